@@ -1,0 +1,56 @@
+# Everything installs into .venv; `make` alone lists the targets.
+
+# Tried in this order; the first that runs and is of a version that lerobot and its
+# dependencies support is taken. Another one: make test PYTHON=/path/to/python
+PYTHON ?= python3.12 python3.13 python3 python
+SUPPORTED := import sys; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
+
+.PHONY: help demo test lint types check constraints clean
+.NOTPARALLEL:
+
+help: ## List the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
+
+demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
+	$(BIN)/tpgmm demo --out out/demo
+
+test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+lint: $(VENV)/.installed-test ## Check style and formatting
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(VENV)/.installed-test ## Check the type hints
+	$(BIN)/python -m mypy
+
+check: lint types test ## All three
+
+constraints: $(VENV)/.installed-test ## Write the versions in .venv into constraints.txt
+	{ grep '^#' constraints.txt; $(BIN)/python -m pip freeze --all --exclude-editable \
+	    --exclude pip --exclude editables; } > constraints.new
+	mv constraints.new constraints.txt
+
+clean: ## Remove results and caches; the environment stays
+	rm -rf out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+
+# A stamp is older than the files below when they ask for other packages than are installed.
+$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) --editable '.[$*]'
+	@touch $@
+
+# pip is what venv writes last, so it stands for an environment that is complete. A pyenv
+# shim may exist and yet not run: only the answer of an interpreter counts.
+$(BIN)/pip:
+	@for python in $(PYTHON); do \
+	    "$$python" -c '$(SUPPORTED)' 2>/dev/null || continue; \
+	    "$$python" -c 'import ensurepip, venv' 2>/dev/null || { \
+	        echo "error: $$python has no ensurepip: install your system's package python3-venv, or give another one: make PYTHON=..." >&2; exit 1; }; \
+	    echo "creating $(VENV) with $$("$$python" -V) ($$python)"; \
+	    exec "$$python" -m venv $(VENV); \
+	done; \
+	echo "error: Python 3.12 or 3.13 is needed, and none of these is one: $(PYTHON); give one: make PYTHON=..." >&2; exit 1

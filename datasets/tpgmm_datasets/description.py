@@ -1,0 +1,164 @@
+"""What is in a data set, and what is wrong with it, without making demonstrations of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tpgmm_datasets.columns import ENVIRONMENT, EVENT
+from tpgmm_datasets.episodes import read_episodes
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.hub import local_folder
+from tpgmm_datasets.joints import joint_feature
+from tpgmm_datasets.layout import BOOKKEEPING, Feature, open_layout
+from tpgmm_datasets.names import pose_groups
+from tpgmm_datasets.units import guess_unit, with_pose_units
+
+__all__ = ["ColumnInfo", "DatasetInfo", "describe_lerobot"]
+
+
+@dataclass(frozen=True)
+class ColumnInfo:
+    """A numeric column of a data set.
+
+    Parameters
+    ----------
+    key, dtype : str
+        Name and type.
+    shape : tuple of int
+        Of a row's value.
+    names : tuple of str or None
+        One per value, where the metadata give them.
+    units : tuple of str or None
+        One per value: those declared; for the joints of a set that declares none, a guess
+        with a question mark.
+    low, high : tuple of float or None
+        Range of each value over the episodes without problems; None if there are none.
+    """
+
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None
+    units: tuple[str, ...] | None
+    low: tuple[float, ...] | None
+    high: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """What :func:`describe_lerobot` found.
+
+    Parameters
+    ----------
+    path : Path
+        The folder.
+    version : str
+        Layout, for example ``"v3.0"``.
+    robot_type : str or None
+        As declared.
+    fps : float
+        Rows per second.
+    columns : tuple of ColumnInfo
+        The numeric ones, LeRobot's bookkeeping apart.
+    cameras : tuple of str
+        Video and image columns, which are not read.
+    joints : str or None
+        The column that ``load_lerobot`` takes for the joints.
+    frames, events : tuple of str
+        Those that it finds by itself.
+    tasks : tuple of str
+        All tasks.
+    lengths : tuple of int
+        Rows of each episode, by the metadata.
+    problems : tuple of DatasetError
+        All that is wrong; empty for a set that loads.
+    """
+
+    path: Path
+    version: str
+    robot_type: str | None
+    fps: float
+    columns: tuple[ColumnInfo, ...]
+    cameras: tuple[str, ...]
+    joints: str | None
+    frames: tuple[str, ...]
+    events: tuple[str, ...]
+    tasks: tuple[str, ...]
+    lengths: tuple[int, ...]
+    problems: tuple[DatasetError, ...]
+
+    @property
+    def duration(self) -> float:
+        """Seconds of all episodes together."""
+        return sum(self.lengths) / self.fps
+
+
+def describe_lerobot(path: str | Path) -> DatasetInfo:
+    """Read a whole data set, at bounded memory, and tell what is in it.
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder, or an id on the hub, as in ``load_lerobot``.
+
+    Returns
+    -------
+    DatasetInfo
+        All problems are in it; at most one per column and episode.
+
+    Raises
+    ------
+    DatasetError
+        If its metadata cannot be read at all.
+    """
+    layout = open_layout(local_folder(path))
+    problems = list(layout.problems)
+    features = [
+        feature
+        for key, feature in layout.features.items()
+        if key not in BOOKKEEPING and not feature.is_camera and feature.dtype != "string"
+    ]
+    ranges: dict[str, tuple[Any, Any]] = {}
+    for rows in read_episodes(layout, layout.episodes, features, problems.append):
+        for key, values in rows.values.items():
+            low, high = values.min(axis=0), values.max(axis=0)
+            if key in ranges:
+                low, high = np.minimum(low, ranges[key][0]), np.maximum(high, ranges[key][1])
+            ranges[key] = low, high
+    try:
+        joints = joint_feature(layout)
+    except DatasetError as problem:
+        problems.append(problem)
+        joints = None
+    environment = layout.features.get(ENVIRONMENT)
+    return DatasetInfo(
+        layout.root,
+        layout.version,
+        layout.robot_type,
+        layout.fps,
+        tuple(_column(feature, ranges.get(feature.key), joints) for feature in features),
+        tuple(key for key, feature in layout.features.items() if feature.is_camera),
+        joints,
+        tuple(pose_groups(environment.names)) if environment else (),
+        tuple(f.key.removeprefix(EVENT) for f in features if f.key.startswith(EVENT)),
+        layout.tasks,
+        tuple(episode.length for episode in layout.episodes),
+        tuple(problems),
+    )
+
+
+def _column(feature: Feature, found: tuple[Any, Any] | None, joints: str | None) -> ColumnInfo:
+    units = feature.units
+    low = high = None
+    if found is not None:
+        low, high = (tuple(map(float, values)) for values in found)
+        if units is None and feature.key == joints:
+            guesses = [f"{guess_unit(a, b)}?" for a, b in zip(low, high, strict=True)]
+            units = with_pose_units(feature.names, guesses)
+    return ColumnInfo(
+        feature.key, feature.dtype, feature.shape, feature.names, units, low, high
+    )

@@ -1,0 +1,170 @@
+"""Parquet files, with errors that name the file instead of pyarrow's own."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tpgmm_datasets.errors import DatasetError
+
+__all__ = ["episode_tables", "open_parquet", "read_columns"]
+
+#: Rows that are decoded at a time: what bounds the memory of an iteration.
+BATCH_ROWS = 1 << 16
+
+
+@contextmanager
+def _named(file: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DatasetError("the file is missing", check="missing", file=file) from error
+    # what pyarrow raises on corrupted bytes is not one class: text that is no UTF-8, sizes
+    # that overflow, columns that vanish
+    except (
+        pa.ArrowException,
+        OSError,
+        ValueError,
+        KeyError,
+        OverflowError,
+        MemoryError,
+    ) as error:
+        if isinstance(error, DatasetError):
+            raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise DatasetError(
+            "this is not a complete parquet file: it is corrupted, truncated, or the set "
+            f"was never finalised ({reason})",
+            check="missing",
+            file=file,
+        ) from error
+
+
+def open_parquet(path: Path, root: Path, columns: Sequence[str]) -> pq.ParquetFile:
+    """Open a parquet file, page checksums verified where it has them.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing or unreadable, or a column is not in it.
+    """
+    file = path.relative_to(root)
+    with _named(file):
+        parquet = pq.ParquetFile(path, page_checksum_verification=True)
+        present = parquet.schema_arrow.names
+    for column in columns:
+        if present.count(column) != 1:
+            raise DatasetError(
+                f"the file has {present.count(column)} columns of that name; it has "
+                f"{[name for name in present if not name.startswith('stats/')]}",
+                file=file,
+                column=column,
+            )
+    return parquet
+
+
+def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
+    """Read some columns of a parquet file whole.
+
+    Raises
+    ------
+    DatasetError
+        If it is missing or unreadable, or a column is not in it.
+    """
+    with open_parquet(path, root, columns) as parquet, _named(path.relative_to(root)):
+        table = parquet.read(columns=list(columns)).select(list(columns))
+        table.validate(full=True)
+        return table
+
+
+def episode_tables(
+    parquet: pq.ParquetFile, file: Path, columns: Sequence[str], wanted: set[int]
+) -> Iterator[tuple[int, pa.Table]]:
+    """Yield the runs of rows of one episode in a data file, decoding a bounded part at a time.
+
+    Parameters
+    ----------
+    parquet : pyarrow.parquet.ParquetFile
+        The file, from :func:`open_parquet`.
+    file : Path
+        How errors call it.
+    columns : sequence of str
+        What to read; ``episode_index`` among them.
+    wanted : set of int
+        Indices of the episodes that are of interest; parts of the file without any of them
+        are skipped, where its statistics tell.
+
+    Yields
+    ------
+    (int, pyarrow.Table)
+        The index and rows of an episode. An episode whose rows are not contiguous comes
+        more than once.
+
+    Raises
+    ------
+    DatasetError
+        If the file is unreadable.
+    """
+    with _named(file):
+        groups = _groups(parquet, wanted)
+        if parquet.metadata.num_rows <= BATCH_ROWS:
+            # faster than batches
+            batches = iter([parquet.read_row_groups(groups, list(columns))])
+        else:
+            batches = parquet.iter_batches(BATCH_ROWS, groups, list(columns))
+    current = -1
+    parts: list[pa.Table] = []
+    while (batch := _next(batches, file)) is not None:
+        table = batch.select(list(columns))
+        index = _episode_index(table, file)
+        cuts = [0, *(np.flatnonzero(np.diff(index)) + 1), len(index)]
+        for start, stop in itertools.pairwise(cuts):
+            if stop > start and index[start] != current and parts:
+                yield current, pa.concat_tables(parts)
+                parts = []
+            if stop > start:
+                current = int(index[start])
+                parts.append(table.slice(start, stop - start))
+    if parts:
+        yield current, pa.concat_tables(parts)
+
+
+def _next(batches: Iterator[Any], file: Path) -> Any:
+    with _named(file):
+        batch = next(batches, None)
+        if batch is not None:
+            batch.validate(full=True)
+        return pa.table(batch) if isinstance(batch, pa.RecordBatch) else batch
+
+
+def _groups(parquet: pq.ParquetFile, wanted: set[int]) -> list[int]:
+    """Row groups that may hold wanted episodes, by their statistics where there are some."""
+    column = parquet.schema_arrow.names.index("episode_index")
+    groups = []
+    for group in range(parquet.num_row_groups):
+        metadata = parquet.metadata.row_group(group)
+        # nested columns count as one leaf each here, since all lists hold plain values
+        leaf = metadata.column(column) if column < metadata.num_columns else None
+        found = leaf.statistics if leaf and leaf.path_in_schema == "episode_index" else None
+        if (
+            found is None
+            or not found.has_min_max
+            or any(found.min <= index <= found.max for index in wanted)
+        ):
+            groups.append(group)
+    return groups
+
+
+def _episode_index(table: pa.Table, file: Path) -> np.ndarray[Any, Any]:
+    column = table["episode_index"]
+    if not pa.types.is_integer(column.type) or column.null_count:
+        raise DatasetError("not all are whole numbers", file=file, column="episode_index")
+    values: np.ndarray[Any, Any] = column.to_numpy()
+    return values

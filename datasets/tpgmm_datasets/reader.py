@@ -1,0 +1,164 @@
+"""Read LeRobot data sets, v2.1 or v3.0, as demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tpgmm_datasets.assembly import Assembly, EventSource, FrameSource, frame_sources
+from tpgmm_datasets.episodes import read_episodes, strict_policy
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.hub import local_folder
+from tpgmm_datasets.joints import JointColumns, joint_feature
+from tpgmm_datasets.layout import Episode, Layout, open_layout
+from tpgmm_datasets.units import Units
+from tpgmm_torch.demonstrations import Demonstration
+
+__all__ = ["iter_lerobot", "load_lerobot"]
+
+
+def load_lerobot(
+    path: str | Path,
+    *,
+    robot: Any = None,
+    joints: str | None = None,
+    joint_names: Mapping[str, str] | Sequence[str] | None = None,
+    units: Units = "auto",
+    frames: Mapping[str, FrameSource] | None = None,
+    events: Mapping[str, EventSource] | None = None,
+    episodes: slice | Sequence[int] | str | None = None,
+    rate: float | None = None,
+    trim: float | None = None,
+    relax: Collection[str] = (),
+) -> list[Demonstration]:
+    """Read a LeRobot data set as demonstrations; videos are not looked at.
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder in layout v2.1 or v3.0, or the id of a data set on the Hugging Face hub.
+    robot : object with ``joint_names`` and ``state(joints)``, optional
+        The demonstrations then have its joints in its order, found by name (also if spelled
+        in another way, ``kLeftElbow`` or ``l_elbow.pos`` for ``left_elbow_joint``); values
+        of the set that are none of its joints are left out. Without a robot all values are
+        taken.
+    joints : str, optional
+        The feature that holds the joints; the default is the first of
+        ``observation.state``, ``state``, ``action`` and their variants.
+    joint_names : mapping or sequence of str, optional
+        Names instead of the data set's: all of them in order, or name in the set to name of
+        the robot's joint for those that differ.
+    units : str, Scale, or mapping of name to these, default="auto"
+        ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is) or a
+        :class:`Scale`, for all values or by name. ``"auto"`` believes the metadata, else
+        assumes radians and refuses what cannot be radians.
+    frames : mapping of str to str, FramePose, LinkPose or Frame, optional
+        Where the pose of each frame is: in a feature (its name alone stands for x y z and a
+        quaternion w x y z, constant from the first row on), where a link is at an event, or
+        given. The default is every pose that the names of ``observation.environment_state``
+        tell of (``bottle.x`` ... ``bottle.qz``), constant if it never changes.
+    events : mapping of str to callable, optional
+        Functions from the demonstration, with all values of the joint feature, to a time
+        [s]. Columns ``event.*`` are found by themselves.
+    episodes : slice, sequence of int, or str, optional
+        Which: of all in order, by index, or those of a task. The default is all.
+    rate : float, optional
+        Resample to this many steps per second.
+    trim : float, optional
+        Cut off the start and end where no joint is faster than this [rad/s].
+    relax : collection of str, default=()
+        Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
+        left out with a :class:`DatasetWarning`.
+
+    Returns
+    -------
+    list of Demonstration
+        In order of the episodes; time starts at 0.
+
+    Raises
+    ------
+    DatasetError
+        With file, episode and column, if the set is incomplete or contradicts itself or the
+        arguments.
+    """
+    selected = iter_lerobot(
+        path,
+        robot=robot,
+        joints=joints,
+        joint_names=joint_names,
+        units=units,
+        frames=frames,
+        events=events,
+        episodes=episodes,
+        rate=rate,
+        trim=trim,
+        relax=relax,
+    )
+    return list(selected)
+
+
+def iter_lerobot(
+    path: str | Path,
+    *,
+    robot: Any = None,
+    joints: str | None = None,
+    joint_names: Mapping[str, str] | Sequence[str] | None = None,
+    units: Units = "auto",
+    frames: Mapping[str, FrameSource] | None = None,
+    events: Mapping[str, EventSource] | None = None,
+    episodes: slice | Sequence[int] | str | None = None,
+    rate: float | None = None,
+    trim: float | None = None,
+    relax: Collection[str] = (),
+) -> Iterator[Demonstration]:
+    """Read episode by episode, for sets larger than memory; arguments as `load_lerobot`.
+
+    The metadata are checked at the call, the rows of an episode when it comes.
+    """
+    policy = strict_policy(relax)
+    layout = open_layout(local_folder(path))
+    for problem in layout.problems:
+        policy(problem)
+    feature = layout.feature(joints or joint_feature(layout))
+    assembly = Assembly(
+        layout,
+        JointColumns.choose(feature, joint_names, units, robot),
+        frame_sources(layout, frames),
+        events or {},
+        robot,
+        rate,
+        trim,
+    )
+    wanted = select_episodes(layout, episodes)
+    rows = read_episodes(layout, wanted, assembly.features, policy)
+    return map(assembly.demonstration, rows)
+
+
+def select_episodes(
+    layout: Layout, episodes: slice | Sequence[int] | str | None
+) -> list[Episode]:
+    """The episodes that are meant, in order of their index, each once.
+
+    Raises
+    ------
+    DatasetError
+        If an index or a task does not exist.
+    """
+    known = {episode.index: episode for episode in layout.episodes}
+    available = list(known.values())
+    if episodes is None:
+        return available
+    if isinstance(episodes, slice):
+        return available[episodes]
+    if isinstance(episodes, str):
+        chosen = [episode for episode in available if episodes in episode.tasks]
+        if not chosen:
+            raise DatasetError(
+                f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
+            )
+        return chosen
+    missing = [index for index in episodes if index not in known]
+    if missing:
+        raise DatasetError(f"there are no episodes {missing}; the set has {sorted(known)}")
+    return [known[index] for index in sorted({int(index) for index in episodes})]

@@ -1,0 +1,64 @@
+"""Statistics of the columns, as LeRobot keeps them per episode and for the whole set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+__all__ = ["QUANTILES", "Statistics", "episode_statistics", "merge_statistics"]
+
+Array = np.ndarray[Any, Any]
+#: By column, by name of the statistic: one value per value of the column.
+Statistics = dict[str, dict[str, Array]]
+
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+def episode_statistics(columns: Mapping[str, Array]) -> Statistics:
+    """Minimum, maximum, mean, standard deviation, count and quantiles of one episode.
+
+    Parameters
+    ----------
+    columns : mapping of str to ndarray of shape (T, width)
+        The values by column.
+    """
+    return {key: _column_statistics(values) for key, values in columns.items()}
+
+
+def _column_statistics(values: Array) -> dict[str, Array]:
+    values = values.astype(np.float64)
+    quantiles = np.quantile(values, list(QUANTILES.values()), axis=0)
+    return {
+        "min": values.min(axis=0),
+        "max": values.max(axis=0),
+        "mean": values.mean(axis=0),
+        "std": values.std(axis=0),
+        "count": np.array([len(values)]),
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }
+
+
+def merge_statistics(a: Statistics, b: Statistics) -> Statistics:
+    """Statistics of two parts together.
+
+    Everything is exact but the quantiles, which are averages weighted by the number of rows:
+    so does LeRobot, and only so can a set grow without being read again.
+    """
+    return {key: _merge_column(a[key], b[key]) for key in a}
+
+
+def _merge_column(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
+    count = a["count"] + b["count"]
+    share = b["count"] / count
+    apart = b["mean"] - a["mean"]
+    variance = (1 - share) * a["std"] ** 2 + share * b["std"] ** 2
+    return {
+        "min": np.minimum(a["min"], b["min"]),
+        "max": np.maximum(a["max"], b["max"]),
+        "mean": a["mean"] + share * apart,
+        "std": np.sqrt(variance + share * (1 - share) * apart**2),
+        "count": count,
+        **{name: (1 - share) * a[name] + share * b[name] for name in QUANTILES},
+    }

@@ -1,0 +1,185 @@
+"""Units of stored values, and how they become radians and metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.names import pose_groups
+
+__all__ = ["POSE_UNITS", "Scale", "Unit", "Units", "convert", "guess_unit", "with_pose_units"]
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """``value * factor + offset`` brings a stored value to radians or metres.
+
+    Parameters
+    ----------
+    factor : float
+        Radians (or metres) per stored unit.
+    offset : float, default=0
+        Radians (or metres) where the stored value is zero.
+
+    Examples
+    --------
+    >>> Scale.between((-100, 100), (-1.5, 1.5))
+    Scale(factor=0.015, offset=0.0)
+    >>> Scale.ticks(4096, zero=2048).factor == 2 * math.pi / 4096
+    True
+    """
+
+    factor: float
+    offset: float = 0.0
+
+    @classmethod
+    def between(cls, stored: tuple[float, float], actual: tuple[float, float]) -> Scale:
+        """The scale that takes the two ``stored`` values to the two ``actual`` ones."""
+        if stored[0] == stored[1]:
+            raise DatasetError(f"a stored range needs two different ends, got {stored}")
+        factor = (actual[1] - actual[0]) / (stored[1] - stored[0])
+        return cls(factor, actual[0] - factor * stored[0])
+
+    @classmethod
+    def ticks(cls, per_turn: int, zero: float = 0.0) -> Scale:
+        """Encoder ticks: ``per_turn`` of them are a turn, ``zero`` is the angle 0."""
+        return cls(math.tau / per_turn, -zero * math.tau / per_turn)
+
+    @classmethod
+    def calibrated(
+        cls,
+        range_min: float,
+        range_max: float,
+        per_turn: int = 4096,
+        zero: float | None = None,
+        stored: tuple[float, float] = (-100.0, 100.0),
+    ) -> Scale:
+        """Values normalised by a calibration, as LeRobot does with motors.
+
+        Parameters
+        ----------
+        range_min, range_max : float
+            The calibration's ends [ticks]; stored as the ends of ``stored``.
+        per_turn : int, default=4096
+            Ticks of a turn.
+        zero : float, optional
+            The tick of angle 0; by default the middle of the range.
+        stored : tuple of float, default=(-100, 100)
+            The normalised range; LeRobot's grippers have (0, 100).
+        """
+        middle = (range_min + range_max) / 2 if zero is None else zero
+        angle = cls.ticks(per_turn, middle)
+        ends = [tick * angle.factor + angle.offset for tick in (range_min, range_max)]
+        return cls.between(stored, (ends[0], ends[1]))
+
+
+#: Units that can be named; "raw" says that the values are to be taken as they are.
+NAMED = {
+    "rad": Scale(1.0),
+    "deg": Scale(math.pi / 180),
+    "m": Scale(1.0),
+    "mm": Scale(1e-3),
+    "1": Scale(1.0),
+    "raw": Scale(1.0),
+}
+
+#: Units of a pose: position, then quaternion.
+POSE_UNITS = ("m", "m", "m", "1", "1", "1", "1")
+
+Unit = str | Scale
+Units = Unit | Mapping[str, Unit]
+
+#: No joint is turned further than this [rad], and hardly any recording in degrees or
+#: normalised units stays below.
+LARGEST_ANGLE = 4 * math.pi
+
+
+def guess_unit(lowest: float, highest: float) -> str:
+    """Guess the unit of a joint from its range: ``"rad"``, or what else it may be."""
+    largest = max(abs(lowest), abs(highest))
+    if largest <= LARGEST_ANGLE:
+        return "rad"
+    if largest <= 100.5:
+        return "deg or normalised"
+    return "deg" if largest <= 360 else "ticks"
+
+
+def with_pose_units(names: Sequence[str] | None, units: Sequence[str]) -> tuple[str, ...]:
+    """``units`` with those of poses where the names tell of a pose."""
+    changed = list(units)
+    for group in pose_groups(names).values():
+        for position, unit in zip(group, POSE_UNITS, strict=True):
+            changed[position] = unit
+    return tuple(changed)
+
+
+def convert(
+    values: Array,
+    names: Sequence[str],
+    units: Sequence[Unit],
+    column: str,
+    **where: Any,
+) -> Array:
+    """Bring values to radians and metres.
+
+    Parameters
+    ----------
+    values : ndarray of shape (T, width)
+        As stored.
+    names : sequence of str
+        How errors call them.
+    units : sequence of str or Scale
+        One of :data:`NAMED`, ``"auto"`` or a scale for each.
+    column : str
+        Where they come from.
+    **where
+        File and episode, for errors.
+
+    Returns
+    -------
+    ndarray of float64 of shape (T, width)
+
+    Raises
+    ------
+    DatasetError
+        If a unit is unknown, or "auto" finds values that cannot be radians.
+    """
+    scales = [_scale(unit, column) for unit in units]
+    low, high = values.min(axis=0), values.max(axis=0)
+    unsure = [
+        f"{name!r} (from {low[i]:.4g} to {high[i]:.4g}: {guess_unit(low[i], high[i])}?)"
+        for i, (name, unit) in enumerate(zip(names, units, strict=True))
+        if unit == "auto" and max(abs(low[i]), abs(high[i])) > LARGEST_ANGLE
+    ]
+    if unsure:
+        raise DatasetError(
+            f"these values are not radians: {', '.join(unsure)}. Say what they are, "
+            "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...}; "
+            "'raw' takes them as they are",
+            column=column,
+            **where,
+        )
+    converted: Array = values.astype(np.float64)
+    if any(scale != NAMED["raw"] for scale in scales):
+        converted = converted * [s.factor for s in scales] + [s.offset for s in scales]
+    return converted
+
+
+def _scale(unit: Unit, column: str) -> Scale:
+    if isinstance(unit, Scale):
+        return unit
+    if unit == "auto":
+        return NAMED["raw"]
+    if unit not in NAMED:
+        raise DatasetError(
+            f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'auto', and Scale(...)",
+            column=column,
+        )
+    return NAMED[unit]

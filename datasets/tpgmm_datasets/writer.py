@@ -1,0 +1,303 @@
+"""Write demonstrations as a LeRobot data set of version 3.0."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from tpgmm_datasets.columns import demonstration_columns, feature_table, features_of
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.files import FileSeries
+from tpgmm_datasets.layout import Layout, open_layout
+from tpgmm_datasets.statistics import (
+    QUANTILES,
+    Statistics,
+    episode_statistics,
+    merge_statistics,
+)
+from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+
+__all__ = ["save_lerobot"]
+
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+#: Files that change when a set grows; all others are taken over as they are.
+REWRITTEN = {"meta/info.json", "meta/stats.json", "meta/tasks.parquet"}
+#: Episodes whose metadata are written at a time.
+FLUSH_EPISODES = 100
+
+
+def save_lerobot(
+    demonstrations: Sequence[Demonstration],
+    path: str | Path,
+    *,
+    fps: int,
+    task: str | Sequence[str],
+    robot_type: str | None = None,
+    dtype: str = "float32",
+    append: bool = False,
+    file_megabytes: float = 100,
+    chunk_files: int = 1000,
+) -> Path:
+    """Write demonstrations as a LeRobot data set (v3.0), one episode each.
+
+    Joints become ``observation.state`` and, one step ahead, ``action``; all frames together
+    ``observation.environment_state``, seven values each; an event ``close`` the column
+    ``event.close``, true at the nearest step. Time starts at 0 in the set. LeRobot's own
+    tools open it, and ``load_lerobot(path)`` gives the demonstrations back (to the precision
+    of ``dtype``; events to the nearest step).
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        With the same joints and frames, sampled at ``fps``.
+    path : str or Path
+        The folder; it must not exist, unless ``append``.
+    fps : int
+        Steps per second; LeRobot stores a whole number.
+    task : str or sequence of str
+        What was done, for all or for each demonstration.
+    robot_type : str, optional
+        Name of the robot, for the metadata.
+    dtype : {"float32", "float64"}, default="float32"
+        How joints and frames are stored. LeRobot's policies read float32 in either case.
+    append : bool, default=False
+        Add the episodes to the set at ``path``, if there is one.
+    file_megabytes : float, default=100
+        A parquet file is closed before it grows beyond this.
+    chunk_files : int, default=1000
+        Number of files in a folder.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    DatasetError
+        If the folder exists, time does not follow ``fps``, or the episodes do not fit to the
+        set they are appended to.
+
+    Notes
+    -----
+    All is written into a folder beside ``path``, which then takes its place: an interrupted
+    write leaves the old set, or none where there was none.
+    """
+    demonstrations = check_demonstrations(demonstrations)
+    path = Path(path)
+    tasks = _tasks(task, len(demonstrations))
+    if dtype not in ("float32", "float64"):
+        raise DatasetError(f"dtype is 'float32' or 'float64', got {dtype!r}")
+    if int(fps) != fps or fps <= 0:
+        raise DatasetError(f"LeRobot stores fps as a whole number > 0, got {fps!r}")
+    if file_megabytes <= 0 or chunk_files < 1:
+        raise DatasetError(
+            "file_megabytes must be > 0 and chunk_files >= 1, "
+            f"got {file_megabytes!r} and {chunk_files!r}"
+        )
+    if path.exists() and not append:
+        raise DatasetError(
+            f"{path} exists; remove it, or pass append=True to add episodes to that set"
+        )
+    new = {
+        "codebase_version": "v3.0",
+        "robot_type": robot_type,
+        "fps": int(fps),
+        "features": features_of(demonstrations, dtype),
+        "chunks_size": int(chunk_files),
+        "data_files_size_in_mb": file_megabytes,
+        "video_files_size_in_mb": 200,
+        "data_path": DATA_PATH,
+        "video_path": None,
+    }
+    old = open_layout(path) if path.exists() else None
+    info = new if old is None else _extended(old, new)
+    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+    try:
+        partial.mkdir(parents=True)
+        if old is not None:
+            _take_over(path, partial)
+        _Writer(partial, info, old).write(demonstrations, tasks)
+        _put_in_place(partial, path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return path
+
+
+def _tasks(task: str | Sequence[str], count: int) -> list[str]:
+    tasks = [task] * count if isinstance(task, str) else list(task)
+    if len(tasks) != count or not all(isinstance(item, str) and item for item in tasks):
+        raise DatasetError(
+            f"task is one text or one per demonstration ({count}), not empty; got {task!r}"
+        )
+    return tasks
+
+
+def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
+    """The ``info.json`` of the old set, if the new episodes fit to it."""
+    if old.problems:
+        raise DatasetError(f"the set cannot grow before it is in order: {old.problems[0]}")
+    info = dict(old.info)
+    features = {**new["features"]}
+    # an event that none of the new demonstrations has stays a column
+    features |= {k: v for k, v in info["features"].items() if k.startswith("event.")}
+    for name, given, found in (
+        ("codebase_version", new["codebase_version"], old.version),
+        ("fps", new["fps"], info["fps"]),
+        ("robot_type", new["robot_type"] or info.get("robot_type"), info.get("robot_type")),
+        ("features", sorted(features), sorted(info["features"])),
+    ):
+        if given != found:
+            raise DatasetError(f"the set has {name} {found!r}, the demonstrations {given!r}")
+    for key, feature in features.items():
+        for name in ("dtype", "shape", "names"):
+            found = info["features"][key].get(name)
+            if feature[name] != found:
+                raise DatasetError(
+                    f"the set has {name} {found!r}, the demonstrations {feature[name]!r}",
+                    column=key,
+                )
+    return info
+
+
+def _take_over(path: Path, partial: Path) -> None:
+    """Link the files that stay as they are; they are never written again."""
+    for source in path.rglob("*"):
+        file = source.relative_to(path)
+        if source.is_file() and file.as_posix() not in REWRITTEN:
+            target = partial / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(source, target)
+            except OSError:
+                shutil.copy2(source, target)
+
+
+def _put_in_place(partial: Path, path: Path) -> None:
+    if not path.exists():
+        partial.rename(path)
+        return
+    previous = path.with_name(f".{path.name}.{uuid.uuid4().hex}.previous")
+    path.rename(previous)
+    try:
+        partial.rename(path)
+    except BaseException:
+        previous.rename(path)
+        raise
+    shutil.rmtree(previous, ignore_errors=True)
+
+
+class _Writer:
+    """Write episodes after those of the set ``old``, if there is one."""
+
+    def __init__(self, root: Path, info: dict[str, Any], old: Layout | None) -> None:
+        self.root, self.info = root, info
+        self.tasks = [] if old is None else list(old.tasks)
+        self.episodes = 0 if old is None else len(old.episodes)
+        self.rows = 0 if old is None else sum(episode.length for episode in old.episodes)
+        self.statistics = None if old is None else _old_statistics(old)
+        self.pending: list[dict[str, Any]] = []
+        limits = int(info["data_files_size_in_mb"] * 1e6), info["chunks_size"]
+        declared = json.dumps({"fps": info["fps"], "features": info["features"]})
+        self.data = FileSeries(root, info["data_path"], *limits, metadata=declared)
+        self.meta = FileSeries(root, EPISODES_PATH, *limits)
+
+    def write(self, demonstrations: Sequence[Demonstration], tasks: Sequence[str]) -> None:
+        with self.data, self.meta:
+            for number, (item, task) in enumerate(zip(demonstrations, tasks, strict=True)):
+                self._episode(item, number, task)
+                if len(self.pending) == FLUSH_EPISODES:
+                    self._flush()
+            self._flush()
+        self._tables()
+
+    def _episode(self, demonstration: Demonstration, number: int, task: str) -> None:
+        features = self.info["features"]
+        if task not in self.tasks:
+            self.tasks.append(task)
+        first = features["observation.state"]["names"]
+        if (demonstration.joint_names is None) != (first is None):
+            raise DatasetError(f"demonstration {number} has joint_names unlike the others")
+        if first is not None:
+            demonstration = demonstration.reordered(first)
+        columns = demonstration_columns(demonstration, number, features, self.info["fps"])
+        rows = len(demonstration)
+        columns["episode_index"] = np.full((rows, 1), self.episodes)
+        columns["index"] = np.arange(self.rows, self.rows + rows)[:, None]
+        columns["task_index"] = np.full((rows, 1), self.tasks.index(task))
+        columns = {key: columns[key] for key in features}
+        chunk, file = self.data.write(feature_table(columns, features))
+        statistics = episode_statistics(columns)
+        row: dict[str, Any] = {
+            "episode_index": self.episodes,
+            "tasks": [task],
+            "length": rows,
+            "data/chunk_index": chunk,
+            "data/file_index": file,
+            "dataset_from_index": self.rows,
+            "dataset_to_index": self.rows + rows,
+        }
+        for key, column in statistics.items():
+            row |= {f"stats/{key}/{name}": column[name].tolist() for name in column}
+        self.pending.append(row)
+        known = self.statistics
+        self.statistics = statistics if known is None else merge_statistics(known, statistics)
+        self.episodes, self.rows = self.episodes + 1, self.rows + rows
+
+    def _flush(self) -> None:
+        if self.pending:
+            schema = pa.schema([(key, _episode_type(key)) for key in self.pending[0]])
+            table = pa.Table.from_pylist(self.pending, schema)
+            self.meta.write(table, place="meta/episodes/")
+            self.pending = []
+
+    def _tables(self) -> None:
+        meta = self.root / "meta"
+        index = pd.Index(self.tasks, name="task")
+        tasks = pd.DataFrame({"task_index": np.arange(len(self.tasks))}, index=index)
+        tasks.to_parquet(meta / "tasks.parquet", write_page_checksum=True)
+        statistics = {
+            key: {name: values.tolist() for name, values in column.items()}
+            for key, column in (self.statistics or {}).items()
+        }
+        self.info |= {
+            "total_episodes": self.episodes,
+            "total_frames": self.rows,
+            "total_tasks": len(self.tasks),
+            "splits": {"train": f"0:{self.episodes}"},
+        }
+        for name, content in (("info.json", self.info), ("stats.json", statistics)):
+            (meta / name).write_text(json.dumps(content, indent=4), encoding="utf-8")
+
+
+def _episode_type(key: str) -> pa.DataType:
+    if key == "tasks":
+        return pa.list_(pa.string())
+    if key.startswith("stats/"):
+        return pa.list_(pa.int64() if key.endswith("/count") else pa.float64())
+    return pa.int64()
+
+
+def _old_statistics(old: Layout) -> Statistics:
+    path = old.root / "meta" / "stats.json"
+    needed = {"min", "max", "mean", "std", "count", *QUANTILES}
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        found = {key: {n: np.array(v) for n, v in stored[key].items()} for key in old.features}
+        if all(needed <= set(column) for column in found.values()):
+            return found
+    raise DatasetError(
+        "statistics of some columns are missing or not readable; the set cannot grow",
+        file="meta/stats.json",
+    )

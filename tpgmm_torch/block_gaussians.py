@@ -1,0 +1,357 @@
+"""Gaussian mixtures with block-diagonal covariance, and the points they are evaluated at.
+
+A point is made of P blocks of columns, independent given the component (section II-B of
+the paper). Points are standardised, and cut into chunks so that the memory needed does not
+grow with their number. Densities are evaluated in the components' own whitened coordinates
+``y = L^-1 (x - mu)``, ``Sigma = L L^T``, where no digits are lost however narrow a component
+is; appending a 1 to ``x`` and ``y`` makes that one matrix product per block for all
+components at once.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError, ShapeError
+
+__all__ = [
+    "Chunk",
+    "Family",
+    "Parameters",
+    "Standardization",
+    "Whitener",
+    "check_blocks",
+]
+
+#: Numbers at a time when the variance is summed.
+MOMENT_CHUNK = 2**20
+
+#: Numbers that a chunk of points is expanded to: a processor's cache full, a GPU's worth.
+CHUNK_SIZE = {"cpu": 2**18, "gpu": 2**25}
+
+#: Least regularisation, as a share of the variance, that survives rounding.
+SMALLEST_SHARE = {torch.float64: 1e-12, torch.float32: 2e-6}
+
+#: One chunk of points: for each block the columns (x; 1), shape (D_j + 1, n).
+Chunk = tuple[Tensor, ...]
+
+
+def check_blocks(blocks: Sequence[int] | None, n_features: int) -> tuple[int, ...]:
+    """Widths of the blocks, once they are known to fit the data; None is one block.
+
+    Raises
+    ------
+    ShapeError
+        If they are not positive integers that add up to ``n_features``.
+    """
+    widths = (n_features,) if blocks is None else tuple(blocks)
+    if not all(isinstance(width, Integral) and width > 0 for width in widths):
+        raise ShapeError(f"blocks must be positive integers, got {blocks!r}")
+    if sum(widths) != n_features:
+        raise ShapeError(
+            f"blocks={blocks!r} add up to {sum(widths)} columns, but the data have {n_features}"
+        )
+    return tuple(int(width) for width in widths)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """A mixture in float64: weights (K,), and per block means (K, D_j), factors (K, D_j, D_j).
+
+    The factors are the lower Cholesky factors of the covariances.
+    """
+
+    weights: Tensor
+    means: tuple[Tensor, ...]
+    factors: tuple[Tensor, ...]
+
+    @classmethod
+    def from_covariances(
+        cls, weights: Tensor, means: Sequence[Tensor], covariances: Sequence[Tensor]
+    ) -> "Parameters":
+        """Factorise covariances of shape (K, D_j, D_j).
+
+        Raises
+        ------
+        DataError
+            If one of them is not positive definite; the message says which.
+        """
+        factors = []
+        for block, covariance in enumerate(covariances):
+            factor, info = torch.linalg.cholesky_ex(covariance)
+            if bool(info.any()):
+                component = int(info.nonzero()[0])
+                raise DataError(
+                    f"the covariance of component {component}, block {block} is not positive "
+                    "definite; raise reg_covar, or use dtype='float64'"
+                )
+            factors.append(factor)
+        return cls(weights, tuple(means), tuple(factors))
+
+    @classmethod
+    def standard(
+        cls, n_components: int, widths: Sequence[int], device: torch.device | str = "cpu"
+    ) -> "Parameters":
+        """All components the standard normal: whitening with them changes nothing."""
+        unit = torch.ones((), dtype=torch.float64, device=device)
+        eyes = (torch.diag(unit.expand(width)).expand(n_components, -1, -1) for width in widths)
+        means = (unit.new_zeros(n_components, width) for width in widths)
+        weights = unit.expand(n_components) / n_components
+        return cls(weights, tuple(means), tuple(eyes))
+
+    @property
+    def covariances(self) -> tuple[Tensor, ...]:
+        """Covariances per block, shape (K, D_j, D_j)."""
+        return tuple(factor @ factor.mT for factor in self.factors)
+
+    def sample(
+        self, n_samples: int, rng: np.random.RandomState
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Points (n_samples, sum D_j) and their components, in ascending order."""
+        weights = self.weights.cpu().numpy()
+        counts = rng.multinomial(n_samples, weights / weights.sum())
+        labels = np.repeat(np.arange(len(counts)), counts)
+        columns = []
+        for mean, factor in zip(self.means, self.factors, strict=True):
+            normal = rng.standard_normal((n_samples, mean.shape[1], 1))
+            spread = factor.cpu().numpy()[labels] @ normal
+            columns.append(mean.cpu().numpy()[labels] + spread[..., 0])
+        return np.concatenate(columns, axis=1), labels
+
+    def affine(self, scales: Sequence[Tensor], offsets: Sequence[Tensor]) -> "Parameters":
+        """The mixture of ``scale * x + offset``, with positive scales (D_j,) per block."""
+        means = tuple(s * m + o for s, m, o in zip(scales, self.means, offsets, strict=True))
+        factors = tuple(s[:, None] * f for s, f in zip(scales, self.factors, strict=True))
+        return Parameters(self.weights, means, factors)
+
+
+@dataclass(frozen=True)
+class Standardization:
+    """The units in which EM works: ``(x - shift) / scale``, per block vectors (D_j,)."""
+
+    shifts: tuple[Tensor, ...]
+    scales: tuple[Tensor, ...]
+
+    @classmethod
+    def of_data(
+        cls, points: NDArray[np.floating], widths: Sequence[int], *, isotropic: bool
+    ) -> "Standardization":
+        """Mean and standard deviation of each column, or one deviation per block.
+
+        A constant column takes the mean variance of its block, or 1 where that is zero too.
+
+        Parameters
+        ----------
+        points : array of shape (n_samples, n_features)
+        widths : sequence of int
+            Widths of the blocks.
+        isotropic : bool
+            Scale all columns of a block alike.
+
+        Raises
+        ------
+        DataError
+            If the variance overflows.
+        """
+        parts = np.array_split(points, max(1, points.size // MOMENT_CHUNK))
+        with np.errstate(over="ignore", invalid="ignore"):
+            mean = points.mean(0, dtype=np.float64)
+            variance = sum(np.square(part - mean).sum(0) for part in parts) / len(points)
+        if not np.isfinite(variance).all():
+            raise DataError("the variance of the data overflows; divide the data by a constant")
+        largest = np.maximum(np.abs(points.max(0)), np.abs(points.min(0)))
+        # what summation leaves of a constant column is no variance
+        variance[np.sqrt(variance) <= 10 * np.finfo(np.float64).eps * largest] = 0.0
+        scales = []
+        for block in np.split(variance, np.cumsum(widths)[:-1]):
+            fallback = block.mean() or 1.0
+            constant = np.full_like(block, True, dtype=bool) if isotropic else block == 0
+            scales.append(torch.from_numpy(np.sqrt(np.where(constant, fallback, block))))
+        return cls(torch.split(torch.from_numpy(mean), list(widths)), tuple(scales))
+
+    @classmethod
+    def of_mixture(cls, parameters: Parameters) -> "Standardization":
+        """Mean and standard deviation of the mixture's own density."""
+        weights = parameters.weights[:, None]
+        shifts, scales = [], []
+        for mean, factor in zip(parameters.means, parameters.factors, strict=True):
+            shift = (weights * mean).sum(0)
+            within = factor.square().sum(-1)
+            scales.append((weights * (within + (mean - shift) ** 2)).sum(0).sqrt())
+            shifts.append(shift)
+        return cls(tuple(shifts), tuple(scales))
+
+    @property
+    def log_volume(self) -> float:
+        """What a log-density per standardised unit exceeds one per unit of the data by."""
+        return float(sum(scale.log().sum() for scale in self.scales))
+
+    def to(self, device: torch.device) -> "Standardization":
+        """The same on another device."""
+        return Standardization(
+            tuple(shift.to(device) for shift in self.shifts),
+            tuple(scale.to(device) for scale in self.scales),
+        )
+
+    def chunks(
+        self, points: NDArray[np.floating], n_components: int, dtype: torch.dtype
+    ) -> list[Chunk]:
+        """Standardise points (n_samples, n_features) in float64 and cut them into chunks."""
+        widths = [len(shift) + 1 for shift in self.shifts]
+        packed = sum(width * (width + 1) // 2 for width in widths)
+        whole = CHUNK_SIZE["cpu" if self.shifts[0].device.type == "cpu" else "gpu"]
+        size = whole // min(n_components * sum(widths), packed) + 1
+        shift, scale = torch.cat(self.shifts)[:, None], torch.cat(self.scales)[:, None]
+        chunks = []
+        for start in range(0, len(points), size):
+            columns = np.array(points[start : start + size].T, dtype=np.float64, order="C")
+            standard = (torch.from_numpy(columns).to(shift.device) - shift) / scale
+            one = standard.new_ones(1, standard.shape[1])
+            blocks = torch.split(standard, [width - 1 for width in widths])
+            chunks.append(tuple(torch.cat((block, one)).to(dtype) for block in blocks))
+        return chunks
+
+    def standardize(self, parameters: Parameters) -> Parameters:
+        """A mixture in units of the data, brought to standardised units."""
+        scales = [1 / scale for scale in self.scales]
+        offsets = [-s * shift for s, shift in zip(scales, self.shifts, strict=True)]
+        return parameters.affine(scales, offsets)
+
+    def restore(self, parameters: Parameters) -> Parameters:
+        """A mixture in standardised units, brought to units of the data."""
+        return parameters.affine(self.scales, self.shifts)
+
+
+@dataclass(frozen=True)
+class Family:
+    """The family of covariances, and the regularisation that keeps them away from zero.
+
+    Parameters
+    ----------
+    covariance_type : {"full", "tied", "diag", "spherical"}
+    diagonals : tuple of Tensor of shape (D_j,)
+        Per block the diagonal matrix ``Lambda`` that regularises.
+    """
+
+    covariance_type: str
+    diagonals: tuple[Tensor, ...]
+
+    @classmethod
+    def regularized(
+        cls,
+        covariance_type: str,
+        units: Standardization,
+        amount: float,
+        *,
+        relative: bool,
+        dtype: torch.dtype,
+    ) -> "Family":
+        """The family in standardised units.
+
+        Parameters
+        ----------
+        covariance_type : {"full", "tied", "diag", "spherical"}
+        units : Standardization
+        amount : float
+            The regularisation: a share of the variance, or in squared units of the data.
+        relative : bool
+            Which of the two.
+        dtype : torch.dtype
+            Precision of the computation, which sets the least regularisation.
+        """
+        shares = (
+            torch.full_like(scale, amount) if relative else amount / scale**2
+            for scale in units.scales
+        )
+        smallest = SMALLEST_SHARE[dtype]
+        return cls(covariance_type, tuple(share.clamp(min=smallest) for share in shares))
+
+    def restrict(self, covariance: Tensor, weights: Tensor) -> Tensor:
+        """The member of the family that the M step wants instead of ``covariance``."""
+        match self.covariance_type:
+            case "tied":
+                pooled = torch.einsum("k,kij->ij", weights, covariance)
+                return pooled.expand_as(covariance)
+            case "diag":
+                return torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
+            case "spherical":
+                variance = covariance.diagonal(dim1=-2, dim2=-1).mean(-1)
+                eye = torch.eye(covariance.shape[-1]).to(covariance)
+                return variance[:, None, None] * eye
+        return covariance
+
+    @staticmethod
+    def floor(covariance: Tensor, diagonal: Tensor) -> Tensor:
+        """Raise to ``Lambda`` what is below it: the most likely one with Sigma - Lambda >= 0.
+
+        ``-log|Sigma| - tr(Sigma^-1 S)`` under that constraint is largest where the
+        eigenvalues of ``Lambda^-1/2 S Lambda^-1/2`` below 1 are replaced by 1.
+        """
+        root = diagonal.sqrt()
+        outer = root[:, None] * root
+        values, vectors = torch.linalg.eigh(covariance / outer)
+        floored: Tensor = (vectors * values.clamp(min=1.0)[..., None, :]) @ vectors.mT * outer
+        return floored
+
+    def admit(self, parameters: Parameters) -> Parameters:
+        """Bring any mixture into the family and above the regularisation."""
+        covariances = [
+            self.floor(self.restrict(covariance, parameters.weights), diagonal)
+            for covariance, diagonal in zip(parameters.covariances, self.diagonals, strict=True)
+        ]
+        return Parameters.from_covariances(parameters.weights, parameters.means, covariances)
+
+
+class Whitener:
+    """Evaluates the log-density of a mixture in the components' whitened coordinates.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    dtype : torch.dtype
+        Precision of the points.
+
+    Attributes
+    ----------
+    maps : list of Tensor of shape (K, D_j + 1, D_j + 1)
+        Per block, in float64, what takes (x; 1) to (y; 1).
+    constant : Tensor of shape (K,)
+        In float64, what the log-density is at (y; 1) = 0.
+    """
+
+    def __init__(self, parameters: Parameters, dtype: torch.dtype) -> None:
+        self.maps: list[Tensor] = []
+        self.constant = parameters.weights.log()
+        for mean, factor in zip(parameters.means, parameters.factors, strict=True):
+            count, width = mean.shape
+            eye = torch.eye(width).to(mean).expand_as(factor)
+            inverse = torch.linalg.solve_triangular(factor, eye, upper=False)
+            homogeneous = torch.zeros(count, width + 1, width + 1).to(mean)
+            homogeneous[:, :width, :width] = inverse
+            homogeneous[:, :width, width] = -(inverse @ mean[..., None])[..., 0]
+            homogeneous[:, width, width] = 1.0
+            self.maps.append(homogeneous)
+            log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+            # the appended 1 adds 1/2 to half the squared norm of (y; 1)
+            normalizer = log_determinant + (width * math.log(2 * math.pi) - 1) / 2
+            self.constant = self.constant - normalizer
+        self._flat = [whitener.flatten(0, 1).to(dtype) for whitener in self.maps]
+        self._column = self.constant.to(dtype)[:, None]
+
+    def __call__(self, chunk: Chunk) -> tuple[Tensor, Chunk]:
+        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (K, n).
+
+        Second comes (y; 1), per block of shape (K, D_j + 1, n), which the caller may change.
+        """
+        whitened = tuple(
+            (whitener @ x).view(len(self._column), len(x), -1)
+            for whitener, x in zip(self._flat, chunk, strict=True)
+        )
+        norms = sum(y.square().sum(1) for y in whitened)
+        return self._column - norms / 2, whitened

@@ -1,0 +1,239 @@
+"""Gaussians in batches: affine maps, products, conditioning, mixing (paper, section II-C).
+
+Means have shape (..., D) and covariances (..., D, D); leading dimensions broadcast, and
+every function is differentiable. A product of Gaussians is available in covariance form,
+eq. (2) as printed, and in information form, which also takes constraints ``J x = y`` that
+leave directions of ``x`` free, where eq. (2) would invert a singular matrix.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError
+
+__all__ = [
+    "affine",
+    "cholesky",
+    "condition",
+    "from_information",
+    "information",
+    "log_density",
+    "moment_match",
+    "product",
+]
+
+
+def cholesky(matrix: Tensor, name: str) -> Tensor:
+    """Lower Cholesky factors, with an error that names the matrix.
+
+    Parameters
+    ----------
+    matrix : Tensor of shape (..., D, D)
+        Symmetric positive definite matrices.
+    name : str
+        How the error message calls them.
+
+    Returns
+    -------
+    Tensor of shape (..., D, D)
+
+    Raises
+    ------
+    DataError
+        If a matrix is not positive definite.
+    """
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    if bool(info.any()):
+        bad = int((info != 0).sum())
+        raise DataError(
+            f"{name} is not positive definite ({bad} of {info.numel()} matrices of size "
+            f"{matrix.shape[-1]}): a direction has no variance; a larger regularisation "
+            "(reg_covar, or epsilon of the covariance form) gives it some"
+        )
+    return factor
+
+
+def affine(
+    mean: Tensor, covariance: Tensor, linear: Tensor, offset: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Image of a Gaussian under ``x -> A x + b``, eq. (1).
+
+    Parameters
+    ----------
+    mean : Tensor of shape (..., D)
+    covariance : Tensor of shape (..., D, D)
+    linear : Tensor of shape (..., n, D)
+        ``A``, of any shape and rank.
+    offset : Tensor of shape (..., n)
+        ``b``.
+
+    Returns
+    -------
+    mean : Tensor of shape (..., n)
+    covariance : Tensor of shape (..., n, n)
+    """
+    return (linear @ mean[..., None])[..., 0] + offset, linear @ covariance @ linear.mT
+
+
+def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Normalised product of P Gaussians in covariance form, eq. (2) as printed.
+
+    Parameters
+    ----------
+    means : Tensor of shape (P, ..., n)
+    covariances : Tensor of shape (P, ..., n, n)
+        Positive definite.
+
+    Returns
+    -------
+    mean : Tensor of shape (..., n)
+    covariance : Tensor of shape (..., n, n)
+
+    Raises
+    ------
+    DataError
+        If one of the covariances is singular.
+    """
+    precisions = torch.cholesky_inverse(cholesky(covariances, "a factor of the product"))
+    precision = precisions.sum(0)
+    vector = (precisions @ means[..., None]).sum(0)[..., 0]
+    return from_information(precision, vector)
+
+
+def information(
+    jacobian: Tensor | None, targets: Tensor, covariance: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What ``J x = y``, known with covariance ``S``, says about ``x``.
+
+    ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank
+    (DESIGN 4.2), so that sums of these terms are the product (2) of the projected Gaussians
+    (1) without any pseudo-inverse; rows may also be dependent.
+
+    Parameters
+    ----------
+    jacobian : Tensor of shape (..., m, n), optional
+        ``J``; None stands for the identity.
+    targets : Tensor of shape (..., m, r)
+        Right-hand sides ``y``, as columns.
+    covariance : Tensor of shape (..., m, m)
+        ``S``, positive definite.
+
+    Returns
+    -------
+    precision : Tensor of shape (..., n, n)
+        ``J^T S^-1 J``.
+    vector : Tensor of shape (..., n, r)
+        ``J^T S^-1 y``.
+    square : Tensor of shape (..., r, r)
+        ``y^T S^-1 y``.
+
+    Raises
+    ------
+    DataError
+        If ``S`` is singular.
+    """
+    factor = cholesky(covariance, "the covariance of a projected component")
+    if jacobian is None:
+        precision = torch.cholesky_inverse(factor)
+        vector = precision @ targets
+        return precision, vector, targets.mT @ vector
+    n = jacobian.shape[-1]
+    batch = torch.broadcast_shapes(jacobian.shape[:-2], targets.shape[:-2], factor.shape[:-2])
+    right = torch.cat((jacobian.expand(*batch, -1, -1), targets.expand(*batch, -1, -1)), dim=-1)
+    white = torch.linalg.solve_triangular(factor, right, upper=False)
+    gram = white.mT @ white
+    return gram[..., :n, :n], gram[..., :n, n:], gram[..., n:, n:]
+
+
+def from_information(precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of the Gaussian of that precision matrix and information vector.
+
+    Parameters
+    ----------
+    precision : Tensor of shape (..., n, n)
+    vector : Tensor of shape (..., n)
+
+    Returns
+    -------
+    mean : Tensor of shape (..., n)
+        ``precision^-1 vector``.
+    covariance : Tensor of shape (..., n, n)
+
+    Raises
+    ------
+    DataError
+        If the precision is singular: a direction is not determined by anything.
+    """
+    factor = cholesky(precision, "the precision of the product")
+    mean = torch.cholesky_solve(vector[..., None], factor)[..., 0]
+    return mean, torch.cholesky_inverse(factor)
+
+
+def condition(mean: Tensor, covariance: Tensor, n_inputs: int) -> tuple[Tensor, Tensor]:
+    """Gaussian mixture regression of one Gaussian: outputs given the first coordinates.
+
+    ``E[x_o | x_i] = mean_o + gain (x_i - mean_i)``.
+
+    Parameters
+    ----------
+    mean : Tensor of shape (..., D)
+        Only its shape matters: gain and covariance do not depend on it.
+    covariance : Tensor of shape (..., D, D)
+    n_inputs : int
+        How many of the leading coordinates are inputs.
+
+    Returns
+    -------
+    gain : Tensor of shape (..., D - n_inputs, n_inputs)
+        ``Sigma_oi Sigma_ii^-1``.
+    covariance : Tensor of shape (..., D - n_inputs, D - n_inputs)
+        ``Sigma_oo - gain Sigma_io``.
+    """
+    inputs = covariance[..., :n_inputs, :n_inputs]
+    cross = covariance[..., :n_inputs, n_inputs:]
+    gain = torch.cholesky_solve(cross, cholesky(inputs, "the covariance of the input")).mT
+    return gain, covariance[..., n_inputs:, n_inputs:] - gain @ cross
+
+
+def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and covariance of a mixture (law of total variance).
+
+    Parameters
+    ----------
+    weights : Tensor of shape (..., K)
+        Sum to one.
+    means : Tensor of shape (..., K, D)
+    covariances : Tensor of shape (..., K, D, D)
+
+    Returns
+    -------
+    mean : Tensor of shape (..., D)
+    covariance : Tensor of shape (..., D, D)
+        Within the components and between them.
+    """
+    mean = (weights[..., None] * means).sum(-2)
+    apart = means - mean[..., None, :]
+    within = (weights[..., None, None] * covariances).sum(-3)
+    return mean, within + (weights[..., None] * apart).mT @ apart
+
+
+def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
+    """Log-density of Gaussians given by the Cholesky factors of their covariances.
+
+    Parameters
+    ----------
+    x : Tensor of shape (..., D)
+    mean : Tensor of shape (..., D)
+    factor : Tensor of shape (..., D, D)
+        Lower Cholesky factors.
+
+    Returns
+    -------
+    Tensor of shape (...)
+    """
+    white = torch.linalg.solve_triangular(factor, (x - mean)[..., None], upper=False)[..., 0]
+    half_log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    constant = 0.5 * math.log(2 * math.pi) * x.shape[-1]
+    return -0.5 * white.square().sum(-1) - half_log_det - constant

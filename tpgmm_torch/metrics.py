@@ -1,0 +1,153 @@
+"""How good a reproduction is: errors against demonstrations, rhythm, smoothness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.trajectories import Trajectory
+
+__all__ = [
+    "Sinusoid",
+    "joint_rmse",
+    "largest_acceleration",
+    "largest_velocity",
+    "reproduction_scorer",
+    "sinusoid",
+]
+
+
+def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
+    """Root mean square joint difference over equal time grids [rad].
+
+    Raises
+    ------
+    ShapeError
+        If the time grids or the joints differ.
+    """
+    wanted = demonstration.reordered(trajectory.joint_names).joints
+    if wanted.shape != trajectory.joints.shape:
+        raise ShapeError(
+            f"the trajectory has shape {tuple(trajectory.joints.shape)}, "
+            f"the demonstration {tuple(wanted.shape)}"
+        )
+    apart = trajectory.joints.to(wanted) - wanted
+    return float(apart.square().mean().sqrt())
+
+
+def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
+    """Minus the joint RMSE of reproductions in the situations of held-out demonstrations.
+
+    For ``cross_val_score(..., scoring=reproduction_scorer)`` and ``GridSearchCV``; unlike the
+    likelihood it compares models with different operators.
+
+    Parameters
+    ----------
+    estimator : TaskParameterizedGMM
+        Fitted.
+    X : sequence of Demonstration
+
+    Returns
+    -------
+    float
+        [rad]; higher is better.
+    """
+    demonstrations = check_demonstrations(X)
+    trajectories = estimator.predict(demonstrations, candidates=False)
+    errors = [
+        joint_rmse(trajectory, demonstration)
+        for trajectory, demonstration in zip(trajectories, demonstrations, strict=True)
+    ]
+    return -float(np.mean(errors))
+
+
+def largest_velocity(motion: Trajectory | Demonstration) -> float:
+    """Largest joint speed by first differences [rad/s]."""
+    speed = motion.joints.diff(dim=0) / motion.time.diff()[:, None]
+    return float(speed.abs().max())
+
+
+def largest_acceleration(motion: Trajectory | Demonstration) -> float:
+    """Largest joint acceleration by second differences [rad/s^2]."""
+    steps = motion.time.diff()
+    speed = motion.joints.diff(dim=0) / steps[:, None]
+    middle = (steps[1:] + steps[:-1]) / 2
+    return float((speed.diff(dim=0) / middle[:, None]).abs().max())
+
+
+@dataclass(frozen=True)
+class Sinusoid:
+    """``offset + amplitude sin(2 pi frequency t + phase)``, and what it leaves unexplained.
+
+    Parameters
+    ----------
+    frequency : float
+        [Hz]
+    amplitude, offset : float
+        In the signal's unit.
+    phase : float
+        At time 0 [rad].
+    residual : float
+        Root mean square of the rest.
+    """
+
+    frequency: float
+    amplitude: float
+    offset: float
+    phase: float
+    residual: float
+
+
+def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
+    """The sinusoid of least squares through a signal.
+
+    The frequency is searched between one period in the window and the Nyquist frequency,
+    coarsely by steps of a fifth of a period in the window, then by golden sections.
+
+    Parameters
+    ----------
+    time : array-like of shape (T,)
+        Seconds.
+    signal : array-like of shape (T,)
+
+    Returns
+    -------
+    Sinusoid
+
+    Raises
+    ------
+    ShapeError
+        If there are fewer than eight points, or the shapes differ.
+    """
+    t = np.asarray(torch.as_tensor(time), dtype=np.float64)
+    y = np.asarray(torch.as_tensor(signal), dtype=np.float64)
+    if t.shape != y.shape or t.ndim != 1 or len(t) < 8:
+        raise ShapeError(
+            f"sinusoid needs two equal vectors of 8 or more, got {t.shape}, {y.shape}"
+        )
+
+    def fit(frequency: float) -> tuple[float, np.ndarray]:
+        angle = 2 * np.pi * frequency * t
+        basis = np.stack((np.sin(angle), np.cos(angle), np.ones_like(t)), axis=1)
+        coefficients = np.linalg.lstsq(basis, y, rcond=None)[0]
+        return float(np.sqrt(np.mean((y - basis @ coefficients) ** 2))), coefficients
+
+    window = t[-1] - t[0]
+    grid = np.arange(1, len(t) / 2, 0.2) / window
+    best = int(np.argmin([fit(frequency)[0] for frequency in grid]))
+    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
+    golden = (np.sqrt(5) - 1) / 2
+    for _ in range(40):
+        left, right = high - golden * (high - low), low + golden * (high - low)
+        low, high = (low, right) if fit(left)[0] < fit(right)[0] else (left, high)
+    frequency = float((low + high) / 2)
+    residual, (sine, cosine, offset) = fit(frequency)
+    amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+    return Sinusoid(frequency, amplitude, float(offset), phase, residual)

@@ -1,0 +1,192 @@
+"""What every operator is: one linear map in task space (DESIGN 4.1)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.kinematics import Kinematics, RobotState
+
+__all__ = ["Linearization", "Operator", "Reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """The displacement that a local Gaussian asks for: ``J (q - q_{t-1}) = M mu + c``.
+
+    Parameters
+    ----------
+    jacobian : Tensor of shape (..., m, n_joints), optional
+        ``J``; None stands for the identity.
+    matrix : Tensor of shape (..., m, D), optional
+        ``M``; None stands for the identity.
+    displacement : Tensor of shape (..., m)
+        ``c``.
+    """
+
+    jacobian: Tensor | None
+    matrix: Tensor | None
+    displacement: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Pose that relative operators refer to: an object, or another link of the robot.
+
+    Parameters
+    ----------
+    frame : Frame
+        Its pose at present.
+    linear_jacobian, angular_jacobian : Tensor of shape (..., 3, n_joints), optional
+        How the joints move it; None for an object, which they do not move.
+    """
+
+    frame: Frame
+    linear_jacobian: Tensor | None = None
+    angular_jacobian: Tensor | None = None
+
+    @classmethod
+    def of(cls, name: str, state: RobotState, frames: Mapping[str, Frame]) -> Reference:
+        """Look a name up, first among the robot's links, then among the frames.
+
+        Raises
+        ------
+        UnknownNameError
+            If it is neither.
+        """
+        if name in state.links:
+            pose = Frame._from(state.position(name), state.orientation(name))
+            return cls(pose, state.linear_jacobian(name), state.angular_jacobian(name))
+        if name not in frames:
+            raise UnknownNameError(
+                "frame", name, "the situation or the robot's links", [*frames, *state.links]
+            )
+        return cls(frames[name])
+
+
+class Operator(ABC):
+    """A candidate projection operator: a row of the paper's Table I.
+
+    Subclass it for an operator of your own: give :meth:`dimension`, :meth:`linearize` and
+    :meth:`coordinates`; make it a frozen dataclass, and ``clone``, ``repr``, ``==``, ``pickle``
+    and grid search work. An operator that is known by its ``A`` and ``b`` (Definition 1 of the
+    paper) returns ``Linearization(None, A, b - state.joints)``; where ``A`` is singular it
+    needs ``fusion="covariance"``.
+    """
+
+    @abstractmethod
+    def dimension(self, kinematics: Kinematics | None) -> int:
+        """D, the number of local coordinates."""
+
+    @abstractmethod
+    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        """``J``, ``M``, ``c`` at the state q_{t-1}.
+
+        Parameters
+        ----------
+        state : RobotState
+            Of any batch shape.
+        frames : mapping of str to Frame
+            Of batch shapes that broadcast with the state's.
+
+        Returns
+        -------
+        Linearization
+        """
+
+    @abstractmethod
+    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """The local coordinates X_t of a state, shape (..., D)."""
+
+    def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
+        """Where unit quaternions begin among the local coordinates; none by default."""
+        return ()
+
+    def links(self) -> tuple[str, ...]:
+        """Links of the robot whose pose is needed; none by default."""
+        return ()
+
+    def references(self) -> tuple[str, ...]:
+        """Names of frames (or links) that the coordinates refer to; none by default."""
+        return ()
+
+    @property
+    def determines_joints(self) -> bool:
+        """Whether ``J`` has full column rank, so that this operator alone fixes every joint."""
+        return False
+
+    def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """``A_t = J^+ M`` of Table I, shape (..., n_joints, D)."""
+        at = self.linearize(state, frames)
+        matrix = at.matrix
+        if matrix is None:
+            size = at.displacement.shape[-1]
+            matrix = torch.eye(size, dtype=state.joints.dtype, device=state.joints.device)
+        linear = matrix if at.jacobian is None else torch.linalg.pinv(at.jacobian) @ matrix
+        batch = torch.broadcast_shapes(state.joints.shape[:-1], linear.shape[:-2])
+        return linear.expand(*batch, *linear.shape[-2:])
+
+    def offset(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """``b_t = J^+ c + q_{t-1}`` of Table I, shape (..., n_joints)."""
+        at = self.linearize(state, frames)
+        if at.jacobian is None:
+            return at.displacement + state.joints
+        inverse = torch.linalg.pinv(at.jacobian)
+        return (inverse @ at.displacement[..., None])[..., 0] + state.joints
+
+    def local(self, demonstration: Demonstration, kinematics: Kinematics) -> Tensor:
+        """The local data set X^(j) of one demonstration.
+
+        Parameters
+        ----------
+        demonstration : Demonstration
+        kinematics : Kinematics
+            Whose joints the demonstration has.
+
+        Returns
+        -------
+        Tensor of shape (T, D)
+            Quaternions are continuous along the demonstration.
+        """
+        demonstration = demonstration.reordered(kinematics.joint_names)
+        state = kinematics.state(demonstration.joints)
+        frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
+        local = self.coordinates(state, frames)
+        if tuple(local.shape) != (len(demonstration), self.dimension(kinematics)):
+            raise ShapeError(
+                f"{self!r} has {self.dimension(kinematics)} coordinates, but its coordinates() "
+                f"gave shape {tuple(local.shape)} for {len(demonstration)} time steps"
+            )
+        for start in self.quaternion_starts(kinematics):
+            block = quaternions.continuous(local[:, start : start + 4])
+            local = torch.cat((local[:, :start], block, local[:, start + 4 :]), dim=-1)
+        return local
+
+    def check(self, kinematics: Kinematics, frames: Mapping[str, Frame]) -> None:
+        """Check that the links and frames that are needed exist.
+
+        Raises
+        ------
+        UnknownNameError
+            If one does not exist, or if a reference is both a link and a frame.
+        """
+        for link in self.links():
+            if link not in kinematics.links:
+                raise UnknownNameError("link", link, "the robot", kinematics.links)
+        for name in self.references():
+            if name not in frames and name not in kinematics.links:
+                raise UnknownNameError("frame", name, "the demonstration", frames)
+            if name in frames and name in kinematics.links:
+                raise UnknownNameError(
+                    "frame",
+                    name,
+                    "the demonstration alone, it is a link of the robot too: rename the frame",
+                    frames,
+                )

@@ -1,0 +1,48 @@
+"""Configuration-space constraints: the first row of Table I."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.operators.base import Linearization, Operator
+
+__all__ = ["Canonical"]
+
+
+@dataclass(frozen=True)
+class Canonical(Operator):
+    """The joints themselves: ``A = I``, ``b = 0``; local data are ``q_t`` (section III-C).
+
+    Examples
+    --------
+    >>> from tpgmm_torch import Canonical
+    >>> Canonical()
+    Canonical()
+    """
+
+    def dimension(self, kinematics: Kinematics | None) -> int:
+        """The number of joints."""
+        if kinematics is None:
+            raise DataError("Canonical() has as many coordinates as the robot has joints")
+        return kinematics.n_joints
+
+    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        """``q - q_{t-1} = mu - q_{t-1}``."""
+        return Linearization(None, None, -state.joints)
+
+    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """``q_t``."""
+        return state.joints
+
+    def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
+        """Those of the joint vector: tracked poses have some, robots have none."""
+        return () if kinematics is None else kinematics.quaternion_starts
+
+    @property
+    def determines_joints(self) -> bool:
+        """Always."""
+        return True

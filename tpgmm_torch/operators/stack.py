@@ -1,0 +1,117 @@
+"""Several operators as one subspace: eqs (16), (17)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.operators.base import Linearization, Operator
+
+__all__ = ["Stack"]
+
+
+@dataclass(frozen=True, init=False)
+class Stack(Operator):
+    """Operators stacked *before* the pseudo-inverse: ``[J_1; J_2] dq = [M_1 mu_1 + c_1; ...]``.
+
+    Their local coordinates stand side by side in one Gaussian, so that correlations between
+    them are learned, and they share one pseudo-inverse: with joints in common (a waist that
+    carries both arms) this differs from projecting each alone. Eq. (17) prints two block rows
+    where the Jacobian of eq. (16) has four: those of the orientations are zero.
+
+    Parameters
+    ----------
+    *operators : Operator
+        In the order of the local coordinates.
+
+    Raises
+    ------
+    DataError
+        If there is none, or one of them is not an operator.
+
+    Examples
+    --------
+    >>> from tpgmm_torch import AbsolutePosition, Stack
+    >>> Stack(AbsolutePosition("left_hand"), AbsolutePosition("right_hand"))
+    Stack(AbsolutePosition(link='left_hand'), AbsolutePosition(link='right_hand'))
+    """
+
+    operators: tuple[Operator, ...]
+
+    def __init__(self, *operators: Operator) -> None:
+        if not operators:
+            raise DataError("Stack needs at least one operator, for example Stack(Canonical())")
+        for operator in operators:
+            if not isinstance(operator, Operator):
+                raise DataError(f"Stack takes operators, got {type(operator).__name__}")
+        object.__setattr__(self, "operators", operators)
+
+    def dimension(self, kinematics: Kinematics | None) -> int:
+        """The sum of the dimensions."""
+        return sum(operator.dimension(kinematics) for operator in self.operators)
+
+    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        """Jacobians and displacements stacked, matrices on the diagonal."""
+        parts = [operator.linearize(state, frames) for operator in self.operators]
+        like, batch = state.joints, state.joints.shape[:-1]
+        identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+        jacobians, matrices, displacements = [], [], []
+        for part in parts:
+            rows = part.displacement.shape[-1]
+            jacobian = identity if part.jacobian is None else part.jacobian
+            matrix = identity.new_ones(rows).diag() if part.matrix is None else part.matrix
+            batch = torch.broadcast_shapes(
+                batch, jacobian.shape[:-2], matrix.shape[:-2], part.displacement.shape[:-1]
+            )
+            jacobians.append(jacobian)
+            matrices.append(matrix)
+            displacements.append(part.displacement)
+        rows, columns = sum(m.shape[-2] for m in matrices), sum(m.shape[-1] for m in matrices)
+        diagonal = like.new_zeros(*batch, rows, columns)
+        row = column = 0
+        for matrix in matrices:
+            m, d = matrix.shape[-2:]
+            diagonal[..., row : row + m, column : column + d] = matrix
+            row, column = row + m, column + d
+        return Linearization(
+            torch.cat([j.expand(*batch, *j.shape[-2:]) for j in jacobians], dim=-2),
+            diagonal,
+            torch.cat([c.expand(*batch, c.shape[-1]) for c in displacements], dim=-1),
+        )
+
+    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """The coordinates side by side."""
+        parts = [operator.coordinates(state, frames) for operator in self.operators]
+        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        return torch.cat([part.expand(*batch, part.shape[-1]) for part in parts], dim=-1)
+
+    def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
+        """Those of the members, shifted to their columns."""
+        starts: list[int] = []
+        column = 0
+        for operator in self.operators:
+            starts += [column + start for start in operator.quaternion_starts(kinematics)]
+            column += operator.dimension(kinematics)
+        return tuple(starts)
+
+    def links(self) -> tuple[str, ...]:
+        """All links of the members."""
+        return tuple(dict.fromkeys(name for o in self.operators for name in o.links()))
+
+    def references(self) -> tuple[str, ...]:
+        """All references of the members."""
+        return tuple(dict.fromkeys(name for o in self.operators for name in o.references()))
+
+    @property
+    def determines_joints(self) -> bool:
+        """If one of the members does."""
+        return any(operator.determines_joints for operator in self.operators)
+
+    def __repr__(self) -> str:
+        return f"Stack({', '.join(map(repr, self.operators))})"

@@ -1,0 +1,169 @@
+"""Pictures of models and reproductions, in the manner of the paper's figures 3 to 6."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from torch import Tensor
+
+from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.trajectories import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["figure", "plot_candidates", "plot_components", "plot_local", "shade"]
+
+DEMONSTRATION, REPRODUCTION = "0.15", "tab:red"
+COMPONENT = "tab:green"
+OPERATORS = ("tab:red", "tab:green", "tab:blue", "tab:orange", "tab:purple")
+
+
+def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Figure:
+    """A new figure of panels one above the other with a common time axis.
+
+    It belongs to no window, so it works without a display and needs no closing.
+
+    Raises
+    ------
+    DependencyError
+        If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise DependencyError(
+            "pictures need matplotlib: pip install 'tpgmm-torch[plot]'"
+        ) from None
+    drawing = Figure(figsize=(width, height * rows + 0.9), layout="constrained")
+    axes = drawing.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    axes[-1].set_xlabel("time [s]")
+    drawing.suptitle(title, fontsize="medium")
+    return drawing
+
+
+def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
+    """Mark phases of the skill: a grey band and its name for each span of time [s]."""
+    for name, (start, end) in spans.items():
+        axes.axvspan(start, end, color="0.9", zorder=0, linewidth=0)
+        axes.annotate(
+            name,
+            ((start + end) / 2, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, -2),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize="x-small",
+            color="0.4",
+        )
+
+
+def plot_components(
+    axes: Axes, model: TaskParameterizedGMM, operator: int, column: int
+) -> None:
+    """Draw the components over time and one coordinate: contours of one standard deviation.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    model : TaskParameterizedGMM
+        Fitted.
+    operator : int
+        Index j of the operator.
+    column : int
+        Index of the local coordinate, time not counted.
+    """
+    from matplotlib.patches import Ellipse
+
+    plane = [0, 1 + column]
+    means = _array(model.means_[operator][:, plane])
+    covariances = _array(model.covariances_[operator][:, plane][:, :, plane])
+    for mean, covariance in zip(means, covariances, strict=True):
+        variances, directions = np.linalg.eigh(covariance)
+        angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+        small, large = 2 * np.sqrt(variances.clip(min=0))
+        axes.add_patch(
+            Ellipse(mean, large, small, angle=angle, color=COMPONENT, alpha=0.35, zorder=3)
+        )
+
+
+def plot_local(
+    axes: Axes,
+    model: TaskParameterizedGMM,
+    operator: int,
+    column: int,
+    demonstrations: Sequence[Demonstration] = (),
+    reproductions: Sequence[tuple[Trajectory, Mapping[str, Frame], Mapping[str, Any]]] = (),
+) -> None:
+    """Draw one local coordinate over time: demonstrations, components, reproductions.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    model : TaskParameterizedGMM
+        Fitted; its operators define the coordinates.
+    operator, column : int
+        Which operator, and which of its coordinates.
+    demonstrations : sequence of Demonstration
+        Black.
+    reproductions : sequence of (Trajectory, frames, style)
+        Red; ``style`` is passed to ``Axes.plot``. Trajectories may come from other models.
+    """
+    chosen = model.operators_[operator]
+    shown = [
+        (d.time, chosen.local(d, model.kinematics_), {"color": DEMONSTRATION, "linewidth": 0.7})
+        for d in demonstrations
+    ]
+    for trajectory, frames, style in reproductions:
+        motion = Demonstration(trajectory.time, trajectory.joints, frames)
+        look = {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, **style}
+        shown.append((motion.time, chosen.local(motion, model.kinematics_), look))
+    starts = chosen.quaternion_starts(model.kinematics_)
+    blocks = [slice(start, start + 4) for start in starts if start <= column < start + 4]
+    for time, local, style in shown:
+        sign = 1.0
+        if blocks:
+            expected = model._regression().expected(operator, time.to(local))
+            sign = 1.0 if (local[:, blocks[0]] * expected[:, blocks[0]]).sum() >= 0 else -1.0
+        axes.plot(_array(time), _array(sign * local[:, column]), **style)
+    plot_components(axes, model, operator, column)
+
+
+def plot_candidates(
+    axes: Axes, trajectory: Trajectory, joint: str, labels: Sequence[str] = ()
+) -> None:
+    """Figure 6: each operator's estimate of one joint, with its envelope, and the result.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    trajectory : Trajectory
+        With candidates.
+    joint : str
+        Name of the joint.
+    labels : sequence of str
+        Names of the operators.
+    """
+    column = trajectory.joint_names.index(joint)
+    time = _array(trajectory.time)
+    for j, candidate in enumerate(trajectory.candidates):
+        mean = _array(candidate.mean[:, column])
+        spread = np.sqrt(_array(candidate.covariance[:, column, column]).clip(min=0))
+        color = OPERATORS[j % len(OPERATORS)]
+        label = labels[j] if j < len(labels) else f"operator {j + 1}"
+        axes.fill_between(
+            time, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0
+        )
+        axes.plot(time, mean, color=color, linewidth=1.6, label=label)
+    axes.plot(time, _array(trajectory.joints[:, column]), "k", linewidth=1.2, label="TP-GMM")
+    axes.set_ylabel(f"{joint} [rad]")
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()

@@ -1,0 +1,347 @@
+"""Unit quaternions: the algebra of the paper's appendix.
+
+Quaternions are ``(w, x, y, z)`` in the last dimension, of unit norm, multiplied by the
+Hamilton product; ``product(a, b)`` is the rotation ``b`` followed by the rotation ``a``,
+both in the fixed (world) frame. ``eps`` and ``-eps`` are one rotation. All functions take
+any leading batch dimensions, broadcast, and are differentiable.
+
+The paper (Silvério et al., Humanoids 2018) writes ``H+`` and ``Hbar`` for the quaternion
+matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; the lower
+three rows of ``Hbar``, ``Hbar*`` of eq. (11), are :func:`vector_matrix`.
+"""
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError, ShapeError
+
+__all__ = [
+    "conjugate",
+    "continuous",
+    "exp",
+    "from_matrix",
+    "identity",
+    "left_matrix",
+    "log",
+    "match_hemisphere",
+    "normalize",
+    "product",
+    "right_matrix",
+    "rotate",
+    "slerp",
+    "to_matrix",
+    "vector_matrix",
+]
+
+
+def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
+    """The quaternion of no rotation, ``(1, 0, 0, 0)``.
+
+    Parameters
+    ----------
+    dtype : torch.dtype, default=torch.float64
+    device : torch.device or str, default="cpu"
+
+    Returns
+    -------
+    Tensor of shape (4,)
+    """
+    return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device)
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product ``a * b`` (eq. 18).
+
+    Parameters
+    ----------
+    a, b : Tensor of shape (..., 4)
+        Quaternions (w, x, y, z).
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+    """
+    w1, x1, y1, z1 = a.unbind(-1)
+    w2, x2, y2, z2 = b.unbind(-1)
+    return torch.stack(
+        (
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        ),
+        dim=-1,
+    )
+
+
+def conjugate(q: Tensor) -> Tensor:
+    """The conjugate ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+    """
+    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+
+
+def left_matrix(q: Tensor) -> Tensor:
+    """``H+(q)`` of eq. (20): ``product(q, b) == left_matrix(q) @ b``.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4, 4)
+    """
+    w, x, y, z = q.unbind(-1)
+    rows = (w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w)
+    return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+
+
+def right_matrix(q: Tensor) -> Tensor:
+    """``Hbar(q)`` of eq. (20): ``product(a, q) == right_matrix(q) @ a``.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4, 4)
+    """
+    w, x, y, z = q.unbind(-1)
+    rows = (w, -x, -y, -z, x, w, z, -y, y, -z, w, x, z, y, -x, w)
+    return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+
+
+def vector_matrix(q: Tensor) -> Tensor:
+    """``Hbar*(q)`` of eq. (11): the lower three rows of :func:`right_matrix`.
+
+    ``vector_matrix(q) @ a`` is the vector part of ``a * q``.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 3, 4)
+    """
+    w, x, y, z = q.unbind(-1)
+    rows = (x, w, z, -y, y, -z, w, x, z, y, -x, w)
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 4))
+
+
+def normalize(q: Tensor) -> Tensor:
+    """Scale to unit norm.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+
+    Raises
+    ------
+    DataError
+        If a quaternion is zero or not finite, so that it has no direction.
+    """
+    norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+    if not bool(((norm > 0) & torch.isfinite(norm)).all()):
+        raise DataError("a quaternion is zero or not finite: it cannot be brought to unit norm")
+    return q / norm
+
+
+def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:
+    """Choose the sign of each quaternion so that it lies on the side of ``reference``.
+
+    Parameters
+    ----------
+    q, reference : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+        ``q`` or ``-q``, whichever has a non-negative inner product with ``reference``.
+    """
+    inner = (q * reference).sum(-1, keepdim=True)
+    return torch.where(inner < 0, -q, q)
+
+
+def continuous(q: Tensor, dim: int = -2) -> Tensor:
+    """Remove the sign jumps along a sequence; the first quaternion keeps its sign.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., T, 4)
+        A sequence of unit quaternions along ``dim``.
+    dim : int, default=-2
+        The dimension of time.
+
+    Returns
+    -------
+    Tensor of the shape of ``q``
+        The same rotations, each in the hemisphere of its predecessor.
+    """
+    q = q.movedim(dim, -2)
+    if q.shape[-2] > 1:
+        inner = (q[..., 1:, :] * q[..., :-1, :]).sum(-1, keepdim=True)
+        flips = torch.where(inner < 0, -torch.ones_like(inner), torch.ones_like(inner))
+        signs = torch.cat((torch.ones_like(flips[..., :1, :]), flips.cumprod(dim=-2)), dim=-2)
+        q = q * signs
+    return q.movedim(-2, dim)
+
+
+def exp(rotation_vector: Tensor) -> Tensor:
+    """Unit quaternion of a rotation vector (axis times angle, rad).
+
+    Parameters
+    ----------
+    rotation_vector : Tensor of shape (..., 3)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+    """
+    square = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
+    small = square < 1e-12
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    # sin(angle / 2) / angle and cos(angle / 2), with their series where the angle vanishes
+    scale = torch.where(small, 0.5 - square / 48.0, torch.sin(0.5 * angle) / angle)
+    real = torch.where(small, 1.0 - square / 8.0, torch.cos(0.5 * angle))
+    return torch.cat((real, scale * rotation_vector), dim=-1)
+
+
+def log(q: Tensor) -> Tensor:
+    """Rotation vector (axis times angle in [0, pi], rad) of a unit quaternion.
+
+    ``q`` and ``-q`` give the same vector, the shorter of the two ways; at half a turn, where
+    both are equally long, opposite ones.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 3)
+    """
+    q = torch.where(q[..., :1] < 0, -q, q)
+    real, vector = q[..., :1], q[..., 1:]
+    square = (vector * vector).sum(-1, keepdim=True)
+    small = square < 1e-12
+    sine = torch.where(small, torch.ones_like(square), square).sqrt()
+    # angle / sin(angle / 2), with its series where the angle vanishes
+    scale = torch.where(small, 2.0 + square / 3.0, 2.0 * torch.atan2(sine, real) / sine)
+    return scale * vector
+
+
+def slerp(a: Tensor, b: Tensor, fraction: Tensor | float) -> Tensor:
+    """Interpolate along the shorter great arc (spherical linear interpolation).
+
+    Parameters
+    ----------
+    a, b : Tensor of shape (..., 4)
+        Rotations at fraction 0 and 1.
+    fraction : Tensor of shape (...) or float
+        Where between them.
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+        In the hemisphere of ``a``.
+    """
+    step = log(product(match_hemisphere(b, a), conjugate(a)))
+    fraction = torch.as_tensor(fraction, dtype=step.dtype, device=step.device)
+    return product(exp(fraction[..., None] * step), a)
+
+
+def rotate(q: Tensor, vector: Tensor) -> Tensor:
+    """Rotate vectors: ``R(q) v``.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+        Unit quaternions.
+    vector : Tensor of shape (..., 3)
+
+    Returns
+    -------
+    Tensor of shape (..., 3)
+    """
+    real, axis = q[..., :1], q[..., 1:]
+    axis, vector = torch.broadcast_tensors(axis, vector)
+    twice = 2.0 * torch.linalg.cross(axis, vector)
+    return vector + real * twice + torch.linalg.cross(axis, twice)
+
+
+def to_matrix(q: Tensor) -> Tensor:
+    """Rotation matrices of unit quaternions.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 3, 3)
+    """
+    w, x, y, z = q.unbind(-1)
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx)
+    return torch.stack((*rows, 1 - xx - yy), dim=-1).unflatten(-1, (3, 3))
+
+
+def from_matrix(matrix: Tensor) -> Tensor:
+    """Unit quaternions of rotation matrices, real part non-negative.
+
+    Of the four textbook formulas the one with the largest divisor is taken, so the result
+    is exact to rounding at every angle, half turns included.
+
+    Parameters
+    ----------
+    matrix : Tensor of shape (..., 3, 3)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+
+    Raises
+    ------
+    ShapeError
+        If the last two dimensions are not 3 x 3.
+    """
+    if matrix.shape[-2:] != (3, 3):
+        raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    # column i of the symmetric matrix 4 q q^T, for q_i the largest entry
+    ww4 = 1 + xx + yy + zz
+    wx4, wy4, wz4 = (
+        m[..., 2, 1] - m[..., 1, 2],
+        m[..., 0, 2] - m[..., 2, 0],
+        m[..., 1, 0] - m[..., 0, 1],
+    )
+    xy4, xz4, yz4 = (
+        m[..., 1, 0] + m[..., 0, 1],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 2, 1] + m[..., 1, 2],
+    )
+    xx4, yy4, zz4 = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
+    rows = (ww4, wx4, wy4, wz4, wx4, xx4, xy4, xz4, wy4, xy4, yy4, yz4, wz4, xz4, yz4, zz4)
+    outer = torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+    largest = torch.stack((ww4, xx4, yy4, zz4), dim=-1).argmax(dim=-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    q = outer.gather(-2, index).squeeze(-2)
+    q = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+    return torch.where(q[..., :1] < 0, -q, q)

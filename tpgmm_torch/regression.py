@@ -1,0 +1,311 @@
+"""Gaussian mixture regression in joint space: Algorithm 1's movement synthesis.
+
+Every component of every operator is first conditioned on time, which commutes with the affine
+map (1) and with the product (2) and does not depend on the robot; what is left to do at each
+tick is to linearise the operators at q_{t-1}, to project the conditionals, to fuse them, and to
+mix the components (DESIGN 4.2, 4.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.operators import Linearization, Operator
+from tpgmm_torch.trajectories import Candidate
+
+__all__ = ["Estimate", "LocalMixture", "Regression"]
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """The joint references of one control tick.
+
+    Parameters
+    ----------
+    joints : Tensor of shape (..., n_joints)
+        Mean of the fused mixture, the reference q_hat_t.
+    covariance : Tensor of shape (..., n_joints, n_joints)
+    activation : Tensor of shape (..., K)
+        Mixing weights h_i of the components.
+    candidates : tuple of Candidate
+        Each operator's own estimate; empty unless asked for.
+    """
+
+    joints: Tensor
+    covariance: Tensor
+    activation: Tensor
+    candidates: tuple[Candidate, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMixture:
+    """The K local Gaussians of one operator, conditioned on time.
+
+    Parameters
+    ----------
+    mean, gain : Tensor of shape (K, D)
+        ``E[x | t] = mean + gain (t - time_mean)``.
+    covariance : Tensor of shape (K, D, D)
+        Of the local coordinates given time.
+    time_mean, time_variance : Tensor of shape (K,)
+        The components' time marginal [s], [s^2].
+    """
+
+    mean: Tensor
+    gain: Tensor
+    covariance: Tensor
+    time_mean: Tensor
+    time_variance: Tensor
+
+    @classmethod
+    def of(cls, means: Tensor, covariances: Tensor) -> LocalMixture:
+        """Condition on the first coordinate: shapes (K, 1 + D) and (K, 1 + D, 1 + D)."""
+        gain, covariance = gaussians.condition(means, covariances, 1)
+        return cls(means[:, 1:], gain[..., 0], covariance, means[:, 0], covariances[:, 0, 0])
+
+    def select(self, components: Tensor) -> LocalMixture:
+        """Only some of the components."""
+        return LocalMixture(*(getattr(self, name)[components] for name in self.__annotations__))
+
+    def at(self, time: Tensor) -> Tensor:
+        """Conditional means at times of shape (...): a tensor of shape (..., K, D)."""
+        return self.mean + self.gain * (time[..., None] - self.time_mean)[..., None]
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """A fitted mixture, ready to be asked for joint references.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    operators : sequence of Operator
+    mixtures : sequence of LocalMixture
+        One per operator.
+    log_weights : Tensor of shape (K,)
+        Logarithms of the mixing coefficients pi_i.
+    fusion : {"information", "covariance"}
+    activation : {"time", "product"}
+    epsilon : float
+        Added to the diagonal of projected covariances by the covariance form [rad^2].
+    prior_std : float
+        Standard deviation of the prior N(q_{t-1}, .) that closes the information form where
+        no operator determines every joint [rad].
+    negligible : float
+        Components with a smaller weight are left out; 0 keeps all.
+    """
+
+    kinematics: Kinematics
+    operators: Sequence[Operator]
+    mixtures: Sequence[LocalMixture]
+    log_weights: Tensor
+    fusion: str = "information"
+    activation: str = "time"
+    epsilon: float = 1e-4
+    prior_std: float = 10.0
+    negligible: float = 1e-9
+
+    def step(
+        self,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        candidates: bool = False,
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """References at ``time`` (scalar or of the batch's shape) from the state q_{t-1}.
+
+        ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
+        """
+        n_components = len(self.log_weights)
+        active = torch.arange(n_components, device=time.device)
+        log_h = self._time_activation(time) if self.activation == "time" else None
+        if log_h is not None and time.ndim == 0 and self.negligible > 0:
+            active = torch.nonzero(log_h.exp() > self.negligible)[:, 0]
+            log_h = torch.log_softmax(log_h[active], dim=-1)
+        projections = [
+            self._project(operator, mixture.select(active), time, state, frames)
+            for operator, mixture in zip(self.operators, self.mixtures, strict=True)
+        ]
+        closed = projections
+        if self.fusion == "covariance":
+            closed = [p.in_joint_space(self.epsilon) for p in projections]
+        precision, vector, square = self._sum(closed, state)
+        if log_h is None:
+            log_h = self._product_activation(time, active, precision, vector, square)
+        step, covariances = gaussians.from_information(precision, vector[..., 0])
+        weights = log_h.exp()
+        mean, covariance = gaussians.moment_match(weights, step, covariances)
+        activation = weights
+        if len(active) < n_components:
+            activation = weights.new_zeros(*weights.shape[:-1], n_components)
+            activation[..., active] = weights
+        alone: tuple[Candidate, ...] = ()
+        if candidates:
+            alone = _candidates(projections, weights, state.joints)
+        joints = state.joints + mean
+        if bounds is not None:
+            joints = _within(joints, covariance, *bounds)
+        return Estimate(joints, covariance, activation, alone)
+
+    def expected(self, operator: int, time: Tensor) -> Tensor:
+        """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
+        weights = self._time_activation(time).exp()
+        return (weights[..., None] * self.mixtures[operator].at(time)).sum(-2)
+
+    def _time_activation(self, time: Tensor) -> Tensor:
+        """``log h_i(t)`` from pi_i N(t | mu_t, sigma_tt), the time marginal taken once."""
+        mixture = self.mixtures[0]
+        apart = (time[..., None] - mixture.time_mean).square() / mixture.time_variance
+        log_h = self.log_weights - 0.5 * (apart + mixture.time_variance.log())
+        return torch.log_softmax(log_h, dim=-1)
+
+    def _product_activation(
+        self, time: Tensor, active: Tensor, precision: Tensor, vector: Tensor, square: Tensor
+    ) -> Tensor:
+        """``log h_i(t)`` from the time marginal of the product, eq. (2)'s own.
+
+        Integrating the joints out of the product leaves a quadratic in the time t + delta:
+        the operators' time marginals plus how much they disagree about the joints.
+        """
+        factor = gaussians.cholesky(precision, "the precision of the product")
+        white = torch.linalg.solve_triangular(factor, vector, upper=False)
+        disagreement = square - white.mT @ white
+        slope, curvature = disagreement[..., 0, 1], disagreement[..., 1, 1]
+        for mixture in self.mixtures:
+            apart = time[..., None] - mixture.time_mean[active]
+            slope = slope + apart / mixture.time_variance[active]
+            curvature = curvature + 1 / mixture.time_variance[active]
+        log_h = self.log_weights[active] + 0.5 * (curvature.log() - slope.square() / curvature)
+        return torch.log_softmax(log_h, dim=-1)
+
+    def _project(
+        self,
+        operator: Operator,
+        mixture: LocalMixture,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+    ) -> _Projection:
+        at = operator.linearize(state, frames)
+        mean, gain, covariance = mixture.at(time), mixture.gain, mixture.covariance
+        matrix = None if at.matrix is None else at.matrix[..., None, :, :]
+        starts = operator.quaternion_starts(self.kinematics)
+        if starts:
+            signs = _hemispheres(mean, operator.coordinates(state, frames), starts)
+            mean, gain = signs * mean, signs * gain
+            covariance = signs[..., None] * covariance * signs[..., None, :]
+        if matrix is not None:
+            mean = (matrix @ mean[..., None])[..., 0]
+            gain = (matrix @ gain[..., None])[..., 0]
+            covariance = matrix @ covariance @ matrix.mT
+        target = mean + at.displacement[..., None, :]
+        targets = torch.stack(torch.broadcast_tensors(target, gain), dim=-1)
+        if self.activation == "time":
+            targets = targets[..., :1]
+        return _Projection(at, targets, covariance)
+
+    def _sum(
+        self, projections: Sequence[_Projection], state: RobotState
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Sums over the operators, in terms of the step ``q - q_{t-1}``."""
+        terms = [
+            gaussians.information(p.jacobian, p.targets, p.covariance) for p in projections
+        ]
+        precision, vector, square = (
+            sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True)
+        )
+        if self.fusion == "information" and not any(
+            o.determines_joints for o in self.operators
+        ):
+            like = state.joints
+            identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+            precision = precision + identity / self.prior_std**2
+        return precision, vector, square
+
+
+def _within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """The mean, given that joints beyond a bound stand at it.
+
+    The other joints take over as the Gaussian says: clipping alone would move the hands away
+    from where they are wanted. A joint that is driven over a bound by that joins the ones that
+    stand, until none is left.
+    """
+    joints, standing = mean, torch.zeros_like(mean, dtype=torch.bool)
+    while bool((beyond := (joints < lower) | (joints > upper)).any()):
+        standing = standing | beyond
+        limit = torch.minimum(torch.maximum(joints, lower), upper)
+        precision = torch.cholesky_inverse(gaussians.cholesky(covariance, "the product"))
+        # a joint that stands is known this many times better than the product knows it
+        weight = torch.where(standing, 1e10 * precision.diagonal(dim1=-2, dim2=-1), 0.0)
+        pull = (weight * (limit - mean))[..., None]
+        factor = gaussians.cholesky(precision + torch.diag_embed(weight), "the product")
+        free = mean + torch.cholesky_solve(pull, factor)[..., 0]
+        joints = torch.where(standing, limit, free)
+    return joints
+
+
+def _hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:
+    """Signs (..., K, D) that bring each mean quaternion to the side of the present one."""
+    batch = torch.broadcast_shapes(mean.shape[:-2], present.shape[:-1])
+    signs = mean.new_ones(*batch, *mean.shape[-2:])
+    for start in starts:
+        block = slice(start, start + 4)
+        inner = (mean[..., block] * present[..., None, block]).sum(-1, keepdim=True)
+        signs[..., block] = torch.where(inner < 0, -1.0, 1.0)
+    return signs
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """Components in task space: ``J (q - q_{t-1}) ~ N(targets, covariance)``.
+
+    ``targets`` (..., K, m, r) holds the mean and, for the product activation, its time
+    derivative, as columns.
+    """
+
+    at: Linearization
+    targets: Tensor
+    covariance: Tensor
+
+    @property
+    def jacobian(self) -> Tensor | None:
+        return None if self.at.jacobian is None else self.at.jacobian[..., None, :, :]
+
+    def in_joint_space(self, epsilon: float = 0.0) -> _Projection:
+        """Eq. (1): ``A mu + b - q_{t-1}`` and ``A Sigma A^T + epsilon I`` as the task."""
+        targets, covariance = self.targets, self.covariance
+        if self.jacobian is not None:
+            inverse = torch.linalg.pinv(self.jacobian)
+            targets, covariance = inverse @ targets, inverse @ covariance @ inverse.mT
+        if epsilon:
+            size = covariance.shape[-1]
+            identity = torch.eye(size, dtype=covariance.dtype, device=covariance.device)
+            covariance = covariance + epsilon * identity
+        at = Linearization(None, None, self.at.displacement)
+        return _Projection(at, targets, covariance)
+
+
+def _candidates(
+    projections: Sequence[_Projection], weights: Tensor, joints: Tensor
+) -> tuple[Candidate, ...]:
+    """Eq. (1) for each operator, mixed over the components, and each one's share."""
+    alone = [p.in_joint_space() for p in projections]
+    mixed = [gaussians.moment_match(weights, p.targets[..., 0], p.covariance) for p in alone]
+    variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in mixed])
+    # where J^+ has no row but rounding, an operator does not touch the joint and has no say
+    touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
+    precisions = touched / torch.where(touched, variances, 1.0)
+    total = precisions.sum(0)
+    shares = precisions / torch.where(total > 0, total, 1.0)
+    return tuple(
+        Candidate(joints + mean, covariance, share)
+        for (mean, covariance), share in zip(mixed, shares, strict=True)
+    )

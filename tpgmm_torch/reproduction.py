@@ -1,0 +1,185 @@
+"""What a fitted model does: predict, step, sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from sklearn.utils import check_random_state
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+from tpgmm_torch.demonstrations import Demonstration, Frame, Situation
+from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
+from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.regression import Estimate, LocalMixture, Regression
+from tpgmm_torch.rollout import rollout
+from tpgmm_torch.trajectories import Trajectory
+
+__all__ = ["Reproduction"]
+
+
+class Reproduction:
+    """The half of :class:`TaskParameterizedGMM` that needs only its fitted attributes."""
+
+    fusion: str
+    activation: str
+    epsilon: float
+    prior_std: float
+    negligible: float
+    blend: float
+    keep_limits: bool
+    weights_: Tensor
+    means_: list[Tensor]
+    covariances_: list[Tensor]
+    operators_: tuple[Operator, ...]
+    kinematics_: Kinematics
+    frame_names_: tuple[str, ...]
+    time_: Tensor
+
+    def predict(
+        self, X: Situation | Sequence[Situation], *, candidates: bool = True
+    ) -> list[Trajectory]:
+        """Reproduce the skill: closed kinematic loop, q_{t-1} is the last reference.
+
+        Parameters
+        ----------
+        X : sequence of Situation or Demonstration
+            Situations of equal time grids run as one batch. A demonstration stands for the
+            situation that it was made in.
+        candidates : bool, default=True
+            Whether to return each operator's own estimate too.
+
+        Returns
+        -------
+        list of Trajectory
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError, NotFittedError
+            If a situation does not fit the model.
+        """
+        self._check_fitted()
+        given = [X] if isinstance(X, Situation | Demonstration) else list(X)
+        situations = [self._situation(item) for item in given]
+        return rollout(self._regression(), situations, self.blend, self.keep_limits, candidates)
+
+    def step(
+        self,
+        time: float | Tensor,
+        state: RobotState | Any,
+        frames: Mapping[str, Frame] | None = None,
+        *,
+        candidates: bool = False,
+    ) -> Estimate:
+        """One control tick for a batch of robots.
+
+        Parameters
+        ----------
+        time : float or Tensor of the batch shape
+            Now [s].
+        state : RobotState, or array-like of shape (..., n_joints)
+            q_{t-1}: the last reference, or what was measured.
+        frames : mapping of str to Frame
+            Object poses now, of shapes that broadcast with the batch.
+        candidates : bool, default=False
+            Whether to return each operator's own estimate too.
+
+        Returns
+        -------
+        Estimate
+        """
+        self._check_fitted()
+        if not isinstance(state, RobotState):
+            state = self.kinematics_.state(state)
+        known = {name: frame.to(state.joints) for name, frame in (frames or {}).items()}
+        now = torch.as_tensor(time, dtype=state.joints.dtype, device=state.joints.device)
+        limits = (self.kinematics_.lower, self.kinematics_.upper) if self.keep_limits else None
+        return self._regression().step(now, state, known, candidates, limits)
+
+    def sample(
+        self,
+        situation: Situation,
+        n_samples: int = 1,
+        random_state: int | np.random.RandomState | None = None,
+    ) -> list[Trajectory]:
+        """Draw joint trajectories around the reproduction.
+
+        Each trajectory keeps one standard normal draw z over time, ``q_t = q_hat_t + L_t z``
+        with ``L_t L_t^T`` the covariance at t: at every instant its law is the reproduction's,
+        and in between it is as smooth as the model.
+
+        Parameters
+        ----------
+        situation : Situation
+        n_samples : int, default=1
+        random_state : int, RandomState instance or None
+
+        Returns
+        -------
+        list of Trajectory
+        """
+        [mean] = self.predict([situation], candidates=False)
+        draws = check_random_state(random_state).standard_normal(
+            (n_samples, mean.joints.shape[-1])
+        )
+        factor = gaussians.cholesky(mean.covariance, "the covariance of the reproduction")
+        return [
+            Trajectory(
+                mean.time,
+                self.kinematics_.retract(mean.joints + factor @ torch.from_numpy(z).to(factor)),
+                mean.covariance,
+                (),
+                mean.joint_names,
+            )
+            for z in draws
+        ]
+
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "weights_"):
+            raise NotFittedError(
+                "this TaskParameterizedGMM is not fitted yet: call fit(demonstrations), or "
+                "TaskParameterizedGMM.load(path)"
+            )
+
+    def _regression(self) -> Regression:
+        """The fitted mixture in the form that reproduction needs, prepared once."""
+        key = (
+            self.fusion,
+            self.activation,
+            self.epsilon,
+            self.prior_std,
+            self.negligible,
+        )
+        prepared = getattr(self, "_prepared", None)
+        if prepared is None or prepared[0] != key or prepared[1] is not self.means_:
+            mixtures = [
+                LocalMixture.of(mean, covariance)
+                for mean, covariance in zip(self.means_, self.covariances_, strict=True)
+            ]
+            log_weights = self.weights_.log()
+            regression = Regression(
+                self.kinematics_, self.operators_, mixtures, log_weights, *key
+            )
+            self._prepared = prepared = (key, self.means_, regression)
+        return prepared[2]
+
+    def _situation(self, given: Situation | Demonstration) -> Situation:
+        names, like = self.kinematics_.joint_names, self.time_
+        if isinstance(given, Demonstration):
+            given = Situation.of(given.reordered(names))
+        if not isinstance(given, Situation):
+            raise DataError(f"predict takes Situation objects, got {type(given).__name__}")
+        if len(given.joints) != len(names):
+            raise ShapeError(
+                f"the start posture has {len(given.joints)} joints, the model has "
+                f"{len(names)}: {names}"
+            )
+        for operator in self.operators_:
+            operator.check(self.kinematics_, given.frames)
+        time = self.time_ if given.time is None else given.time.to(like)
+        frames = {name: given.frames[name].to(like) for name in self.frame_names_}
+        return Situation(given.joints.to(like), frames, time)
