@@ -1,13 +1,15 @@
 """Random regression problems, in our terms and in the oracles'."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tests import oracles
+from tests.oracles import Array
 from tests.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
 from tpgmm_torch import (
     AbsoluteOrientation,
@@ -20,23 +22,17 @@ from tpgmm_torch import (
     RobotState,
     Stack,
 )
-from tpgmm_torch.regression import LocalMixture, Regression
+from tpgmm_torch.regression import Estimate, LocalMixture, Regression
 
 Rows = Callable[[oracles.At], list[oracles.Row]]
 
 
-def random_local(
-    rng: np.random.Generator, n_components: int, centre: np.ndarray
-) -> oracles.Local:
+def random_local(rng: np.random.Generator, n_components: int, centre: Array) -> oracles.Local:
     """Gaussians over time in [0, 2] s and coordinates around ``centre``, with correlations."""
     size = 1 + len(centre)
-    means = np.concatenate((rng.uniform(0, 2, 1), centre)) + np.concatenate(
-        (
-            rng.uniform(-0.5, 0.5, (n_components, 1)),
-            0.15 * rng.standard_normal((n_components, size - 1)),
-        ),
-        axis=1,
-    )
+    means = 0.15 * rng.standard_normal((n_components, size))
+    means[:, 0] = rng.uniform(0, 2, n_components)
+    means[:, 1:] += centre
     factors = rng.standard_normal((n_components, size, size)) / np.sqrt(size)
     scale = np.diag([0.4] + [0.2] * (size - 1))
     return oracles.Local(means, scale @ (factors @ factors.mT + 0.2 * np.eye(size)) @ scale)
@@ -64,24 +60,22 @@ class Problem:
     frames: Mapping[str, Frame]
     mixtures: list[oracles.Local]
     weights: np.ndarray
-    options: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def of(cls, case: Case, n_components: int, *batch: int, seed: int = 0) -> "Problem":
         rng = np.random.default_rng([seed, n_components])
-        centre_state, centre_frames = case.world.scene(seed=seed)
-        # a batch of states around one, so that the same mixture is near all of them
-        near = 0.05 * rng.standard_normal((*batch, case.world.kinematics.n_joints))
-        joints = case.world.kinematics.retract(centre_state.joints + torch.from_numpy(near))
+        kinematics = case.world.kinematics
+        centre, around = case.world.scene(seed=seed)
+        # states around one, so that the same mixture is near all of them
+        near = 0.05 * rng.standard_normal((*batch, kinematics.n_joints))
+        joints = kinematics.retract(centre.joints + torch.from_numpy(near))
         shift = torch.from_numpy(0.05 * rng.standard_normal((*batch, 3)))
-        pose = centre_frames[OBJECT]
+        pose = around[OBJECT]
         frames = {OBJECT: Frame(pose.position + shift, pose.orientation.expand(*batch, 4))}
-        mixtures = [
-            random_local(rng, n_components, o.coordinates(centre_state, centre_frames).numpy())
-            for o in case.operators
-        ]
+        centres = [operator.coordinates(centre, around).numpy() for operator in case.operators]
+        mixtures = [random_local(rng, n_components, at) for at in centres]
         weights = rng.dirichlet(3 * np.ones(n_components))
-        return cls(case, case.world.kinematics.state(joints), frames, mixtures, weights)
+        return cls(case, kinematics.state(joints), frames, mixtures, weights)
 
     def regression(self, **options: Any) -> Regression:
         mixtures = [local_mixture(local) for local in self.mixtures]
@@ -96,13 +90,29 @@ class Problem:
         here = {name: frame[index] for name, frame in self.frames.items()}
         return self.case.world.at(self.state[index], here)
 
-    def answer(
-        self, time: float, index: tuple[int, ...] = (), **options: Any
-    ) -> oracles.Answer:
+    def answer(self, time: float, index: tuple[int, ...] = (), **how: Any) -> oracles.Answer:
         at = self.at(index)
-        return oracles.regress(
-            time, at.joints, self.case.rows(at), self.mixtures, self.weights, **options
-        )
+        rows = self.case.rows(at)
+        return oracles.regress(time, at.joints, rows, self.mixtures, self.weights, **how)
+
+
+def times(*batch: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(9).uniform(0, 2, batch))
+
+
+def assert_close(actual: Tensor, expected: object, tolerance: float = 1e-8) -> None:
+    expected = torch.as_tensor(np.asarray(expected))
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+def assert_equal_estimates(a: Estimate, b: Estimate, tolerance: float = 1e-10) -> None:
+    assert_close(a.joints, b.joints, tolerance)
+    assert_close(a.covariance, b.covariance, tolerance)
+    assert_close(a.activation, b.activation, tolerance)
+    for one, other in zip(a.candidates, b.candidates, strict=True):
+        assert_close(one.mean, other.mean, tolerance)
+        assert_close(one.covariance, other.covariance, tolerance)
+        assert_close(one.share, other.share, tolerance)
 
 
 def pose_of(link: str, frame: str) -> Stack:

@@ -60,6 +60,8 @@ class OperatorLaws(World):
         time = torch.linspace(0, 1, length, dtype=torch.float64)
         joints = self.kinematics.retract(torch.lerp(ends[0], ends[1], time[:, None]))
         spin = quaternions.exp(time[:, None] * torch.tensor([0.0, 12.0, 3.0]).double())
+        # as trackers do, which know rotations and not the signs of quaternions
+        joints[::3], spin[::4] = self.flipped_answer(joints[::3]), -spin[::4]
         turning = Frame(time[:, None] * torch.ones(3), spin)
         names = self.kinematics.joint_names
         return Demonstration(time, joints, {OBJECT: turning, "table": Frame(np.ones(3))}, names)

@@ -121,8 +121,7 @@ def test_warping_lowers_the_spread_of_the_shake_tenfold(linear, warped):
 
 def test_events_of_the_motion_come_together(linear, warped):
     before, after = spread_of_events(linear[1]), spread_of_events(warped[1])
-    # the hand arrives and leaves at a standstill: the instant itself is not observable
-    assert all(after[name] < before[name] / 2 for name in EVENTS)
+    assert all(after[name] < before[name] / 4 for name in EVENTS)
     assert after["shake"] < 0.05 and after["rest"] < 0.05
 
 
@@ -150,7 +149,6 @@ def test_names_constant_frames_and_inputs_stay(warped):
     for aligned, own in zip(warped[1], DEMONSTRATIONS, strict=True):
         assert aligned.joint_names == own.joint_names
         assert aligned.frames["bottle"] is own.frames["bottle"]
-        assert len(own) != len(aligned) or own is not aligned
     again, _ = generate()
     for own, fresh in zip(DEMONSTRATIONS, again, strict=True):
         assert torch.equal(own.joints, fresh.joints) and own.events == fresh.events
@@ -166,7 +164,7 @@ def test_the_reference_is_recovered_exactly():
     transformer = DynamicTimeWarping(reference=2, robot=Arm())
     aligned = transformer.fit_transform(DEMONSTRATIONS[:4])
     own = DEMONSTRATIONS[2]
-    assert transformer.reference_ is not own or transformer.reference_index_ == 2
+    assert transformer.reference_ is own and transformer.reference_index_ == 2
     torch.testing.assert_close(aligned[2].joints, own.joints, rtol=0, atol=1e-11)
     assert torch.equal(aligned[2].time, own.time)
     assert dict(aligned[2].events) == pytest.approx(dict(own.events), abs=1e-9)
@@ -187,7 +185,8 @@ def test_a_time_warped_copy_is_recovered(seed, scale, rate):
     original = Demonstration(even, motion(even, start, goal))
     time, phase = random_clock(rng, NOMINAL * scale, rate)
     copy = Demonstration(time, motion(phase, start, goal))
-    transformer = DynamicTimeWarping(reference=0)
+    # copies match exactly in joint space; directions and penalty are for those that do not
+    transformer = DynamicTimeWarping(reference=0, features=["joints"], penalty=0.0)
     aligned = transformer.fit_transform([original, copy])[1]
     assert (aligned.joints - original.joints).abs().max() < 0.02
     moving = ((even > 0.8) & (even < 2.2)) | ((even > 8.4) & (even < 11.6))
@@ -206,14 +205,13 @@ def test_the_barycenter_represents_all_better_than_any_one_of_them():
     assert float(average.time_[-1]) == pytest.approx(np.mean(durations), rel=1e-9)
 
 
-def test_the_medoid_is_the_least_different_one():
+def test_the_medoid_is_the_one_in_the_middle():
     even = np.linspace(0, 1, 80)
     family = [
         Demonstration(even, np.stack((np.sin(5 * even) + c * even, even), 1))
-        for c in (0.0, 3.0, 0.2, 0.1)
+        for c in (-1.0, 1.0, 0.0, 2.0, -2.0)
     ]
-    summed = [DynamicTimeWarping(i).fit(family).distortions_.sum() for i in range(4)]
-    assert DynamicTimeWarping().fit(family).reference_index_ == np.argmin(summed) != 1
+    assert DynamicTimeWarping().fit(family).reference_index_ == 2
 
 
 def turning(time, phase):
@@ -225,21 +223,6 @@ def turning(time, phase):
     return Demonstration(
         time, poses, {"moving": Frame(place, turn)}, Poses(["hand"]).joint_names
     )
-
-
-@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
-def test_moving_frames_and_recorded_poses_turn_along_great_arcs(interpolation):
-    coarse, fine = np.linspace(0, 2, 9), np.linspace(0, 1, 65)
-    transformer = LinearTimeNormalization(
-        n_steps=65, duration=1.0, robot=Poses(["hand"]), interpolation=interpolation
-    )
-    [aligned] = transformer.fit_transform([turning(coarse, coarse / 2)])
-    exact = turning(fine, fine)
-    arcs = aligned.frames["moving"].orientation
-    torch.testing.assert_close(arcs, exact.frames["moving"].orientation, rtol=0, atol=1e-12)
-    torch.testing.assert_close(aligned.joints[:, 3:], arcs, rtol=0, atol=1e-12)
-    error = (aligned.joints[:, :3] - exact.joints[:, :3]).abs().max()
-    assert error < (1e-3 if interpolation == "cubic" else 2e-2)
 
 
 def test_the_sign_of_recorded_quaternions_does_not_matter():
@@ -261,15 +244,16 @@ def test_units_do_not_decide_but_weights_do():
     paths = [DynamicTimeWarping(0, n_steps=200).fit(x).paths_[1] for x in (family, milli)]
     torch.testing.assert_close(*paths, rtol=0, atol=1e-9)
     noise = [Demonstration(d.time, rng.normal(size=(len(d), 5)), d.frames) for d in family]
-    with_weight = DynamicTimeWarping(weights={"velocities": 0}).fit(noise)
+    with_weight = DynamicTimeWarping(weights={"directions": 0}).fit(noise)
     assert with_weight.feature_names_ == ("joints",)
 
 
 def test_features_are_named_and_constant_ones_left_out():
     transformer = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
-    assert transformer.feature_names_ == (
-        "joints", "velocities", "elbow", "elbow in bottle", "hand", "hand in bottle",
-    )  # fmt: skip
+    assert transformer.feature_names_ == ("joints", "directions", "elbow", "hand")
+    chosen = ["hand in bottle", "joints"]
+    transformer = DynamicTimeWarping(0, features=chosen, robot=Arm()).fit(DEMONSTRATIONS[:2])
+    assert transformer.feature_names_ == tuple(chosen)
     still = [
         Demonstration(d.time, d.joints * torch.tensor([0.0, 1, 0, 1, 1]), d.frames)
         for d in DEMONSTRATIONS[:2]
@@ -283,7 +267,7 @@ def test_an_open_end_matches_the_best_prefix():
     time, phase = random_clock(np.random.default_rng(5), 13.0)
     events = {name: np.interp(s, phase, time) for name, s in (("early", 6.5), ("late", 12.0))}
     whole = Demonstration(time, motion(phase, np.zeros(5), np.ones(5)), events=events)
-    open_end = DynamicTimeWarping(0, open_end=True)
+    open_end = DynamicTimeWarping(0, features=["joints"], penalty=0.0, open_end=True)
     aligned = open_end.fit_transform([short, whole])[1]
     assert (aligned.joints - short.joints).abs().max() < 0.02
     assert np.interp(open_end.paths_[1][-1], np.arange(len(phase)), phase) < 8.3
@@ -327,20 +311,6 @@ def test_n_steps_sets_the_grid(transformer):
     aligned = clone(transformer).set_params(n_steps=57).fit_transform(DEMONSTRATIONS[:2])
     assert [len(d) for d in aligned] == [57, 57]
     torch.testing.assert_close(aligned[0].time.diff(), aligned[0].time.diff()[:1].expand(56))
-
-
-@pytest.mark.parametrize("duration, expected", [("mean", 2.0), ("median", 1.5), (1.0, 1.0)])
-def test_linear_normalization_scales_durations_and_events(duration, expected):
-    family = [
-        Demonstration(
-            np.linspace(5, 5 + t, 31), np.arange(31.0)[:, None], events={"half": 5 + t / 2}
-        )
-        for t in (1.0, 1.5, 3.5)
-    ]
-    for aligned in LinearTimeNormalization(duration).fit_transform(family):
-        assert (float(aligned.time[0]), aligned.duration) == pytest.approx((0, expected))
-        assert aligned.events["half"] == pytest.approx(expected / 2)
-        assert aligned.joints[:, 0].tolist() == pytest.approx(list(range(31)))
 
 
 def test_float32_and_uneven_sampling_are_kept():
@@ -387,7 +357,7 @@ def test_errors_say_what_is_wrong_with_the_input(transformer):
     with pytest.raises(UnknownNameError, match="'a' is not in the demonstration"):
         fitted.transform([Demonstration([0.0, 1.0], np.eye(2), joint_names=("x", "y"))])
     with pytest.raises(ShapeError, match="the robot has 7"):
-        clone(transformer).set_params(robot=Poses(["hand"])).fit(
+        clone(transformer).set_params(robot=Poses(["hand"])).fit_transform(
             [Demonstration([0.0, 1.0], np.eye(2))]
         )
 
@@ -415,7 +385,8 @@ def test_nothing_to_align_by_is_an_error():
 
 
 def test_frames_unknown_to_fit_are_an_error():
-    fitted = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
+    fitted = DynamicTimeWarping(0, features=["elbow in bottle"], robot=Arm())
+    fitted.fit(DEMONSTRATIONS[:2])
     bare = Demonstration(DEMONSTRATIONS[0].time, DEMONSTRATIONS[0].joints, None, tuple("abcde"))
     with pytest.raises(UnknownNameError, match="'elbow in bottle'"):
         fitted.transform([bare])

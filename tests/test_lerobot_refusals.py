@@ -38,10 +38,6 @@ def root(tmp_path):
     return tmp_path / "set"
 
 
-def in_episodes(change):
-    return lambda root: change_table(root, EPISODES, change)
-
-
 def nulls(root):
     def change(table):
         values = table["observation.state"].to_pylist()
@@ -68,12 +64,26 @@ def copied_rows(root):
     change_table(root, DATA, change)
 
 
+STATE, POSE = "observation.state", "observation.environment_state"
+EXTRA = "data/chunk-000/file-007.parquet"
+INFO = ("meta/info.json", None, None)
+
+
+def without(name):
+    return lambda root: change_table(root, DATA, lambda table: table.drop_columns([name]))
+
+
+def listed_twice(root):
+    index = pa.array([0, 1, 1])
+    change_table(root, EPISODES, lambda table: set_column(table, "episode_index", index))
+
+
 REFUSALS = [
-    ("nan", in_data("observation.state", spoil(14, 1, np.nan)), (DATA, 1, "observation.state")),
-    ("nan", in_data("observation.state", spoil(14, 1, np.inf)), (DATA, 1, "observation.state")),
-    ("nan", in_data("observation.environment_state", spoil(14, 1, np.nan)), (DATA, 1, "observation.environment_state")),
+    ("nan", in_data(STATE, spoil(14, 1, np.nan)), (DATA, 1, STATE)),
+    ("nan", in_data(STATE, spoil(14, 1, np.inf)), (DATA, 1, STATE)),
+    ("nan", in_data(POSE, spoil(14, 1, np.nan)), (DATA, 1, POSE)),
     ("nan", in_data("timestamp", spoil(14, 0, np.nan)), (DATA, 1, "timestamp")),
-    ("nan", nulls, (DATA, 1, "observation.state")),
+    ("nan", nulls, (DATA, 1, STATE)),
     ("time", in_data("timestamp", stuck), (DATA, 1, "timestamp")),
     ("gaps", in_data("timestamp", later), (DATA, 1, "timestamp")),
     ("metadata", in_data("frame_index", spoil(14, 0, 7)), (DATA, 1, "frame_index")),
@@ -81,9 +91,9 @@ REFUSALS = [
     ("metadata", lambda r: change_table(r, DATA, lambda t: t.slice(0, 35)), (DATA, 2, None)),
     ("metadata", in_data("episode_index", spoil(slice(12, 21), 0, 8)), (DATA, 8, None)),
     ("duplicates", copied_rows, (DATA, 1, None)),
-    ("duplicates", in_episodes(lambda t: set_column(t, "episode_index", pa.array([0, 1, 1]))), (None, 1, None)),
-    ("metadata", in_info(total_episodes=4), ("meta/info.json", None, None)),
-    ("metadata", in_info(total_frames=35), ("meta/info.json", None, None)),
+    ("duplicates", listed_twice, (None, 1, None)),
+    ("metadata", in_info(total_episodes=4), INFO),
+    ("metadata", in_info(total_frames=35), INFO),
     ("metadata", in_info(fps=25), (DATA, None, "fps")),
     ("missing", lambda r: (r / DATA).unlink(), (DATA, None, None)),
     ("missing", cut_file, (DATA, None, None)),
@@ -91,15 +101,15 @@ REFUSALS = [
     ("missing", lambda r: (r / EPISODES).unlink(), ("meta/episodes", None, None)),
     ("missing", lambda r: (r / "meta/info.json").unlink(), (None, None, None)),
     ("missing", lambda r: shutil.rmtree(r), (None, None, None)),
-    ("metadata", lambda r: shutil.copy(r / DATA, r / "data/chunk-000/file-007.parquet"), ("data/chunk-000/file-007.parquet", None, None)),
-    ("", lambda r: change_table(r, DATA, lambda t: t.drop_columns(["observation.state"])), (DATA, None, "observation.state")),
-    ("", lambda r: change_table(r, DATA, lambda t: t.drop_columns(["episode_index"])), (DATA, None, "episode_index")),
-    ("", lambda r: (r / "meta/info.json").write_text("{"), ("meta/info.json", None, None)),
-    ("", in_info(codebase_version="v1.6"), ("meta/info.json", None, None)),
-    ("", in_info(fps="fast"), ("meta/info.json", None, None)),
-    ("", in_info(features={}), ("meta/info.json", None, None)),
-    ("", in_info(data_path="../{chunk_index}"), ("meta/info.json", None, None)),
-    ("", in_info(data_path="{file}"), ("meta/info.json", None, None)),
+    ("metadata", lambda r: shutil.copy(r / DATA, r / EXTRA), (EXTRA, None, None)),
+    ("", without(STATE), (DATA, None, STATE)),
+    ("", without("episode_index"), (DATA, None, "episode_index")),
+    ("", lambda r: (r / "meta/info.json").write_text("{"), INFO),
+    ("", in_info(codebase_version="v1.6"), INFO),
+    ("", in_info(fps="fast"), INFO),
+    ("", in_info(features={}), INFO),
+    ("", in_info(data_path="../{chunk_index}"), INFO),
+    ("", in_info(data_path="{file}"), INFO),
 ]  # fmt: skip
 
 
@@ -125,7 +135,7 @@ def test_declared_type_and_shape_must_be_those_of_the_data(root, tmp_path):
         plain = to_v21(root, tmp_path / name)
         change = {name: value, "names": None, "info": None}
         change_info(plain, lambda i, c=change: i["features"]["observation.state"].update(c))
-        with pytest.raises(DatasetError, match="info.json declares") as caught:
+        with pytest.raises(DatasetError, match=r"info\.json declares") as caught:
             load_lerobot(plain)
         assert caught.value.column == "observation.state"
 

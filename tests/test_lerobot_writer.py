@@ -214,6 +214,29 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
         assert_same(load_lerobot(root)[0], old[0], 1e-6)
 
 
+def test_a_failed_exchange_brings_the_old_set_back(tmp_path, monkeypatch):
+    root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
+    rename = Path.rename
+
+    def failing(path, target):
+        if path.suffix == ".partial":
+            raise OSError("no space left on device")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="no space"):
+        save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    assert_same(load_lerobot(root)[0], demonstration(0), 1e-6)
+
+
+def test_an_exchange_that_was_killed_is_pointed_out(tmp_path):
+    root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
+    root.rename(tmp_path / ".set.0123.previous")
+    with pytest.raises(DatasetError, match=r"interrupted.*\.set\.0123\.previous"):
+        load_lerobot(root)
+
+
 def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
     environment = {
         **os.environ,

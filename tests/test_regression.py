@@ -1,5 +1,6 @@
 """Regression in joint space against dense oracles that keep time inside the Gaussians."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,20 @@ import torch
 from torch import Tensor
 
 from tests import oracles
-from tests.mixtures import BOTH_HANDS, CASES, Case, Problem, local_mixture
-from tests.worlds import OBJECT, upper_body
+from tests.mixtures import (
+    BOTH_HANDS,
+    CASES,
+    Case,
+    Problem,
+    assert_close,
+    assert_equal_estimates,
+    local_mixture,
+    times,
+)
+from tests.worlds import OBJECT
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression import Estimate, LocalMixture
+from tpgmm_torch.regression import LocalMixture
 
 EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 ACTIVATIONS = pytest.mark.parametrize("activation", ["time", "product"])
@@ -26,25 +36,6 @@ def options_of(case: Case, fusion: str) -> dict[str, float]:
         return {"epsilon": EPSILON}
     closed = any(operator.determines_joints for operator in case.operators)
     return {} if closed else {"prior_std": PRIOR_STD}
-
-
-def assert_close(actual: Tensor, expected: object, tolerance: float = 1e-8) -> None:
-    expected = torch.as_tensor(np.asarray(expected))
-    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
-
-
-def assert_equal_estimates(a: Estimate, b: Estimate, tolerance: float = 1e-10) -> None:
-    assert_close(a.joints, b.joints, tolerance)
-    assert_close(a.covariance, b.covariance, tolerance)
-    assert_close(a.activation, b.activation, tolerance)
-    for one, other in zip(a.candidates, b.candidates, strict=True):
-        assert_close(one.mean, other.mean, tolerance)
-        assert_close(one.covariance, other.covariance, tolerance)
-        assert_close(one.share, other.share, tolerance)
-
-
-def times(*batch: int) -> Tensor:
-    return torch.from_numpy(np.random.default_rng(9).uniform(0, 2, batch))
 
 
 # Eqs (1), (2)
@@ -73,10 +64,12 @@ def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion
 
 
 @EVERY_CASE
-def test_the_two_activations_are_different_models(case):
+def test_the_activations_are_different_models_of_two_operators_and_one_of_one(case):
     problem = Problem.of(case, 4)
     weights = [
-        problem.regression(activation=name).step(times(), problem.state, problem.frames)
+        problem.regression(activation=name, fusion="covariance").step(
+            times(), problem.state, problem.frames
+        )
         for name in ("time", "product")
     ]
     differ = (weights[0].activation - weights[1].activation).abs().max() > 1e-3
@@ -103,7 +96,7 @@ def test_the_covariance_form_tends_to_the_information_form_as_epsilon_vanishes()
         (problem.regression(fusion="covariance", epsilon=eps).step(*now).joints - limit).norm()
         for eps in (1e-4, 1e-5, 1e-6)
     ]
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in itertools.pairwise(errors):
         assert float(fine / coarse) == pytest.approx(0.1, rel=0.05)
 
 
@@ -143,7 +136,7 @@ def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
         float((problem.regression(prior_std=std).step(*now).joints - limit).norm())
         for std in (10.0, 100.0, 1000.0)
     ]
-    for near, nearer in zip(distances, distances[1:], strict=False):
+    for near, nearer in itertools.pairwise(distances):
         assert nearer == pytest.approx(near / 100, rel=0.2)
     printed = problem.regression(fusion="covariance").step(*now).joints
     assert_close(printed, limit)
@@ -177,6 +170,14 @@ def test_leaving_components_out_moves_the_mean_by_no_more_than_their_weight(thre
     assert 0 < moved <= full.activation[dropped].sum() * apart * (1 + 1e-9)
 
 
+def test_the_most_likely_component_is_never_left_out():
+    problem = Problem.of(CASES["the paper's"], 5)
+    now = times(), problem.state, problem.frames
+    best = problem.regression().step(*now).activation.argmax()
+    one = problem.regression(negligible=0.99).step(*now).activation
+    assert torch.equal(one, torch.eye(5, dtype=torch.float64)[best])
+
+
 def test_expected_coordinates_are_those_of_regression_in_the_local_space():
     problem = Problem.of(CASES["the paper's"], 4)
     grid, local = times(6), problem.mixtures[0]
@@ -192,77 +193,6 @@ def test_expected_coordinates_are_those_of_regression_in_the_local_space():
             for m, c in zip(local.means, local.covariances, strict=True)
         ]
         assert_close(actual, np.array(marginals) / sum(marginals) @ np.array(at))
-
-
-# Candidates
-
-
-@EVERY_CASE
-@FUSIONS
-def test_candidates_are_each_operators_own_projection(case, fusion):
-    problem = Problem.of(case, 3, 2)
-    estimate = problem.regression(fusion=fusion).step(
-        times(2), problem.state, problem.frames, candidates=True
-    )
-    assert len(estimate.candidates) == len(case.operators)
-    for index in range(2):
-        time, joints = float(times(2)[index]), problem.state.joints[index].numpy()
-        activation = estimate.activation[index].numpy()
-        rows = problem.rows((index,))
-        for each, row, local in zip(estimate.candidates, rows, problem.mixtures, strict=True):
-            mean, covariance = oracles.candidate(time, joints, row, local, activation)
-            assert_close(each.mean[index], mean)
-            assert_close(each.covariance[index], covariance)
-
-
-def test_candidates_are_not_computed_unless_asked_for():
-    problem = Problem.of(CASES["the paper's"], 2)
-    assert problem.regression().step(times(), problem.state, problem.frames).candidates == ()
-
-
-def shares(case: Case, *batch: int) -> Tensor:
-    problem = Problem.of(case, 3, *batch)
-    estimate = problem.regression().step(
-        times(*batch), problem.state, problem.frames, candidates=True
-    )
-    return torch.stack([candidate.share for candidate in estimate.candidates])
-
-
-@pytest.mark.parametrize("name", ["canonical", "the paper's", "three", "poses in two frames"])
-def test_shares_are_fractions_of_the_marginal_precisions(name):
-    problem = Problem.of(CASES[name], 3, 2)
-    estimate = problem.regression().step(
-        times(2), problem.state, problem.frames, candidates=True
-    )
-    variances = [c.covariance.diagonal(dim1=-2, dim2=-1) for c in estimate.candidates]
-    fractions = shares(CASES[name], 2)
-    assert bool(((fractions >= 0) & (fractions <= 1)).all())
-    assert_close(fractions.sum(0), np.ones(problem.state.joints.shape))
-    for one, other in zip(range(len(variances)), range(1, len(variances)), strict=False):
-        ratio = variances[other] / variances[one]
-        seen = (fractions[one] > 0) & (fractions[other] > 0)
-        assert_close((fractions[one] / fractions[other])[seen], ratio[seen])
-
-
-def test_a_joint_that_an_operator_does_not_touch_gets_no_share_of_it():
-    left, both, everything = shares(CASES["three"], 2)
-    names = upper_body().joint_names
-    right_arm = [name.startswith("r_") for name in names]
-    assert bool((left[:, right_arm] == 0).all())
-    assert bool((left[:, [not right for right in right_arm]] > 0).all())
-    waist = [name.startswith("waist") for name in names]
-    # the waist carries both hands: it does not move one relative to the other
-    assert bool((both[:, waist] == 0).all())
-    assert bool((everything > 0).all())
-
-
-def test_a_joint_that_no_operator_touches_has_no_shares_and_no_nan():
-    case = CASES["two that leave joints free"]
-    alone = Case(case.world, case.operators[:1], lambda at: case.rows(at)[:1])
-    [share] = shares(alone)
-    right_arm = [name.startswith("r_") for name in upper_body().joint_names]
-    assert bool((share[right_arm] == 0).all())
-    assert bool((share[[not right for right in right_arm]] == 1).all())
 
 
 # Signs, batches, precision, gradients

@@ -121,25 +121,25 @@ class DynamicTimeWarping(Alignment):
         the others, their iterative average (DBA), or the demonstration of that index.
     features : sequence of str, optional
         Groups of features to compare, see :class:`AlignmentFeatures`: ``"joints"``,
-        ``"velocities"``, with a robot also each link, ``"left_hand"``, and each link seen
-        from each frame, ``"left_hand in bottle"``. The default is all of them.
+        ``"directions"`` of motion, with a robot also each link, ``"left_hand"``, and each
+        link seen from each frame, ``"left_hand in bottle"``. The default is all but the last.
     weights : mapping of str to float, optional
-        Relative weight of groups, 1 if not named. Units do not matter: each group is
-        divided by its standard deviation.
+        Weight of groups; by default 3 for the directions, and ``n ** -0.5`` for each of
+        the n others. Units do not matter: each group is divided by its standard deviation.
     robot : Kinematics, optional
         Gives the link positions; see :class:`Robot` and :class:`Poses`.
     window : float, optional
         Largest difference between a warp and linear time normalisation, as a fraction of
         the duration. With ``open_end``, between a warp and equal clocks, as a fraction of
         the reference's duration.
-    penalty : float, default=0.5
+    penalty : float, default=1.0
         Resistance against stretching and compressing: its square is added to the squared
         feature distance of each step that advances in one sequence alone. It stands in for
         a slope constraint and matters where little moves.
     open_end : bool, default=False
         Whether a demonstration may go on after the end of the reference: its best prefix is
         matched with the whole reference. The reference should then be one that ends early.
-    smoothing : float, default=0.1
+    smoothing : float, default=0.2
         Half the length of the kernel that smooths a warp [s].
     n_iter : int, default=10
         Largest number of rounds of ``reference="barycenter"``.
@@ -200,9 +200,9 @@ class DynamicTimeWarping(Alignment):
         weights: Mapping[str, float] | None = None,
         robot: Any = None,
         window: float | None = None,
-        penalty: float = 0.5,
+        penalty: float = 1.0,
         open_end: bool = False,
-        smoothing: float = 0.1,
+        smoothing: float = 0.2,
         n_iter: int = 10,
         n_steps: int | None = None,
         interpolation: str = "linear",
@@ -246,7 +246,7 @@ class DynamicTimeWarping(Alignment):
         self.joint_names_ = demonstrations[0].joint_names
         demonstrations = self._checked(demonstrations)
         self._features = AlignmentFeatures.fit(
-            demonstrations, self.robot, self.features, self.weights, not self.open_end
+            demonstrations, self.robot, self.features, self.weights
         )
         self.feature_names_ = self._features.names
         sequences = [self._features(one) for one in demonstrations]

@@ -133,7 +133,13 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Standardization:
-    """The units in which EM works: ``(x - shift) / scale``, per block vectors (D_j,)."""
+    """The units in which EM works: ``(x - shift) / scale``.
+
+    Parameters
+    ----------
+    shifts, scales : tuple of Tensor of shape (D_j,)
+        One per block.
+    """
 
     shifts: tuple[Tensor, ...]
     scales: tuple[Tensor, ...]
@@ -200,13 +206,18 @@ class Standardization:
         )
 
     def chunks(
-        self, points: NDArray[np.floating], n_components: int, dtype: torch.dtype
+        self,
+        points: NDArray[np.floating],
+        n_components: int,
+        dtype: torch.dtype,
+        group_size: int = 1,
     ) -> list[Chunk]:
-        """Standardise points (n_samples, n_features) in float64 and cut them into chunks."""
+        """Standardise points (n_samples, n_features) in float64; cut between groups."""
         widths = [len(shift) + 1 for shift in self.shifts]
         packed = sum(width * (width + 1) // 2 for width in widths)
         whole = CHUNK_SIZE["cpu" if self.shifts[0].device.type == "cpu" else "gpu"]
-        size = whole // min(n_components * sum(widths), packed) + 1
+        size = whole // min(n_components * sum(widths), packed) // group_size + 1
+        size *= group_size
         shift, scale = torch.cat(self.shifts)[:, None], torch.cat(self.scales)[:, None]
         chunks = []
         for start in range(0, len(points), size):

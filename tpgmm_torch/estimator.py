@@ -52,14 +52,20 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         Shape of the local covariances.
     reg_covar : float, default=1e-6
         Added to the diagonal of the covariances, relative to the variance of each coordinate.
-    tol : float, default=1e-4
+    tol : float, default=1e-3
         EM stops when the mean log-likelihood gains less.
-    max_iter : int, default=200
+    max_iter : int, default=100
         Largest number of EM iterations.
     n_init : int, default=1
         Number of starts; the most likely result is kept.
     init_params : {"time", "kmeans", "random"}, default="time"
         How EM starts; "time" cuts the time axis into equal bins.
+    responsibilities : {"auto", "instant", "point"}, default="auto"
+        What one responsibility is for. "point": every point of every demonstration, as in
+        the paper. "instant": all demonstrations at one instant together, which keeps
+        components from splitting a phase of the skill among few demonstrations and thereby
+        from a confidence that nothing supports. "auto": "instant" where the demonstrations
+        share one time grid, as after alignment, else "point".
     fusion : {"information", "covariance"}, default="information"
         Form of the product of Gaussians (DESIGN 4.2); "covariance" is eqs (1), (2) as printed.
     activation : {"time", "product"}, default="time"
@@ -135,6 +141,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "init_params": [StrOptions({"time", "kmeans", "random"})],
+        "responsibilities": [StrOptions({"auto", "instant", "point"})],
         "fusion": [StrOptions({"information", "covariance"})],
         "activation": [StrOptions({"time", "product"})],
         "epsilon": [Interval(Real, 0, None, closed="left")],
@@ -157,10 +164,11 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         *,
         covariance_type: str = "full",
         reg_covar: float = 1e-6,
-        tol: float = 1e-4,
-        max_iter: int = 200,
+        tol: float = 1e-3,
+        max_iter: int = 100,
         n_init: int = 1,
         init_params: str = "time",
+        responsibilities: str = "auto",
         fusion: str = "information",
         activation: str = "time",
         epsilon: float = 1e-4,
@@ -183,6 +191,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         self.max_iter = max_iter
         self.n_init = n_init
         self.init_params = init_params
+        self.responsibilities = responsibilities
         self.fusion = fusion
         self.activation = activation
         self.epsilon = epsilon
@@ -226,11 +235,15 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
             operator.check(kinematics, demonstrations[0].frames)
         rows = local_data(demonstrations, operators, kinematics)
         settings = self._mixture_parameters(operators, kinematics)
+        settings["group_size"] = self._group_size(demonstrations)
         if self.warm_start and hasattr(self, "mixture_"):
             mixture = self.mixture_.set_params(**settings)
         else:
             mixture = BlockGaussianMixture(**settings)
-        mixture.fit(torch.cat(rows).cpu().numpy())
+        points = (
+            torch.cat(rows) if mixture.group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
+        )
+        mixture.fit(points.cpu().numpy())
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_ = tuple(
             dict.fromkeys(
@@ -313,6 +326,16 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
             )
         default = tuple(f"joint_{index}" for index in range(demonstration.n_joints))
         return JointSpace(demonstration.joint_names or default, dtype, self.device)
+
+    def _group_size(self, demonstrations: Sequence[Demonstration]) -> int:
+        first = demonstrations[0].time
+        aligned = all(torch.equal(item.time, first) for item in demonstrations)
+        if self.responsibilities == "instant" and not aligned:
+            raise DataError(
+                "responsibilities='instant' needs demonstrations of one common time grid: "
+                "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
+            )
+        return len(demonstrations) if aligned and self.responsibilities != "point" else 1
 
     def _mixture_parameters(
         self, operators: Sequence[Operator], kinematics: Kinematics

@@ -53,7 +53,10 @@ class Expectation:
 
 
 def expect(
-    parameters: Parameters, chunks: Sequence[Chunk], labels: Tensor | None = None
+    parameters: Parameters,
+    chunks: Sequence[Chunk],
+    labels: Tensor | None = None,
+    group_size: int = 1,
 ) -> Expectation:
     """E step: one pass over the points.
 
@@ -64,11 +67,17 @@ def expect(
     chunks : sequence of tuple of Tensor of shape (D_j + 1, n)
     labels : Tensor of shape (n_samples,), optional
         Give each point wholly to one component, instead of by its responsibilities.
+    group_size : int, default=1
+        So many consecutive points have one responsibility together: that of the geometric
+        mean of their densities. The chunks end where groups end.
     """
     gathered = statistics(parameters, chunks)
     totals, start = [], 0
     for chunk in chunks:
         joint = gathered.joint(chunk)
+        if group_size > 1:
+            grouped = joint.unflatten(1, (-1, group_size))
+            grouped.copy_(grouped.mean(-1, keepdim=True))
         total = torch.logsumexp(joint, dim=0)
         if labels is None:
             responsibilities = joint.sub_(total).exp_()
@@ -149,7 +158,7 @@ class Run:
     @property
     def bound(self) -> float:
         """The last of the bounds."""
-        return self.bounds[-1] if self.bounds else self.expectation.bound
+        return self.bounds[-1]
 
     def complaints(self) -> Iterator[tuple[type[Warning], str]]:
         """What the user should know, as categories and messages of warnings."""
@@ -223,6 +232,7 @@ def ascend(
     tol: float,
     max_iter: int,
     rng: np.random.RandomState,
+    group_size: int = 1,
     verbose: int = 0,
 ) -> Run:
     """Iterate from a start that the family admits until the bound rises by less than ``tol``.
@@ -231,8 +241,27 @@ def ascend(
     likelihood beyond rounding; it is undone, and from then on the regularisation is a floor
     (see :func:`maximize`). Only a component placed anew, which happens at most K times,
     can lower it; the bounds are then counted from there.
+
+    Parameters
+    ----------
+    start : Parameters
+    chunks : sequence of tuple of Tensor of shape (D_j + 1, n)
+    family : Family
+    tol : float
+    max_iter : int
+        Most M steps, at least 1.
+    rng : RandomState
+        Chooses the places of components placed anew.
+    group_size : int, default=1
+        See :func:`expect`.
+    verbose : int, default=0
+        1 prints a line at the end, 2 also one per iteration.
     """
-    run = Run(expect(start, chunks))
+
+    def expectation(parameters: Parameters) -> Expectation:
+        return expect(parameters, chunks, group_size=group_size)
+
+    run = Run(expectation(start))
     floored, allowed = False, len(start.weights)
     for run.n_iter in range(1, max_iter + 1):
         current = run.expectation
@@ -247,19 +276,21 @@ def ascend(
             allowed -= int(dead.sum())
             run.replaced.append(_obituary(dead, current, run.n_iter))
             proposal = place_anew(proposal, dead, current, chunks, rng)
-            run.expectation = expect(proposal, chunks)
+            run.expectation = expectation(proposal)
             if run.expectation.bound < least:
                 run.bounds.clear()
             continue
-        run.expectation = expect(proposal, chunks)
+        run.expectation = expectation(proposal)
         if run.expectation.bound < least and not floored:
             floored = True
-            run.expectation = expect(maximize(current, family, floored=True), chunks)
+            run.expectation = expectation(maximize(current, family, floored=True))
         if run.expectation.bound < least:
             run.expectation = current
         if abs(change) < tol:
             run.converged = True
             break
+    if not run.bounds:  # a component was placed anew in the last iteration
+        run.bounds.append(run.expectation.bound)
     if verbose:
         end = "converged" if run.converged else "not converged"
         print(f"start: {end} in {run.n_iter} iterations, bound {run.bound:.6g}")

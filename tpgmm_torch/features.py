@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -22,6 +22,11 @@ Array = NDArray[np.floating[Any]]
 
 #: Half the length of the kernel that smooths joints before they are differentiated [s].
 VELOCITY_SMOOTHING = 0.1
+#: Below this fraction of a demonstration's root mean square speed the direction fades out.
+STANDSTILL = 0.3
+#: Weight of the directions, where those of the postures together have 1: postures differ
+#: between demonstrations at equal phase, by start and goal, and would shift a rhythm.
+DIRECTIONS_WEIGHT = 3.0
 #: Columns that vary by less than this, relative to their size, count as constant.
 CONSTANT = 1e-9
 
@@ -63,18 +68,17 @@ def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[in
 class AlignmentFeatures:
     """Groups of features, each scaled to unit variance over the demonstrations of ``fit``.
 
-    The groups are ``"joints"``, ``"velocities"`` (of the joints, per phase or per second) and
-    with a robot its link positions by link, ``"left_hand"``, and the same seen from each
-    frame, ``"left_hand in bottle"``. Quaternions among the joints count as rotation matrices,
-    which do not depend on their sign.
+    The groups are ``"joints"``, ``"directions"`` (in which the joints move: their velocity
+    over its norm, which does not depend on the speed and fades out at standstill), and with a
+    robot its link positions by link, ``"left_hand"``, and the same seen from each frame,
+    ``"left_hand in bottle"``. Quaternions among the joints count as rotation matrices, which
+    do not depend on their sign.
 
     Parameters
     ----------
     names : tuple of str
         The groups in use.
     robot : Kinematics or None
-    per_phase : bool
-        Whether velocities are divided by the duration.
     columns : mapping of str to ndarray of bool
         Which columns of each group are not constant.
     scales : mapping of str to float
@@ -83,7 +87,6 @@ class AlignmentFeatures:
 
     names: tuple[str, ...]
     robot: Any
-    per_phase: bool
     columns: Mapping[str, NDArray[np.bool_]]
     scales: Mapping[str, float]
 
@@ -94,7 +97,6 @@ class AlignmentFeatures:
         robot: Any = None,
         names: Sequence[str] | None = None,
         weights: Mapping[str, float] | None = None,
-        per_phase: bool = True,
     ) -> Self:
         """Choose and scale the groups.
 
@@ -106,10 +108,11 @@ class AlignmentFeatures:
         demonstrations : sequence of Demonstration
         robot : Kinematics, optional
         names : sequence of str, optional
-            By default all that there are.
+            By default all but those seen from a frame: away from the object that the motion
+            is about, they differ between demonstrations at equal phase.
         weights : mapping of str to float, optional
-            1 for groups that are not named; 0 leaves a group out.
-        per_phase : bool, default=True
+            0 leaves a group out. By default 3 for the directions, and for n others
+            ``n ** -0.5`` each.
 
         Returns
         -------
@@ -122,14 +125,22 @@ class AlignmentFeatures:
         DataError
             If a weight is negative, or no feature changes.
         """
-        raw = [_groups(one, robot, per_phase) for one in demonstrations]
-        wanted = _checked_names(names, raw[0], "feature")
+        links = getattr(robot, "links", ())
+        raw = [_groups(one, robot) for one in demonstrations]
+        if names is None:
+            seen = {
+                f"{link} in {frame}" for link in links for frame in demonstrations[0].frames
+            }
+            names = [name for name in raw[0] if name not in seen]
+        _check_names(names, raw[0], "feature")
         weights = dict(weights or {})
-        _checked_names(list(weights), dict.fromkeys(wanted), "weight")
+        _check_names(weights, names, "weight")
+        usual = max(1, len(set(names) - {"directions"})) ** -0.5
+        defaults = dict.fromkeys(names, usual) | {"directions": DIRECTIONS_WEIGHT}
         columns: dict[str, NDArray[np.bool_]] = {}
         scales: dict[str, float] = {}
-        for name in wanted:
-            weight = float(weights.get(name, 1.0))
+        for name in dict.fromkeys(names):
+            weight = float(weights[name] if name in weights else defaults[name])
             if not 0 <= weight < np.inf:
                 raise DataError(f"the weight of {name!r} is a number >= 0, got {weight}")
             sizes = [len(groups[name]) for groups in raw]
@@ -142,14 +153,14 @@ class AlignmentFeatures:
                 scales[name] = weight / float(np.sqrt(variance[varying].sum()))
         if not columns:
             raise DataError(
-                f"none of the features {list(wanted)} changes in the demonstrations: "
+                f"none of the features {list(names)} changes in the demonstrations: "
                 "there is nothing to align by"
             )
-        return cls(tuple(columns), robot, per_phase, columns, scales)
+        return cls(tuple(columns), robot, columns, scales)
 
     def __call__(self, demonstration: Demonstration) -> Array:
         """The features of a demonstration, shape (T, D)."""
-        groups = _groups(demonstration, self.robot, self.per_phase)
+        groups = _groups(demonstration, self.robot)
         for name in self.names:
             if name not in groups:
                 raise UnknownNameError("feature", name, "the demonstration", groups)
@@ -159,16 +170,13 @@ class AlignmentFeatures:
         )
 
 
-def _checked_names(
-    names: Sequence[str] | None, available: Mapping[str, Any], kind: str
-) -> tuple[str, ...]:
-    for name in names or ():
+def _check_names(names: Iterable[str], available: Iterable[str], kind: str) -> None:
+    for name in names:
         if name not in available:
             raise UnknownNameError(kind, name, "the features", available)
-    return tuple(dict.fromkeys(available if names is None else names))
 
 
-def _groups(demonstration: Demonstration, robot: Any, per_phase: bool) -> dict[str, Array]:
+def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     """All feature groups that a demonstration has, unscaled, each of shape (T, d)."""
     joints = demonstration.joints
     quaternion = quaternion_columns(demonstration, robot)
@@ -176,7 +184,7 @@ def _groups(demonstration: Demonstration, robot: Any, per_phase: bool) -> dict[s
     others = [column for column in range(demonstration.n_joints) if column not in inside]
     turns = [quaternions.to_matrix(joints[:, block]).flatten(1) for block in quaternion]
     values = _numpy(torch.cat((joints[:, others], *turns), dim=1))
-    groups = {"joints": values, "velocities": _velocities(values, demonstration, per_phase)}
+    groups = {"joints": values, "directions": _directions(values, demonstration)}
     if robot is None:
         return groups
     names = getattr(robot, "joint_names", None)
@@ -190,16 +198,16 @@ def _groups(demonstration: Demonstration, robot: Any, per_phase: bool) -> dict[s
     return groups
 
 
-def _velocities(values: Array, demonstration: Demonstration, per_phase: bool) -> Array:
+def _directions(values: Array, demonstration: Demonstration) -> Array:
     time = _numpy(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
     smooth = moving_average(resample(values, time, even), round(VELOCITY_SMOOTHING / step))
     rates = resample(np.gradient(smooth, step, axis=0), even, time)
-    speed = np.sqrt((rates**2).sum(axis=1, keepdims=True))
-    import os
-    still = float(os.environ.get('STILL','0.1')) * np.sqrt((speed**2).mean())
-    return np.asarray(rates / np.sqrt(speed**2 + still**2))
+    squared = (rates**2).sum(axis=1, keepdims=True)
+    norm = np.sqrt(squared + STANDSTILL**2 * squared.mean())
+    # a demonstration that stands still has no direction
+    return np.divide(rates, norm, out=np.zeros_like(rates), where=norm > 0)
 
 
 def _numpy(tensor: Tensor) -> Array:

@@ -82,7 +82,15 @@ def time_labels(times: Floats, n_components: int, rng: np.random.RandomState | N
 
 
 def kmeans_labels(points: Floats, n_components: int, rng: np.random.RandomState) -> Labels:
-    """Clusters of scikit-learn's k-means (one run) on standardised points."""
+    """Clusters of scikit-learn's k-means (one run).
+
+    Parameters
+    ----------
+    points : array of shape (n_samples, n_features)
+        Standardised.
+    n_components : int
+    rng : RandomState
+    """
     kmeans = KMeans(n_components, n_init=1, random_state=rng)
     return np.asarray(kmeans.fit(points).labels_, dtype=np.int64)
 
@@ -90,7 +98,18 @@ def kmeans_labels(points: Floats, n_components: int, rng: np.random.RandomState)
 def random_labels(
     points: Floats, distinct: Labels, n_components: int, rng: np.random.RandomState
 ) -> Labels:
-    """The nearest of ``n_components`` distinct points drawn at random."""
+    """The nearest of some distinct points drawn at random.
+
+    Parameters
+    ----------
+    points : array of shape (n_samples, n_features)
+        Standardised.
+    distinct : array of int
+        Indices of the points to draw from.
+    n_components : int
+        How many are drawn.
+    rng : RandomState
+    """
     chosen = rng.choice(distinct, n_components, replace=False)
     centers = points[chosen]
     # the squared distance less the point's own norm, which no comparison needs

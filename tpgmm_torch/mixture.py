@@ -27,6 +27,7 @@ from tpgmm_torch.block_gaussians import (
 from tpgmm_torch.exceptions import (
     DataError,
     NotFittedError,
+    ShapeError,
 )
 from tpgmm_torch.expectation_maximization import ascend
 from tpgmm_torch.initialization import GivenStart, StartDrawer
@@ -73,6 +74,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         k-means on standardised data, or the nearest of K random points.
     time_feature : int, default=0
         Column of the first block that holds time.
+    group_size : int, default=1
+        In ``fit``, so many consecutive rows share one responsibility, that of the geometric
+        mean of their densities: demonstrations of one skill at one instant, for example.
     weights_init : array-like of shape (K,), optional
         Start of the weights, in place of what ``init_params`` gives.
     means_init : sequence of array-like of shape (K, D_j), optional
@@ -138,6 +142,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "init_params": [StrOptions({"time", "kmeans", "random"})],
         "time_feature": [Interval(Integral, 0, None, closed="left")],
+        "group_size": [Interval(Integral, 1, None, closed="left")],
         "weights_init": ["array-like", None],
         "means_init": ["array-like", None],
         "covariances_init": ["array-like", None],
@@ -161,6 +166,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         n_init: int = 1,
         init_params: str = "time",
         time_feature: int = 0,
+        group_size: int = 1,
         weights_init: Any = None,
         means_init: Any = None,
         covariances_init: Any = None,
@@ -180,6 +186,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.n_init = n_init
         self.init_params = init_params
         self.time_feature = time_feature
+        self.group_size = group_size
         self.weights_init = weights_init
         self.means_init = means_init
         self.covariances_init = covariances_init
@@ -235,7 +242,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Raises
         ------
         ShapeError
-            If the blocks, or the arrays of the start, do not fit the data.
+            If the blocks, the groups, or the arrays of the start do not fit the data.
         DataError
             If there are fewer distinct points than components.
         """
@@ -244,11 +251,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             self, _on_cpu(X), dtype=[np.float64, np.float32], ensure_min_samples=2
         )
         widths = check_blocks(self.blocks, points.shape[1])
+        if len(points) % self.group_size:
+            raise ShapeError(f"{len(points)} rows are no multiple of {self.group_size=}")
         isotropic = self.covariance_type == "spherical"
         units = Standardization.of_data(points, widths, isotropic=isotropic)
         units = units.to(torch.device(self.device))
         dtype = getattr(torch, self.dtype)
-        chunks = units.chunks(points, self.n_components, dtype)
+        chunks = units.chunks(points, self.n_components, dtype, self.group_size)
         relative = self.regularization == "relative"
         family = Family.regularized(
             self.covariance_type, units, self.reg_covar, relative=relative, dtype=dtype
@@ -258,11 +267,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             known = (self.weights_, self.means_, self.covariances_)
         given = GivenStart.checked(*known, self.n_components, widths).standardize(units)
         drawer = StartDrawer(self.init_params, self.time_feature, self.n_components, chunks)
-        settings: dict[str, Any] = {
-            "tol": self.tol,
-            "max_iter": self.max_iter,
-            "verbose": self.verbose,
-        }
+        names = ("tol", "max_iter", "group_size", "verbose")
+        settings = {name: getattr(self, name) for name in names}
         rng = check_random_state(self.random_state)
         runs = []
         for attempt in range(1 if given.complete else self.n_init):
@@ -278,7 +284,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         return self
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
-        """Fit, and return the most probable component of each point, shape (n_samples,)."""
+        """Fit, and return :meth:`predict` of the same points."""
         return self.fit(X).predict(X)
 
     def score_samples(self, X: Any) -> NDArray[np.floating]:

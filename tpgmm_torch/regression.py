@@ -128,7 +128,8 @@ class Regression:
         active = torch.arange(n_components, device=time.device)
         log_h = self._time_activation(time) if self.activation == "time" else None
         if log_h is not None and time.ndim == 0 and self.negligible > 0:
-            active = torch.nonzero(log_h.exp() > self.negligible)[:, 0]
+            h = log_h.exp()
+            active = torch.nonzero(h >= h.max().clamp(max=self.negligible))[:, 0]
             log_h = torch.log_softmax(log_h[active], dim=-1)
         projections = [
             self._project(operator, mixture.select(active), time, state, frames)
@@ -239,7 +240,8 @@ def _within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> T
     stand, until none is left.
     """
     joints, standing = mean, torch.zeros_like(mean, dtype=torch.bool)
-    while bool((beyond := (joints < lower) | (joints > upper)).any()):
+    # bounds that contradict each other, of a robot that stands outside, end the loop too
+    while bool((beyond := ~standing & ((joints < lower) | (joints > upper))).any()):
         standing = standing | beyond
         limit = torch.minimum(torch.maximum(joints, lower), upper)
         precision = torch.cholesky_inverse(gaussians.cholesky(covariance, "the product"))

@@ -31,7 +31,13 @@ ROUNDING = {torch.float64: 2e-13, torch.float32: 1e-5}
 
 
 class Statistics(Protocol):
-    """Chunk by chunk: the joint log-density first, then what its responsibilities gather."""
+    """Chunk by chunk: the joint log-density first, then what its responsibilities gather.
+
+    Attributes
+    ----------
+    rounding : float
+        By how much a mean log-density may be off, relative to 1 and to itself.
+    """
 
     rounding: float
 
@@ -143,7 +149,13 @@ def sharpness(whitener: Whitener) -> float:
 
 
 def statistics(parameters: Parameters, chunks: Sequence[Chunk]) -> Statistics:
-    """The faster formulation where it is accurate enough, else the accurate one."""
+    """The faster formulation where it is accurate enough, else the accurate one.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    chunks : sequence of tuple of Tensor of shape (D_j + 1, n)
+    """
     dtype = chunks[0][0].dtype
     whitener = Whitener(parameters, dtype)
     many = sum(chunk[0].shape[1] for chunk in chunks) >= MANY_POINTS

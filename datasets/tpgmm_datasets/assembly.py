@@ -126,7 +126,7 @@ class Assembly:
             if isinstance(source, FramePose):
                 feature = self.layout.feature(source.feature)
                 places = source.select(name, feature)
-                frames[name] = source.frame(rows.values[feature.key][:, places], **rows.where)
+                frames[name] = source.frame(rows.values[feature.key], places, **rows.where)
             elif isinstance(source, Frame):
                 frames[name] = source
         return frames

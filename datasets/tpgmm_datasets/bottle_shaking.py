@@ -34,10 +34,10 @@ __all__ = ["BottleShaking", "upper_body"]
 HANDS = ("l_hand", "r_hand")
 SHOULDERS = ("l_shoulder_pitch", "r_shoulder_pitch")
 #: Where the hands hold the bottle, in its frame [m], and how they are turned there.
-GRASP_POINT = {"l_hand": (0.0, 0.07, 0.0), "r_hand": (0.0, -0.07, 0.0)}
+GRASP_POINT = {"l_hand": (0.0, 0.08, 0.0), "r_hand": (0.0, -0.08, 0.0)}
 GRASP_TURN = (math.cos(-math.pi / 4), 0.0, math.sin(-math.pi / 4), 0.0)
 #: Where the hands wait before they close, in the bottle's frame [m].
-APPROACH_POINT = {"l_hand": (-0.05, 0.13, 0.0), "r_hand": (-0.05, -0.13, 0.0)}
+APPROACH_POINT = {"l_hand": (-0.05, 0.14, 0.0), "r_hand": (-0.05, -0.14, 0.0)}
 #: Where the bottle is brought, upright [m].
 CHEST = np.array((0.24, 0.0, 0.18))
 #: Nominal seconds of each phase; 13 in all, as in the paper.
@@ -82,7 +82,7 @@ class BottleShaking:
         13 s; each phase moreover takes up to 12 % more or less of its demonstration.
     start_spread : float, default=0.05
         Start postures differ by up to this in each joint [rad].
-    chest_spread : float, default=0.01
+    chest_spread : float, default=0.005
         Where the bottle is brought differs by up to this in each direction [m].
 
     Attributes
@@ -96,7 +96,7 @@ class BottleShaking:
     cycles: float = 3.0
     stretch: float = 0.18
     start_spread: float = 0.05
-    chest_spread: float = 0.01
+    chest_spread: float = 0.005
     robot: Robot = field(default_factory=upper_body, repr=False)
 
     def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
@@ -320,7 +320,7 @@ def _least_squares(
     posture: Tensor,
     dt: float,
     damping: float = 1e-3,
-    posture_rate: float = 0.7,
+    posture_rate: float = 1.0,
 ) -> Tensor:
     """Damped least-squares step to the wanted hand poses; the null space seeks the posture."""
     state = robot.state(joints)

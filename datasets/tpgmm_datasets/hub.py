@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import re
 from pathlib import Path
@@ -36,7 +37,11 @@ def local_folder(path: str | Path) -> Path:
     if folder.is_dir():
         return folder
     if isinstance(path, Path) or not re.fullmatch(r"[\w.-]+/[\w.-]+", path):
-        raise DatasetError(f"there is no folder {folder}", check="missing")
+        kept = list(folder.parent.glob(f".{glob.escape(folder.name)}.*.previous"))
+        hint = (
+            f"; a write was interrupted, the old set is in {kept[0]}: rename it" if kept else ""
+        )
+        raise DatasetError(f"there is no folder {folder}{hint}", check="missing")
     home = os.environ.get("HF_HOME", Path.home() / ".cache" / "huggingface")
     recorded = Path(os.environ.get("HF_LEROBOT_HOME", Path(home) / "lerobot")) / path
     if (recorded / "meta" / "info.json").is_file():

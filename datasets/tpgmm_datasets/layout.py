@@ -252,8 +252,9 @@ def _episodes_v3(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         )
     for path in files:
         table = read_columns(path, root, EPISODE_COLUMNS)
+        file = str(path.relative_to(root))
         for row in table.to_pylist():
-            yield str(path.relative_to(root)), row
+            yield file, row
 
 
 def _episodes_v2(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -57,7 +57,8 @@ def open_parquet(path: Path, root: Path, columns: Sequence[str]) -> pq.ParquetFi
     """
     file = path.relative_to(root)
     with _named(file):
-        parquet = pq.ParquetFile(path, page_checksum_verification=True)
+        # buffering ahead would hold the whole file
+        parquet = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         present = parquet.schema_arrow.names
     for column in columns:
         if present.count(column) != 1:
@@ -79,7 +80,7 @@ def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
         If it is missing or unreadable, or a column is not in it.
     """
     with open_parquet(path, root, columns) as parquet, _named(path.relative_to(root)):
-        table = parquet.read(columns=list(columns)).select(list(columns))
+        table = parquet.read(columns=list(columns), use_threads=False).select(list(columns))
         table.validate(full=True)
         return table
 

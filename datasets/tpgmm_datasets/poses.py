@@ -93,17 +93,18 @@ class FramePose:
             column=self.feature,
         )
 
-    def frame(self, values: Array, **where: Any) -> Frame:
-        """The frame of selected values (T, 3 + rotation).
+    def frame(self, values: Array, places: list[int], **where: Any) -> Frame:
+        """The frame of the values at ``places`` of a feature's (T, width).
 
         Raises
         ------
         DatasetError
             If a quaternion is not of unit norm.
         """
-        moving = self.constant is None and bool((values != values[:1]).any())
-        values = values if self.constant is False or moving else values[0]
-        tensor = torch.from_numpy(values.astype(np.float64))
+        rows = values if not self.constant else values[:1]
+        rows = rows[:, places].astype(np.float64)
+        still = self.constant or (self.constant is None and bool((rows == rows[:1]).all()))
+        tensor = torch.from_numpy(rows[0] if still else rows)
         position, rotation = tensor[..., :3] * self.scale, tensor[..., 3:]
         if self.rotation in ("wxyz", "xyzw"):
             off = (torch.linalg.vector_norm(rotation, dim=-1) - 1).abs().max()

@@ -112,9 +112,23 @@ def iter_lerobot(
     trim: float | None = None,
     relax: Collection[str] = (),
 ) -> Iterator[Demonstration]:
-    """Read episode by episode, for sets larger than memory; arguments as `load_lerobot`.
+    """Read episode by episode, for sets larger than memory.
 
     The metadata are checked at the call, the rows of an episode when it comes.
+
+    Parameters
+    ----------
+    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
+        As for :func:`load_lerobot`.
+
+    Yields
+    ------
+    Demonstration
+
+    Raises
+    ------
+    DatasetError
+        As :func:`load_lerobot`.
     """
     policy = strict_policy(relax)
     layout = open_layout(local_folder(path))

@@ -15,7 +15,8 @@ from tpgmm_torch.demonstrations import Demonstration, Frame, check_demonstration
 
 __all__ = ["demonstrations_from_frame", "demonstrations_to_frame"]
 
-KINDS = ("joint", "frame", "constant frame", "event")
+FRAME_KINDS = ("frame", "constant frame")
+KINDS = ("joint", *FRAME_KINDS, "event")
 
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
@@ -112,16 +113,16 @@ def _demonstration(episode: Any, part: pd.DataFrame) -> Demonstration:
     if not names["joint"]:
         raise DatasetError(f"{where} has no joints")
     numbered = names["joint"] == list(range(len(names["joint"])))
+    poses = [(k, n.rpartition(".")[0]) for k, n in part.columns if k in FRAME_KINDS]
     frames = {}
-    for kind in ("frame", "constant frame"):
-        for name in dict.fromkeys(full.rpartition(".")[0] for full in names[kind]):
-            own = [(kind, f"{name}.{x}") for x in POSE_PARTS]
-            lacking = [full for _, full in own if full not in names[kind]]
-            if lacking:
-                raise DatasetError(f"{where} lacks {lacking} of frame {name!r}")
-            pose = torch.from_numpy(np.array(part[own], dtype=np.float64))
-            pose = pose if kind == "frame" else _only(pose, name, where)
-            frames[name] = Frame(pose[..., :3], pose[..., 3:])
+    for kind, name in dict.fromkeys(poses):
+        own = [(kind, f"{name}.{x}") for x in POSE_PARTS]
+        lacking = [full for _, full in own if full not in names[kind]]
+        if lacking:
+            raise DatasetError(f"{where} lacks {lacking} of frame {name!r}")
+        pose = torch.from_numpy(np.array(part[own], dtype=np.float64))
+        pose = pose if kind == "frame" else _only(pose, name, where)
+        frames[name] = Frame(pose[..., :3], pose[..., 3:])
     events = {
         name: float(_only(torch.from_numpy(np.array(part[[("event", name)]])), name, where))
         for name in names["event"]

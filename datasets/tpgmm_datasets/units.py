@@ -152,6 +152,17 @@ def convert(
         If a unit is unknown, or "auto" finds values that cannot be radians.
     """
     scales = [_scale(unit, column) for unit in units]
+    if "auto" in units:
+        _check_angles(values, names, units, column, where)
+    converted: Array = values.astype(np.float64)
+    if any(scale != NAMED["raw"] for scale in scales):
+        converted = converted * [s.factor for s in scales] + [s.offset for s in scales]
+    return converted
+
+
+def _check_angles(
+    values: Array, names: Sequence[str], units: Sequence[Unit], column: str, where: Any
+) -> None:
     low, high = values.min(axis=0), values.max(axis=0)
     unsure = [
         f"{name!r} (from {low[i]:.4g} to {high[i]:.4g}: {guess_unit(low[i], high[i])}?)"
@@ -166,10 +177,6 @@ def convert(
             column=column,
             **where,
         )
-    converted: Array = values.astype(np.float64)
-    if any(scale != NAMED["raw"] for scale in scales):
-        converted = converted * [s.factor for s in scales] + [s.offset for s in scales]
-    return converted
 
 
 def _scale(unit: Unit, column: str) -> Scale:

@@ -1,0 +1,90 @@
+"""Figures 3 to 6 of the paper, drawn from a run of the experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, Trajectory
+from tpgmm_torch.plotting import figure, plot_candidates, plot_local, shade
+
+__all__ = ["draw_figures"]
+
+
+def draw_figures(
+    out: Path,
+    model: TaskParameterizedGMM,
+    demonstrations: Sequence[Demonstration],
+    reproduction: Trajectory,
+    position_only: Trajectory,
+    situation: Situation,
+    spans: Mapping[str, tuple[float, float]],
+) -> list[Path]:
+    """Write ``figure_3.png`` to ``figure_6.png``.
+
+    Parameters
+    ----------
+    out : Path
+        Directory.
+    model : TaskParameterizedGMM
+        With the operators of eqs (16), (17).
+    demonstrations : sequence of Demonstration
+        Aligned.
+    reproduction, position_only : Trajectory
+        Of the model, with candidates, and of the one without orientation.
+    situation : Situation
+        In which both were made.
+    spans : mapping of str to (float, float)
+        Phases to shade [s].
+
+    Returns
+    -------
+    list of Path
+    """
+    solid = (reproduction, situation.frames, {"label": "reproduction"})
+    dashed = (position_only, situation.frames, {"linestyle": "--", "label": "position only"})
+    joints = reproduction.joint_names
+    panels = {
+        "figure_3.png": (
+            "Left hand's position seen from the bottle's initial frame",
+            0,
+            {f"$x_{i + 1}$ [m]": i for i in range(3)},
+            [solid],
+        ),
+        "figure_4.png": (
+            "Left hand's orientation seen from the bottle's initial frame",
+            0,
+            {rf"$\epsilon_{i}$": 3 + i for i in range(4)},
+            [solid, dashed],
+        ),
+        "figure_5.png": (
+            "Waist and left shoulder",
+            1,
+            {
+                f"{name} [rad]": joints.index(name)
+                for name in ("waist_pitch", "waist_yaw", "l_shoulder_pitch")
+            },
+            [solid],
+        ),
+    }
+    paths = []
+    for name, (title, operator, columns, shown) in panels.items():
+        drawing = figure(len(columns), title)
+        for axes, (label, column) in zip(drawing.axes, columns.items(), strict=True):
+            shade(axes, spans)
+            plot_local(axes, model, operator, column, demonstrations, shown)
+            axes.set_ylabel(label)
+            axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
+        drawing.axes[-1].legend(loc="lower right", fontsize="x-small")
+        paths.append(out / name)
+        drawing.savefig(paths[-1], dpi=110)
+    drawing = figure(
+        1, "Left shoulder: what each operator asks for, and the result", height=3.2
+    )
+    [axes] = drawing.axes
+    shade(axes, spans)
+    plot_candidates(axes, reproduction, "l_shoulder_pitch", ("bottle", "canonical"))
+    axes.legend(loc="lower left", fontsize="x-small")
+    paths.append(out / "figure_6.png")
+    drawing.savefig(paths[-1], dpi=110)
+    return paths
