@@ -63,10 +63,9 @@ def as_tensor(values: Any, name: str) -> Tensor:
     finite = torch.isfinite(tensor)
     if not bool(finite.all()):
         first = torch.nonzero(~finite)[0].tolist()
-        value = tensor[tuple(first)].item() if tensor.ndim else tensor.item()
         raise DataError(
             f"{name} holds {int((~finite).sum())} value(s) that are NaN or infinite, "
-            f"the first is {value} at index {first}"
+            f"the first is {tensor[tuple(first)].item()} at index {first}"
         )
     return tensor
 
@@ -111,12 +110,16 @@ class Frame:
                 f"of shape {expected}, got {tuple(orientation.shape)}"
             )
         norm = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
-        worst = (norm.detach() - 1).abs().max() if norm.numel() else torch.zeros(())
+        excess = norm.detach() - 1
+        worst = excess.abs().max() if norm.numel() else torch.zeros(())
         if worst > UNIT_NORM_TOLERANCE:
             raise DataError(
                 "a frame's orientation must be a unit quaternion (w, x, y, z): "
                 f"a norm is off by {worst:.3g}, the tolerance is {UNIT_NORM_TOLERANCE}"
             )
+        # what is of unit norm but for rounding stays as it is, bit for bit
+        rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps
+        norm = norm - torch.where(rounded, excess, 0.0)
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "orientation", orientation / norm)
 
@@ -242,9 +245,7 @@ class Demonstration(_PlainFrames):
                 f"got {tuple(joints.shape)}"
             )
         names = None if self.joint_names is None else tuple(self.joint_names)
-        if names is not None and (
-            len(names) != joints.shape[1] or len(set(names)) < len(names)
-        ):
+        if names is not None and not len(set(names)) == len(names) == joints.shape[1]:
             raise ShapeError(
                 f"joint_names needs {joints.shape[1]} different names, got {names}"
             )
@@ -289,6 +290,8 @@ class Demonstration(_PlainFrames):
 
     def reordered(self, joint_names: Sequence[str]) -> Demonstration:
         """The same demonstration with its joint columns in the order of ``joint_names``.
+
+        Other columns are left out. Without names of its own its order is trusted.
 
         Raises
         ------
@@ -357,6 +360,7 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
     Returns
     -------
     list of Demonstration
+        With their joints in the order of the first that names them.
 
     Raises
     ------
@@ -377,16 +381,20 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
             raise DataError(
                 f"expected a list of Demonstration, item {index} is {type(item).__name__}"
             )
-    first = checked[0]
+    first, names = checked[0], next((d.joint_names for d in checked if d.joint_names), ())
     for index, item in enumerate(checked):
         if item.n_joints != first.n_joints:
             raise ShapeError(
                 f"demonstration {index} has {item.n_joints} joints, the first has "
                 f"{first.n_joints}"
             )
+        if set(item.joint_names or names) != set(names):
+            raise DataError(
+                f"demonstration {index} has joint_names {item.joint_names}, another {names}"
+            )
         if set(item.frames) != set(first.frames):
             raise DataError(
                 f"demonstration {index} has frames {sorted(item.frames)}, the first has "
                 f"{sorted(first.frames)}"
             )
-    return checked
+    return [item.reordered(names) for item in checked]

@@ -9,13 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from tpgmm_torch.demonstrations import (
-    Demonstration,
-    check_demonstrations,
-)
+from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.joint_space import JointSpace
 from tpgmm_torch.kinematics import Kinematics
@@ -50,8 +48,10 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         not needed by ``Canonical()`` alone.
     covariance_type : {"full", "diag", "tied", "spherical"}, default="full"
         Shape of the local covariances.
-    reg_covar : float, default=1e-6
+    reg_covar : float, default=1e-5
         Added to the diagonal of the covariances, relative to the variance of each coordinate.
+        A smaller value is more exact where demonstrations agree, a larger one smoother where
+        operators contradict each other.
     tol : float, default=1e-3
         EM stops when the mean log-likelihood gains less.
     max_iter : int, default=100
@@ -131,6 +131,8 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
     True
     """
 
+    mixture_: BlockGaussianMixture
+
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "n_components": [Interval(Integral, 1, None, closed="left")],
         "operators": ["array-like", tuple, None],
@@ -163,7 +165,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         robot: Kinematics | None = None,
         *,
         covariance_type: str = "full",
-        reg_covar: float = 1e-6,
+        reg_covar: float = 1e-5,
         tol: float = 1e-3,
         max_iter: int = 100,
         n_init: int = 1,
@@ -236,10 +238,9 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         rows = local_data(demonstrations, operators, kinematics)
         settings = self._mixture_parameters(operators, kinematics)
         settings["group_size"] = self._group_size(demonstrations)
+        mixture = BlockGaussianMixture(**settings)
         if self.warm_start and hasattr(self, "mixture_"):
             mixture = self.mixture_.set_params(**settings)
-        else:
-            mixture = BlockGaussianMixture(**settings)
         points = (
             torch.cat(rows) if mixture.group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
         )
@@ -270,7 +271,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         lengths = [len(demonstration) for demonstration in check_demonstrations(X)]
         return float(np.average(self.score_samples(X), weights=lengths))
 
-    def score_samples(self, X: Sequence[Demonstration]) -> np.ndarray:
+    def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
         """Mean log-likelihood per time step of each demonstration, shape (n,)."""
         return np.array([self.mixture_.score(row) for row in self._rows(X)])
 
@@ -343,7 +344,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         blocks = tuple(1 + operator.dimension(kinematics) for operator in operators)
         return {"blocks": blocks} | {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
 
-    def _rows(self, X: Sequence[Demonstration]) -> list[np.ndarray]:
+    def _rows(self, X: Sequence[Demonstration]) -> list[NDArray[np.float64]]:
         self._check_fitted()
         demonstrations = check_demonstrations(X)
         for operator in self.operators_:

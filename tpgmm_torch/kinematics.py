@@ -214,7 +214,7 @@ class Kinematics(abc.ABC):
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
-        """A copy of another dtype or on another device."""
+        """The same kinematics in another dtype or on another device; itself if none changes."""
         other = copy.copy(self)
         for name in {*vars(self), "lower", "upper", "velocity"}:
             value = getattr(self, name)

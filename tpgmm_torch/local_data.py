@@ -31,7 +31,8 @@ def local_data(
     expected : callable, optional
         ``expected(j, time)`` gives the local coordinates (T, D_j) that a model expects at
         ``time``; quaternions are brought to its side. By default to that of the first
-        demonstration, compared at equal phase.
+        demonstration, compared at equal phase, and coordinates that vary by rounding alone
+        are made constant.
 
     Returns
     -------
@@ -68,7 +69,23 @@ def local_data(
                 local = _same_side(local, template, slice(start, start + 4))
             blocks += [time[:, None], local]
         rows.append(torch.cat(blocks, dim=1))
+    if expected is None:
+        rows = _without_rounding(rows, [1 + o.dimension(kinematics) for o in operators])
     return rows
+
+
+def _without_rounding(rows: Sequence[Tensor], widths: Sequence[int]) -> list[Tensor]:
+    """Make constant what varies by rounding alone: learned, it would be certain beyond reason.
+
+    Rounding is measured by the largest coordinate of the operator, from which it comes: think
+    of a quaternion that turns about one axis.
+    """
+    blocks: list[Tensor] = []
+    for block in torch.cat(rows).split(list(widths), dim=1):
+        spread = block.amax(0) - block.amin(0)
+        rounding = 100 * torch.finfo(block.dtype).eps * block[:, 1:].abs().max()
+        blocks.append(torch.where(spread <= rounding, block[0], block))
+    return list(torch.cat(blocks, dim=1).split([len(row) for row in rows]))
 
 
 def _same_side(local: Tensor, template: Tensor, block: slice) -> Tensor:

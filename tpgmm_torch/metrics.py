@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import ShapeError
@@ -133,7 +133,7 @@ def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
             f"sinusoid needs two equal vectors of 8 or more, got {t.shape}, {y.shape}"
         )
 
-    def fit(frequency: float) -> tuple[float, np.ndarray]:
+    def fit(frequency: float) -> tuple[float, NDArray[np.float64]]:
         angle = 2 * np.pi * frequency * t
         basis = np.stack((np.sin(angle), np.cos(angle), np.ones_like(t)), axis=1)
         coefficients = np.linalg.lstsq(basis, y, rcond=None)[0]

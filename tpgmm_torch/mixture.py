@@ -24,11 +24,7 @@ from tpgmm_torch.block_gaussians import (
     Whitener,
     check_blocks,
 )
-from tpgmm_torch.exceptions import (
-    DataError,
-    NotFittedError,
-    ShapeError,
-)
+from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.expectation_maximization import ascend
 from tpgmm_torch.initialization import GivenStart, StartDrawer
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.demonstrations import Demonstration, Frame
@@ -55,10 +56,10 @@ def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
             name,
             ((start + end) / 2, 1),
             xycoords=("data", "axes fraction"),
-            xytext=(0, -2),
+            xytext=(0, 1),
             textcoords="offset points",
             ha="center",
-            va="top",
+            va="bottom",
             fontsize="x-small",
             color="0.4",
         )
@@ -116,7 +117,7 @@ def plot_local(
         Red; ``style`` is passed to ``Axes.plot``. Trajectories may come from other models.
     """
     chosen = model.operators_[operator]
-    shown = [
+    shown: list[tuple[Tensor, Tensor, dict[str, Any]]] = [
         (d.time, chosen.local(d, model.kinematics_), {"color": DEMONSTRATION, "linewidth": 0.7})
         for d in demonstrations
     ]
@@ -165,5 +166,5 @@ def plot_candidates(
     axes.set_ylabel(f"{joint} [rad]")
 
 
-def _array(tensor: Tensor) -> np.ndarray:
+def _array(tensor: Tensor) -> NDArray[np.float64]:
     return tensor.detach().cpu().numpy()

@@ -87,11 +87,13 @@ def _loop(
         poses = {name: f[k] if f.position.ndim == 3 else f for name, f in frames.items()}
         bounds = None
         if keep_limits:
-            step = kinematics.velocity * (now - time[k - 1]) if k else torch.inf
-            # of the estimate, to which the fading gap comes on top
+            reach = kinematics.velocity * (now - time[k - 1]) if k else torch.inf
+            low, high = reference - reach, reference + reach
+            # a start beyond a limit comes back as fast as the speed allows; the bounds are
+            # those of the estimate, to which the fading gap comes on top
             bounds = (
-                torch.maximum(kinematics.lower, reference - step) - fade[k] * gap,
-                torch.minimum(kinematics.upper, reference + step) - fade[k] * gap,
+                torch.minimum(torch.maximum(kinematics.lower, low), high) - fade[k] * gap,
+                torch.maximum(torch.minimum(kinematics.upper, high), low) - fade[k] * gap,
             )
         estimate = regression.step(now, kinematics.state(reference), poses, candidates, bounds)
         if k == 0:

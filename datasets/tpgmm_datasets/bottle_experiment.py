@@ -8,6 +8,7 @@ paper's figures.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import shutil
 import time
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_datasets.bottle_figures import draw_figures
@@ -37,7 +39,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     Trajectory,
 )
-from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity, sinusoid
 
 __all__ = ["BottleExperiment", "bottle_operators"]
@@ -84,7 +86,7 @@ class BottleExperiment:
     """
 
     #: How many times :meth:`run` reports.
-    STAGES = 12
+    STAGES = 13
 
     out: Path
     n_components: int = 30
@@ -109,8 +111,9 @@ class BottleExperiment:
         self.report("writing and reading the LeRobot data set")
         demonstrations = self._through_files(generated)
         self.report("aligning")
-        warping = DynamicTimeWarping(robot=self.skill.robot)
-        aligned = warping.fit_transform(demonstrations)
+        # how the joints move tells the phase of this skill, not where: postures differ
+        warping = DynamicTimeWarping(features=["directions"]).fit(demonstrations)
+        aligned = warping.transform(demonstrations)
         measure = _Measure(self.skill, aligned)
         situations = self.skill.situations(self.n_situations, self.seed + 1000)
 
@@ -137,6 +140,9 @@ class BottleExperiment:
         ablated = position_only.predict(situations, candidates=False)
         rows["position only"] = measure(ablated, situations)
 
+        self.report("learning and reproducing without time warping")
+        alignment = self._alignment(demonstrations, measure, warping, reproductions)
+
         self.report("drawing")
         draw_figures(
             self.out, model, aligned, reproductions[0], ablated[0], situations[0], measure.spans
@@ -146,6 +152,7 @@ class BottleExperiment:
             "settings": self._settings(),
             "rows": rows,
             "share of information on the shoulders": measure.shares(reproductions),
+            "alignment": alignment,
             "demonstrations": measure.demonstrations(demonstrations),
             "seconds": time.perf_counter() - began,
         }
@@ -161,6 +168,29 @@ class BottleExperiment:
         return load_lerobot(
             path, robot=self.skill.robot, frames={"bottle": "observation.environment_state"}
         )
+
+    def _alignment(
+        self,
+        demonstrations: Sequence[Demonstration],
+        measure: _Measure,
+        warping: DynamicTimeWarping,
+        reproductions: Sequence[Trajectory],
+    ) -> dict[str, Any]:
+        """Dynamic time warping against linear time normalisation."""
+        linear = LinearTimeNormalization().fit(demonstrations)
+        aligned = linear.transform(demonstrations)
+        others = (
+            self._model(self.n_components)
+            .fit(aligned)
+            .predict(
+                self.skill.situations(self.n_situations, self.seed + 1000), candidates=False
+            )
+        )
+        normalised = _Measure(self.skill, aligned)
+        return {
+            "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
+            "linear": normalised.alignment(demonstrations, linear.paths_, others),
+        }
 
     def _model(self, n_components: int, orientation: bool = True) -> TaskParameterizedGMM:
         operators = bottle_operators(orientation)
@@ -184,7 +214,7 @@ class _Measure:
     """The figures of merit, against aligned demonstrations."""
 
     def __init__(self, skill: BottleShaking, aligned: Sequence[Demonstration]) -> None:
-        self.skill = skill
+        self.skill, self.aligned = skill, aligned
         self.time = aligned[0].time
         events = {
             name: float(np.mean([d.events[name] for d in aligned]))
@@ -236,7 +266,7 @@ class _Measure:
             ),
         }
 
-    def _rhythm(self, shoulders: Tensor) -> np.ndarray:
+    def _rhythm(self, shoulders: Tensor) -> NDArray[np.float64]:
         """Frequency and amplitude, the mean of both shoulders."""
         fits = [sinusoid(self.time[self.steady], side[self.steady]) for side in shoulders.T]
         return np.mean([(fit.frequency, fit.amplitude) for fit in fits], axis=0)
@@ -253,6 +283,33 @@ class _Measure:
         return {
             "task operator, two seconds before the grasp": float(task[self.grasping].mean()),
             "canonical operator, while shaking": float(canonical[self.steady].mean()),
+        }
+
+    def alignment(
+        self,
+        demonstrations: Sequence[Demonstration],
+        paths: Sequence[Tensor],
+        trajectories: Sequence[Trajectory],
+    ) -> dict[str, float]:
+        """How far apart the demonstrations shake, and the reproductions from each of them.
+
+        The true phase of a demonstration is known from its events, and ``paths`` say which
+        of its time steps stands at each instant of the common clock.
+        """
+        phases = []
+        for demonstration, path in zip(demonstrations, paths, strict=True):
+            shake, rest = (demonstration.events[name] for name in ("shake", "rest"))
+            source = path / self.skill.rate
+            done = ((source - shake) / (rest - shake)).clamp(0, 1)
+            phases.append(2 * math.pi * self.skill.cycles * done)
+        spread = torch.stack(phases)[:, self.steady].std(0)
+        shoulders = torch.stack([self.skill.shoulders(t) for t in trajectories])
+        apart = [(shoulders - self.skill.shoulders(d))[:, self.shaking] for d in self.aligned]
+        return {
+            "spread of the shaking's phase [rad]": float(spread.square().mean().sqrt()),
+            "shoulder RMSE against each demonstration [rad]": float(
+                torch.stack(apart).square().mean().sqrt()
+            ),
         }
 
     def demonstrations(self, demonstrations: Sequence[Demonstration]) -> dict[str, Any]:

@@ -1,0 +1,130 @@
+"""A group of commands whose errors are one line, and to which plugins add."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+__all__ = ["Commands"]
+
+#: Each entry point is a typer app or a function, added under its name.
+ENTRY_POINTS = "tpgmm.commands"
+#: Packages that come with the extra ``cli``.
+OPTIONAL = ("dtaidistance", "matplotlib", "pandas", "pyarrow", "pytorch_kinematics")
+
+
+class Commands(TyperGroup):
+    """Typer's group with one-line errors (exit code 2) and commands from plugins.
+
+    Attributes
+    ----------
+    debug : bool
+        Let errors through, for their traceback.
+    """
+
+    debug = False
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run with arguments and exit; as in click, ``standalone_mode=False`` returns."""
+        run = partial(super().main, args, prog_name, complete_var, False, **extra)
+        if not standalone_mode:
+            return run()
+        with _warnings_in_one_line():
+            try:
+                code = run()
+            except Exception as error:
+                message = None if self.debug else explain(error)
+                if message is None:
+                    raise
+                _say(message)
+                code = 2
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Own commands, then those of plugins."""
+        own = super().list_commands(ctx)
+        return [*own, *sorted(set(_plugins()) - set(own))]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command by name; a plugin is imported only now."""
+        own = super().get_command(ctx, cmd_name)
+        if own is not None or cmd_name not in _plugins():
+            return own
+        try:
+            return _command(cmd_name, _plugins()[cmd_name].load())
+        except Exception as error:  # whatever is wrong with it, the others must work
+            _say(
+                f"warning: the command {cmd_name!r} of a plugin cannot be loaded: "
+                f"{type(error).__name__}: {error}"
+            )
+            return None
+
+
+def explain(error: Exception) -> str | None:
+    """The message of an error that a user can mend; None for any other.
+
+    Parameters
+    ----------
+    error : Exception
+    """
+    # typer brought its own copy of click's classes with it in some releases, not in others
+    if hasattr(error, "format_message"):
+        context = getattr(error, "ctx", None)
+        hint = f" (see {context.command_path} --help)" if context else ""
+        return f"{error.format_message()}{hint}"
+    if isinstance(error, typer.Abort):
+        return "aborted"
+    if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL:
+        return f"this command needs {error.name}: pip install 'tpgmm-torch[cli]'"
+    from sklearn.utils._param_validation import InvalidParameterError
+
+    from tpgmm_torch.exceptions import TPGMMError
+
+    known = isinstance(error, TPGMMError | InvalidParameterError | OSError)
+    return str(error) if known else None
+
+
+def _say(message: str) -> None:
+    typer.echo(f"tpgmm: {' '.join(message.split())}", err=True)
+
+
+@contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    def show(message: Warning | str, *_where: Any, **_more: Any) -> None:
+        _say(f"warning: {message}")
+
+    original, warnings.showwarning = warnings.showwarning, show
+    try:
+        yield
+    finally:
+        warnings.showwarning = original
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+
+
+def _command(name: str, found: Any) -> Any:
+    if not isinstance(found, typer.Typer):
+        if not callable(found):
+            raise TypeError(f"it is {found!r}, not a typer app or a function")
+        function, found = found, typer.Typer(add_completion=False)
+        found.command(name)(function)
+    command = typer.main.get_command(found)
+    command.name = name
+    return command

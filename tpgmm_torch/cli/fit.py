@@ -1,0 +1,246 @@
+"""``tpgmm fit``: learn a model from a data set."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from tpgmm_torch.cli import options
+
+if TYPE_CHECKING:
+    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.operators import Operator
+
+__all__ = ["app"]
+
+app = typer.Typer()
+
+EXAMPLE = (
+    "Example: tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand "
+    "--frame bottle --n-components 30 --out out/model"
+)
+LEARNING, REPRODUCING = "Learning", "Reproduction (saved with the model)"
+
+
+@app.command(epilog=EXAMPLE)
+def fit(
+    dataset: options.Dataset,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the model goes.")],
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URDF",
+            rich_help_panel=options.ROBOT,
+            help="The robot's URDF file; 'upper_body' is the one that comes with the package. "
+            "Without a robot, joints alone are learned.",
+        ),
+    ] = None,
+    link: Annotated[
+        list[str] | None,
+        typer.Option(
+            rich_help_panel=options.ROBOT, help="A link of interest (a hand), repeatable."
+        ),
+    ] = None,
+    robot_joint: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="PATTERN",
+            rich_help_panel=options.ROBOT,
+            help="Joints that move, repeatable, like 'left_*'; the others stand still. "
+            "Default: all.",
+        ),
+    ] = None,
+    coordinate: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            rich_help_panel=options.ROBOT,
+            help="A value that is learned like a joint but moves no link (a gripper), "
+            "repeatable.",
+        ),
+    ] = None,
+    poses: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME",
+            rich_help_panel=options.ROBOT,
+            help="Instead of a robot: a tracked body whose pose the data set holds, "
+            "repeatable.",
+        ),
+    ] = None,
+    frame: options.Frames = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    rate: options.Rate = None,
+    alignment: options.AlignmentMethod = "dtw",
+    operator: Annotated[
+        list[str] | None,
+        typer.Option(
+            rich_help_panel=LEARNING,
+            help="What is learned together, repeatable: 'canonical' (the joints), "
+            "'position:LINK@FRAME', 'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), "
+            "without @FRAME in the base frame; FRAME may be another link; '+' stacks. "
+            "Default: the poses of all links in all frames, stacked, and canonical.",
+        ),
+    ] = None,
+    n_components: Annotated[
+        int, typer.Option(min=1, rich_help_panel=LEARNING, help="K, the number of Gaussians.")
+    ] = 10,
+    covariance_type: Annotated[
+        Literal["full", "diag", "tied", "spherical"],
+        typer.Option(rich_help_panel=LEARNING, help="Shape of the covariances."),
+    ] = "full",
+    reg_covar: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            rich_help_panel=LEARNING,
+            help="Added to the covariances' diagonal, relative to each coordinate's variance.",
+        ),
+    ] = 1e-6,
+    tol: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            rich_help_panel=LEARNING,
+            help="Stop when the mean log-likelihood gains less.",
+        ),
+    ] = 1e-3,
+    max_iter: Annotated[
+        int, typer.Option(min=1, rich_help_panel=LEARNING, help="Largest number of iterations.")
+    ] = 100,
+    n_init: Annotated[
+        int,
+        typer.Option(min=1, rich_help_panel=LEARNING, help="Starts, of which the best counts."),
+    ] = 1,
+    init_params: Annotated[
+        Literal["time", "kmeans", "random"],
+        typer.Option(rich_help_panel=LEARNING, help="How to start; 'time' cuts equal bins."),
+    ] = "time",
+    responsibilities: Annotated[
+        Literal["auto", "instant", "point"],
+        typer.Option(
+            rich_help_panel=LEARNING,
+            help="Whether a component takes all demonstrations at an instant, or each point "
+            "by itself; 'auto' is 'instant' after alignment.",
+        ),
+    ] = "auto",
+    random_state: Annotated[
+        int, typer.Option(rich_help_panel=LEARNING, help="Seed of what is random.")
+    ] = 0,
+    fusion: Annotated[
+        Literal["information", "covariance"],
+        typer.Option(
+            rich_help_panel=REPRODUCING,
+            help="Form of the product of Gaussians; 'covariance' is the paper's, as printed.",
+        ),
+    ] = "information",
+    activation: Annotated[
+        Literal["time", "product"],
+        typer.Option(rich_help_panel=REPRODUCING, help="Where mixing weights come from."),
+    ] = "time",
+    epsilon: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            rich_help_panel=REPRODUCING,
+            help="Regulariser of --fusion covariance, rad^2.",
+        ),
+    ] = 1e-4,
+    blend: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            rich_help_panel=REPRODUCING,
+            help="Seconds over which the start posture leads into the model's reference.",
+        ),
+    ] = 1.0,
+) -> None:
+    """Learn a skill from a LeRobot data set.
+
+    Episodes are aligned in time, described by operators (links seen from frames, and joints),
+    and learned as one Gaussian mixture over all of them. The model is a folder of JSON and
+    safetensors that 'tpgmm reproduce' and 'tpgmm plot' take.
+    """
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.operators.text import parse_operator
+
+    operators = [parse_operator(text) for text in operator or ()]
+    kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
+    read = options.read_demonstrations(
+        dataset, kinematics, frame, episodes, units, joints, rate
+    )
+    demonstrations = options.align(read, alignment, kinematics)
+    links = kinematics.links if kinematics is not None else ()
+    model = TaskParameterizedGMM(
+        n_components,
+        operators or default_operators(links, list(read[0].frames)),
+        kinematics,
+        covariance_type=covariance_type,
+        reg_covar=reg_covar,
+        tol=tol,
+        max_iter=max_iter,
+        n_init=n_init,
+        init_params=init_params,
+        responsibilities=responsibilities,
+        random_state=random_state,
+        fusion=fusion,
+        activation=activation,
+        epsilon=epsilon,
+        blend=blend,
+    ).fit(demonstrations)
+    model.save(out)
+    _report(model, read, demonstrations)
+    typer.echo(f"saved            {out}")
+
+
+def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
+    """All links seen from all frames (from the base without frames) as one stack; the joints.
+
+    Parameters
+    ----------
+    links, frames : sequence of str
+        Their names.
+    """
+    from tpgmm_torch.operators.text import parse_operator
+
+    references = [f"@{name}" for name in frames] or [""]
+    poses = [f"pose:{link}{reference}" for reference in references for link in links]
+    texts = [" + ".join(poses), "canonical"] if poses else ["canonical"]
+    return [parse_operator(text) for text in texts]
+
+
+def _report(
+    model: TaskParameterizedGMM,
+    read: Sequence[Demonstration],
+    aligned: Sequence[Demonstration],
+) -> None:
+    from tpgmm_torch.operators.text import format_operator
+
+    durations = [demonstration.duration for demonstration in read]
+    steps = sum(map(len, aligned))
+    kinematics = model.kinematics_
+    converged = "converged" if model.converged_ else "not converged: raise --max-iter or --tol"
+    lines = {
+        "demonstrations": f"{len(read)} of {min(durations):.2f} to {max(durations):.2f} s, "
+        f"{steps} steps after alignment",
+        "joints": f"{kinematics.n_joints}",
+        "links": ", ".join(kinematics.links) or "none",
+        "frames": ", ".join(model.frame_names_) or "none",
+    }
+    for number, operator in enumerate(model.operators_, start=1):
+        size = operator.dimension(kinematics)
+        lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"
+    lines |= {
+        "components": f"{model.n_components} ({model.covariance_type})",
+        "iterations": f"{model.n_iter_}, {converged}",
+        "log-likelihood": f"{model.score(aligned):.3f} per step",
+        "BIC": f"{model.bic(aligned):.0f}",
+    }
+    for name, value in lines.items():
+        typer.echo(f"{name:<16} {value}")

@@ -1,0 +1,268 @@
+"""Options that several commands share, and what their texts mean."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+if TYPE_CHECKING:
+    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_torch.kinematics import Kinematics
+
+__all__ = [
+    "align",
+    "parse_episodes",
+    "parse_frames",
+    "parse_units",
+    "read_demonstrations",
+    "read_robot",
+]
+
+DATA, ROBOT = "Data set", "Robot"
+ENVIRONMENT = "observation.environment_state"
+#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
+FRAME = re.compile(
+    r"(?P<name>[^=@\[\]]+)"
+    r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
+)
+
+Dataset = Annotated[str, typer.Argument(help="A LeRobot data set: its folder, or its hub id.")]
+Model = Annotated[Path, typer.Argument(metavar="DIR", help="A model that 'tpgmm fit' saved.")]
+Frames = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--frame",
+        metavar="NAME[=SOURCE]",
+        rich_help_panel=DATA,
+        help="An object's pose, repeatable: NAME (found by the names in "
+        f"{ENVIRONMENT}), NAME=FEATURE, NAME=FEATURE\\[7:14], or NAME=LINK@EVENT, where a "
+        "link of the robot is at an event. Default: all poses that the set names.",
+    ),
+]
+Episodes = Annotated[
+    str | None,
+    typer.Option(
+        metavar="0:10 | 0,3,5 | TASK",
+        rich_help_panel=DATA,
+        help="Which episodes; default all.",
+    ),
+]
+Units = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="[JOINT=]UNIT",
+        rich_help_panel=DATA,
+        help="Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them, "
+        "repeatable. Default: as the set declares.",
+    ),
+]
+Joints = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FEATURE",
+        rich_help_panel=DATA,
+        help="The feature that holds the joints; default observation.state or the like.",
+    ),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option(min=1e-3, rich_help_panel=DATA, help="Resample to so many steps per second."),
+]
+AlignmentMethod = Annotated[
+    Literal["dtw", "barycenter", "linear", "none"],
+    typer.Option(
+        rich_help_panel=DATA,
+        help="Bring episodes onto one clock: by time warping onto the most typical one, onto "
+        "their average, by stretching time, or not at all.",
+    ),
+]
+
+
+def read_demonstrations(
+    dataset: str,
+    robot: Kinematics | None,
+    frames: Sequence[str] | None,
+    episodes: str | None,
+    units: Sequence[str] | None,
+    joints: str | None,
+    rate: float | None,
+) -> list[Demonstration]:
+    """Read a data set as the options say.
+
+    Parameters
+    ----------
+    dataset, frames, episodes, units, joints, rate
+        The options.
+    robot : Kinematics or None
+        Gives the order of the joints.
+    """
+    from tpgmm_datasets import load_lerobot
+
+    return load_lerobot(
+        dataset,
+        robot=robot,
+        frames=parse_frames(frames or ()),
+        episodes=parse_episodes(episodes),
+        units=parse_units(units or ()),
+        joints=joints,
+        rate=rate,
+    )
+
+
+def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
+    """What ``load_lerobot`` takes as ``frames``; None if nothing was given.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``.
+
+    Raises
+    ------
+    DataError
+        If a text is none of these.
+    """
+    from tpgmm_datasets import FramePose, LinkPose
+    from tpgmm_torch.exceptions import DataError
+
+    frames: dict[str, Any] = {}
+    for text in texts:
+        match = FRAME.fullmatch(text)
+        if match is None:
+            raise DataError(
+                f"frame {text!r} is none of NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
+                "NAME=LINK@EVENT"
+            )
+        source, event, start = match["source"], match["event"], match["start"]
+        if event:
+            frames[match["name"]] = LinkPose(source, event)
+        elif source is None:
+            frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
+        else:
+            columns = slice(int(start), int(match["stop"])) if start else None
+            frames[match["name"]] = FramePose(source, columns)
+    return frames or None
+
+
+def parse_episodes(text: str | None) -> slice | list[int] | str | None:
+    """What ``load_lerobot`` takes as ``episodes``.
+
+    Parameters
+    ----------
+    text : str or None
+        ``"0:10"`` is a slice, ``"0,3,5"`` a list, anything else the name of a task.
+    """
+    if text is None:
+        return None
+    if re.fullmatch(r"(-?\d*):(-?\d*)", text):
+        start, stop = (int(part) if part else None for part in text.split(":"))
+        return slice(start, stop)
+    if re.fullmatch(r"\d+(,\d+)*", text):
+        return [int(part) for part in text.split(",")]
+    return text
+
+
+def parse_units(texts: Sequence[str]) -> Any:
+    """What ``load_lerobot`` takes as ``units``.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        One unit for all, or any number of ``JOINT=UNIT``.
+
+    Raises
+    ------
+    DataError
+        If both are given, or several for all.
+    """
+    from tpgmm_torch.exceptions import DataError
+
+    pairs = [text.rpartition("=") for text in texts]
+    if not pairs:
+        return "auto"
+    if len(pairs) == 1 and not pairs[0][1]:
+        return pairs[0][2]
+    if not all(name and unit for name, _, unit in pairs):
+        raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
+    return {name: unit for name, _, unit in pairs}
+
+
+def read_robot(
+    robot: str | None,
+    links: Sequence[str] | None = None,
+    joints: Sequence[str] | None = None,
+    coordinates: Sequence[str] | None = None,
+    poses: Sequence[str] | None = None,
+) -> Kinematics | None:
+    """The robot that the options describe; None for joints alone.
+
+    Parameters
+    ----------
+    robot : str or None
+        Path of a URDF, or ``"upper_body"``.
+    links : sequence of str, optional
+    joints : sequence of str, optional
+        Patterns with ``*`` for the joints that move; the others stand still. All by default.
+    coordinates : sequence of str, optional
+        Joints without kinematics.
+    poses : sequence of str, optional
+        Tracked bodies in place of a robot.
+
+    Raises
+    ------
+    DataError
+        If they do not go together.
+    """
+    from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+    if poses:
+        if robot or links or joints or coordinates:
+            raise DataError("--poses are instead of --robot and its links and joints")
+        from tpgmm_torch.poses import Poses
+
+        return Poses(poses)
+    if robot is None:
+        if links or joints or coordinates:
+            raise DataError("--link, --robot-joint and --coordinate need --robot URDF")
+        return None
+    from tpgmm_torch.robots import Robot
+    from tpgmm_torch.urdf import read_urdf
+
+    if robot == "upper_body":
+        from tpgmm_datasets.robots import upper_body_urdf
+
+        robot = upper_body_urdf()
+    moving = None
+    if joints:
+        actuated = read_urdf(robot).actuated
+        for pattern in joints:
+            if not any(fnmatchcase(name, pattern) for name in actuated):
+                raise UnknownNameError("joint", pattern, "the URDF", actuated)
+        moving = [n for n in actuated if any(fnmatchcase(n, pattern) for pattern in joints)]
+    return Robot.from_urdf(robot, links or (), joints=moving, coordinates=coordinates or ())
+
+
+def align(
+    demonstrations: Sequence[Demonstration], method: str, robot: Kinematics | None
+) -> list[Demonstration]:
+    """Bring demonstrations onto one clock.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    method : {"dtw", "barycenter", "linear", "none"}
+    robot : Kinematics or None
+    """
+    from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+
+    if method == "none":
+        return list(demonstrations)
+    if method == "linear":
+        return LinearTimeNormalization(robot=robot).fit_transform(demonstrations)
+    reference = "medoid" if method == "dtw" else method
+    return DynamicTimeWarping(reference, robot=robot).fit_transform(demonstrations)

@@ -1,0 +1,115 @@
+"""``tpgmm plot``: pictures of a fitted model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tpgmm_torch.cli import options
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from tpgmm_torch.kinematics import Kinematics
+    from tpgmm_torch.operators import Operator
+
+__all__ = ["app"]
+
+app = typer.Typer()
+
+EXAMPLE = (
+    "Example: tpgmm plot out/model --dataset out/demo/dataset --joint l_shoulder_pitch "
+    "--out out/pictures"
+)
+
+
+@app.command(epilog=EXAMPLE)
+def plot(
+    model: options.Model,
+    dataset: Annotated[str, typer.Option(help="A LeRobot data set: its folder or hub id.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the pictures go.")],
+    joint: Annotated[
+        list[str] | None,
+        typer.Option(help="Also draw each operator's estimate of this joint; repeatable."),
+    ] = None,
+    frame: options.Frames = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    rate: options.Rate = None,
+    alignment: options.AlignmentMethod = "dtw",
+) -> None:
+    """Draw what a model has learned.
+
+    For every operator a picture of its coordinates over time: the demonstrations (black), the
+    components (green), and the reproduction in the situation of the first episode (red).
+    """
+    from tpgmm_torch.demonstrations import Situation
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.exceptions import UnknownNameError
+    from tpgmm_torch.operators.text import format_operator
+    from tpgmm_torch.plotting import figure, plot_candidates, plot_local
+
+    fitted = TaskParameterizedGMM.load(model)
+    kinematics = fitted.kinematics_
+    chosen = joint or ()
+    for name in chosen:
+        if name not in kinematics.joint_names:
+            raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
+    demonstrations = options.align(
+        options.read_demonstrations(dataset, kinematics, frame, episodes, units, joints, rate),
+        alignment,
+        kinematics,
+    )
+    [trajectory] = fitted.predict([Situation.of(demonstrations[0])])
+    shown: list[tuple[Any, Any, Any]] = [(trajectory, demonstrations[0].frames, {})]
+    drawings: dict[str, Figure] = {}
+    for index, operator in enumerate(fitted.operators_):
+        names = coordinate_names(operator, kinematics)
+        drawing = figure(len(names), format_operator(operator), height=1.3)
+        for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
+            plot_local(axes, fitted, index, column, demonstrations, shown)
+            axes.set_ylabel(name, fontsize="small")
+        drawings[f"operator_{index + 1}.png"] = drawing
+    labels = [format_operator(operator) for operator in fitted.operators_]
+    for name in chosen:
+        drawing = figure(1, f"{name}: what each operator asks for, and the result", height=3.2)
+        plot_candidates(drawing.axes[0], trajectory, name, labels)
+        drawing.axes[0].legend(fontsize="x-small")
+        drawings[f"joint_{name}.png"] = drawing
+    out.mkdir(parents=True, exist_ok=True)
+    for name, drawing in drawings.items():
+        drawing.savefig(out / name, dpi=110)
+        typer.echo(out / name)
+
+
+def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
+    """A label for each local coordinate of an operator.
+
+    Parameters
+    ----------
+    operator : Operator
+    kinematics : Kinematics
+    """
+    from tpgmm_torch.operators import (
+        AbsoluteOrientation,
+        AbsolutePosition,
+        Canonical,
+        RelativeOrientation,
+        RelativePosition,
+        Stack,
+    )
+
+    if isinstance(operator, Stack):
+        return [
+            n for member in operator.operators for n in coordinate_names(member, kinematics)
+        ]
+    if isinstance(operator, Canonical):
+        return list(kinematics.joint_names)
+    if isinstance(operator, AbsolutePosition | RelativePosition):
+        return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    if isinstance(operator, AbsoluteOrientation | RelativeOrientation):
+        return [f"{operator.link}\nq{part}" for part in "wxyz"]
+    return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]

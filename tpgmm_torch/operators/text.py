@@ -1,0 +1,108 @@
+"""Operators written as short text, for command lines and labels.
+
+``position:l_hand@bottle + orientation:l_hand@bottle`` is a stack of two relative operators,
+``position:l_hand`` an absolute one, ``pose:l_hand@bottle`` short for position and orientation,
+and ``canonical`` the joints themselves.
+"""
+
+from __future__ import annotations
+
+import re
+
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators.base import Operator
+from tpgmm_torch.operators.canonical import Canonical
+from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
+from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
+from tpgmm_torch.operators.stack import Stack
+
+__all__ = ["format_operator", "parse_operator"]
+
+TERM = re.compile(
+    r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)(@(?P<frame>[^\s:@+]+))?"
+)
+GRAMMAR = (
+    "'canonical', or 'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each "
+    "with '@FRAME' behind it if seen from a frame or another link; '+' stacks them, as in "
+    "'position:l_hand@bottle + orientation:l_hand@bottle'"
+)
+
+
+def parse_operator(text: str) -> Operator:
+    """The operator that a text stands for.
+
+    Parameters
+    ----------
+    text : str
+        One term, or several joined by ``+``. A term is ``canonical``, or ``position``,
+        ``orientation`` or ``pose`` (both), a colon and a link; ``@`` and the name of a frame
+        or of another link make it relative.
+
+    Returns
+    -------
+    Operator
+        A :class:`Stack` if there are several.
+
+    Raises
+    ------
+    DataError
+        If a term is none of these; the message says what one looks like.
+
+    Examples
+    --------
+    >>> parse_operator("position:l_hand@bottle")
+    RelativePosition(link='l_hand', frame='bottle')
+    >>> parse_operator("pose:l_hand + canonical").operators[2]
+    Canonical()
+    """
+    operators = [operator for term in text.split("+") for operator in _term(term.strip(), text)]
+    return operators[0] if len(operators) == 1 else Stack(*operators)
+
+
+def _term(term: str, text: str) -> list[Operator]:
+    if term == "canonical":
+        return [Canonical()]
+    match = TERM.fullmatch(term)
+    if match is None:
+        raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
+    kind, link, frame = match["kind"], match["link"], match["frame"]
+    operators: list[Operator] = []
+    if kind in ("position", "pose"):
+        operators.append(RelativePosition(link, frame) if frame else AbsolutePosition(link))
+    if kind in ("orientation", "pose"):
+        operators.append(
+            RelativeOrientation(link, frame) if frame else AbsoluteOrientation(link)
+        )
+    return operators
+
+
+def format_operator(operator: Operator) -> str:
+    """The inverse of :func:`parse_operator`, for people to read.
+
+    Parameters
+    ----------
+    operator : Operator
+        Operators that have no such text, like a user's own, are given by their ``repr``. The
+        gain of orientations is left out.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> format_operator(Stack(RelativePosition("l_hand", "bottle"), Canonical()))
+    'position:l_hand@bottle + canonical'
+    """
+    if isinstance(operator, Stack):
+        return " + ".join(map(format_operator, operator.operators))
+    if isinstance(operator, Canonical):
+        return "canonical"
+    if isinstance(operator, AbsolutePosition | RelativePosition):
+        kind = "position"
+    elif isinstance(operator, AbsoluteOrientation | RelativeOrientation):
+        kind = "orientation"
+    else:
+        return repr(operator)
+    frame = "".join(f"@{name}" for name in operator.references())
+    return f"{kind}:{operator.link}{frame}"
