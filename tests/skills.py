@@ -166,3 +166,29 @@ def tensors(thing: object) -> list[Tensor]:
         return tensors([thing.time, thing.joints, *thing.frames.values()])
     assert isinstance(thing, list | tuple | Mapping) or thing is None
     return [found for part in thing or () for found in tensors(part)]
+
+
+def canonical(**options: object) -> TaskParameterizedGMM:
+    """A model for :func:`waves`, unfitted."""
+    return TaskParameterizedGMM(**{"n_components": 6, "blend": 0.0, **options})
+
+
+def new_handling(moves: bool = False, seed: int = 7) -> tuple[Situation, torch.Tensor]:
+    """A situation never seen, and the motion that fits it."""
+    time = torch.linspace(0, LAST, 30, dtype=torch.float64)
+    cup = cups(1, seed)[0]
+    cup = moving(cup, time) if moves else cup
+    wanted = handling(cup, time)
+    return Situation(wanted[0], {"cup": cup}, time), wanted
+
+
+def same(a: TaskParameterizedGMM, b: TaskParameterizedGMM, tolerance: float = 0.0) -> None:
+    """Two models are one, to a relative tolerance."""
+    close = {"rtol": tolerance, "atol": tolerance}
+    torch.testing.assert_close(a.weights_, b.weights_, **close)
+    torch.testing.assert_close(a.means_, b.means_, **close)
+    torch.testing.assert_close(a.covariances_, b.covariances_, **close)
+
+
+def apart(a, b) -> float:
+    return float((a.double() - b.double()).abs().max())

@@ -89,3 +89,26 @@ def test_frames_name_what_is_nan():
         Frame([0.0, math.nan, 0.0])
     with pytest.raises(DataError, match="the frame's orientation holds 4 value"):
         Frame([0.0, 0.0, 0.0], [math.nan] * 4)
+
+
+def test_what_is_of_unit_norm_but_for_rounding_stays_bit_for_bit():
+    rng = np.random.default_rng(0)
+    for dtype in (torch.float64, torch.float32):
+        given = quaternions.normalize(
+            torch.from_numpy(rng.standard_normal((1000, 4))).to(dtype)
+        )
+        once = Frame(torch.zeros(1000, 3, dtype=dtype), given)
+        assert torch.equal(once.orientation, given)
+        assert torch.equal(Frame(once.position, once.orientation).orientation, given)
+
+
+def test_rounded_digits_are_brought_to_unit_norm():
+    frame = Frame([0, 0, 0], [0.7071, 0.7071, 0, 0])
+    assert abs(float(frame.orientation.norm()) - 1) < 1e-15
+
+
+def test_gradients_of_an_orientation_stay_on_the_unit_sphere():
+    given = torch.tensor([0.6, 0.8, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    orientation = Frame(torch.zeros(3, dtype=torch.float64), given).orientation
+    (gradient,) = torch.autograd.grad(orientation[0], given)
+    assert abs(float(gradient @ given.detach())) < 1e-15

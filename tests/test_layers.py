@@ -29,7 +29,7 @@ LAYERS = (
     ("block_gaussians", "sufficient_statistics"),
     ("expectation_maximization", "initialization", "mixture"),
     ("regression", "rollout", "reproduction"),
-    ("persistence",),
+    ("persistence", "situations"),
     ("estimator",),
     ("metrics", "plotting"),
     ("cli",),

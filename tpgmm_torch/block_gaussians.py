@@ -258,7 +258,7 @@ class Family:
         cls,
         covariance_type: str,
         units: Standardization,
-        amount: float,
+        amount: float | Sequence[float] | NDArray[np.float64],
         *,
         relative: bool,
         dtype: torch.dtype,
@@ -269,16 +269,31 @@ class Family:
         ----------
         covariance_type : {"full", "tied", "diag", "spherical"}
         units : Standardization
-        amount : float
+        amount : float or array-like of shape (n_features,)
             The regularisation: a share of the variance, or in squared units of the data.
         relative : bool
             Which of the two.
         dtype : torch.dtype
             Precision of the computation, which sets the least regularisation.
+
+        Raises
+        ------
+        ShapeError, DataError
+            If ``amount`` is neither one number nor one per column, or negative.
         """
+        widths = [len(scale) for scale in units.scales]
+        amounts = np.asarray(amount, dtype=np.float64)
+        if amounts.shape not in ((), (sum(widths),)):
+            raise ShapeError(
+                f"reg_covar is one number or one for each of the {sum(widths)} columns, "
+                f"got shape {amounts.shape}"
+            )
+        if not (np.isfinite(amounts) & (amounts >= 0)).all():
+            raise DataError(f"reg_covar must be finite and not negative, got {amount!r}")
+        columns = torch.from_numpy(np.broadcast_to(amounts, sum(widths)).copy()).split(widths)
         shares = (
-            torch.full_like(scale, amount) if relative else amount / scale**2
-            for scale in units.scales
+            column.to(scale) if relative else column.to(scale) / scale**2
+            for column, scale in zip(columns, units.scales, strict=True)
         )
         smallest = SMALLEST_SHARE[dtype]
         return cls(covariance_type, tuple(share.clamp(min=smallest) for share in shares))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 
+from tpgmm_torch.block_gaussians import Standardization
 from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.joint_space import JointSpace
@@ -232,19 +233,22 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         for operator in operators:
             if not isinstance(operator, Operator):
                 raise DataError(f"operators holds Operator objects, got {operator!r}")
-        kinematics = self._kinematics(demonstrations[0], operators)
+        kinematics = self._kinematics(demonstrations, operators)
         for operator in operators:
             operator.check(kinematics, demonstrations[0].frames)
         rows = local_data(demonstrations, operators, kinematics)
+        group_size = self._group_size(demonstrations)
+        together = torch.cat(rows) if group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
+        points = together.cpu().numpy()
         settings = self._mixture_parameters(operators, kinematics)
-        settings["group_size"] = self._group_size(demonstrations)
+        settings |= {
+            "group_size": group_size,
+            "reg_covar": self._regularization(points, operators, kinematics),
+        }
         mixture = BlockGaussianMixture(**settings)
         if self.warm_start and hasattr(self, "mixture_"):
             mixture = self.mixture_.set_params(**settings)
-        points = (
-            torch.cat(rows) if mixture.group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
-        )
-        mixture.fit(points.cpu().numpy())
+        mixture.fit(points)
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_ = tuple(
             dict.fromkeys(
@@ -277,11 +281,13 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
 
     def bic(self, X: Sequence[Demonstration]) -> float:
         """Bayesian information criterion on demonstrations; lower is better."""
-        return float(self.mixture_.bic(np.concatenate(self._rows(X))))
+        rows = np.concatenate(self._rows(X))
+        return float(self.mixture_.bic(rows))
 
     def aic(self, X: Sequence[Demonstration]) -> float:
         """Akaike information criterion on demonstrations; lower is better."""
-        return float(self.mixture_.aic(np.concatenate(self._rows(X))))
+        rows = np.concatenate(self._rows(X))
+        return float(self.mixture_.aic(rows))
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
@@ -314,7 +320,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         return model
 
     def _kinematics(
-        self, demonstration: Demonstration, operators: Sequence[Operator]
+        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
     ) -> Kinematics:
         dtype = getattr(torch, self.dtype)
         if self.robot is not None:
@@ -325,8 +331,9 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
                 f"the operators need the pose of {needed}: pass robot=Robot.from_urdf(...), or "
                 "robot=Poses(...) for recorded poses without a robot"
             )
-        default = tuple(f"joint_{index}" for index in range(demonstration.n_joints))
-        return JointSpace(demonstration.joint_names or default, dtype, self.device)
+        default = tuple(f"joint_{index}" for index in range(demonstrations[0].n_joints))
+        names = next((d.joint_names for d in demonstrations if d.joint_names), default)
+        return JointSpace(names, dtype, self.device)
 
     def _group_size(self, demonstrations: Sequence[Demonstration]) -> int:
         first = demonstrations[0].time
@@ -337,6 +344,19 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
                 "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
             )
         return len(demonstrations) if aligned and self.responsibilities != "point" else 1
+
+    def _regularization(
+        self,
+        points: NDArray[np.float64],
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+    ) -> NDArray[np.float64]:
+        """``reg_covar`` and the operators' tolerances, as shares of each column's variance."""
+        widths = [1 + operator.dimension(kinematics) for operator in operators]
+        isotropic = self.covariance_type == "spherical"
+        scales = torch.cat(Standardization.of_data(points, widths, isotropic=isotropic).scales)
+        tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
+        return self.reg_covar + (np.concatenate(tolerances) / scales.numpy()) ** 2
 
     def _mixture_parameters(
         self, operators: Sequence[Operator], kinematics: Kinematics

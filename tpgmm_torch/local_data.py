@@ -74,7 +74,7 @@ def local_data(
     return rows
 
 
-def _without_rounding(rows: Sequence[Tensor], widths: Sequence[int]) -> list[Tensor]:
+def _without_rounding(rows: list[Tensor], widths: Sequence[int]) -> list[Tensor]:
     """Make constant what varies by rounding alone: learned, it would be certain beyond reason.
 
     Rounding is measured by the largest coordinate of the operator, from which it comes: think

@@ -27,6 +27,16 @@ __all__ = [
 def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
     """Root mean square joint difference over equal time grids [rad].
 
+    Parameters
+    ----------
+    trajectory : Trajectory
+    demonstration : Demonstration
+        Its joints may have another order, if they are named.
+
+    Returns
+    -------
+    float
+
     Raises
     ------
     ShapeError
@@ -53,6 +63,8 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
     estimator : TaskParameterizedGMM
         Fitted.
     X : sequence of Demonstration
+    y : ignored
+        Here for scikit-learn.
 
     Returns
     -------
@@ -69,13 +81,23 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
 
 
 def largest_velocity(motion: Trajectory | Demonstration) -> float:
-    """Largest joint speed by first differences [rad/s]."""
+    """Largest joint speed by first differences [rad/s].
+
+    Parameters
+    ----------
+    motion : Trajectory or Demonstration
+    """
     speed = motion.joints.diff(dim=0) / motion.time.diff()[:, None]
     return float(speed.abs().max())
 
 
 def largest_acceleration(motion: Trajectory | Demonstration) -> float:
-    """Largest joint acceleration by second differences [rad/s^2]."""
+    """Largest joint acceleration by second differences [rad/s^2].
+
+    Parameters
+    ----------
+    motion : Trajectory or Demonstration
+    """
     steps = motion.time.diff()
     speed = motion.joints.diff(dim=0) / steps[:, None]
     middle = (steps[1:] + steps[:-1]) / 2

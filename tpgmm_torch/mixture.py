@@ -55,7 +55,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         one per component, or one variance per component.
     tol : float, default=1e-3
         EM stops when the mean log-likelihood changes by less.
-    reg_covar : float, default=1e-6
+    reg_covar : float or array-like of shape (n_features,), default=1e-6
         Regularisation of the covariances' diagonals.
     regularization : {"relative", "absolute"}, default="relative"
         Whether ``reg_covar`` is a share of each column's variance (of its block's mean
@@ -132,7 +132,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "blocks": ["array-like", None],
         "covariance_type": [StrOptions({"full", "tied", "diag", "spherical"})],
         "tol": [Interval(Real, 0.0, None, closed="left")],
-        "reg_covar": [Interval(Real, 0.0, None, closed="left")],
+        "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
         "regularization": [StrOptions({"relative", "absolute"})],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
@@ -156,7 +156,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         blocks: Sequence[int] | None = None,
         covariance_type: str = "full",
         tol: float = 1e-3,
-        reg_covar: float = 1e-6,
+        reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
         regularization: str = "relative",
         max_iter: int = 100,
         n_init: int = 1,

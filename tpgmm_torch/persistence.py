@@ -12,10 +12,11 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
@@ -50,20 +51,31 @@ KNOWN: dict[str, type] = {
 def encode(thing: Operator | Kinematics) -> dict[str, Any]:
     """Describe an operator or a robot by its class name and its fields, ready for JSON.
 
+    Parameters
+    ----------
+    thing : Operator or Kinematics
+
+    Returns
+    -------
+    dict
+
     Raises
     ------
     ModelFileError
         If it has no such description.
     """
     name = type(thing).__name__
-    if isinstance(thing, Stack):
+    if KNOWN.get(name, type(thing)) is not type(thing):
+        raise ModelFileError(f"your class {name} has the name of a built-in one: rename it")
+    if type(thing) is Stack:
         return {"type": name, "operators": [encode(member) for member in thing.operators]}
-    if isinstance(thing, Operator):
+    if isinstance(thing, Operator) and is_dataclass(thing):
         return {"type": name} | {f.name: getattr(thing, f.name) for f in fields(thing)}  # type: ignore[arg-type]
     if hasattr(thing, "config"):
         return {"type": name, "config": thing.config()}
     raise ModelFileError(
-        f"{name} cannot be saved: give it config() and a classmethod from_config()"
+        f"{name} cannot be saved: make an operator a frozen dataclass, give a robot config() "
+        "and a classmethod from_config()"
     )
 
 
@@ -95,9 +107,14 @@ def decode(description: Mapping[str, Any], custom: Sequence[type] = ()) -> Any:
             return Stack(*(decode(member, custom) for member in arguments["operators"]))
         if "config" in arguments:
             return known[name].from_config(arguments["config"])  # type: ignore[attr-defined]
-        return known[name](**arguments)
+        return known[name](**{key: _frozen(value) for key, value in arguments.items()})
     except (TypeError, KeyError, ValueError) as error:
         raise ModelFileError(f"the model's {name} cannot be rebuilt: {error}") from error
+
+
+def _frozen(value: Any) -> Any:
+    """JSON has lists, operators have tuples."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def _digest(content: bytes) -> str:
@@ -125,16 +142,13 @@ def write_model(
     Raises
     ------
     ModelFileError
-        If ``path`` exists and is no model directory: it is left alone.
+        If ``path`` exists and is no model directory, or holds other files too: it is left
+        alone. If the configuration is not of JSON's values.
     """
     path = Path(path)
-    if (
-        path.exists()
-        and not (path / CONFIG).is_file()
-        and (not path.is_dir() or any(path.iterdir()))
-    ):
+    if path.exists() and not _replaceable(path):
         raise ModelFileError(
-            f"{path} exists and is not a saved model; choose another directory"
+            f"{path} exists and is not a saved model alone; choose another directory"
         )
     blob = safetensors.torch.save(
         {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
@@ -142,7 +156,10 @@ def write_model(
     shapes = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
     full = {"format": FORMAT, "version": VERSION, **config}
     full |= {"tensors": shapes, "tensors_sha256": _digest(blob)}
-    full["digest"] = _digest(_canonical(full))
+    try:
+        full["digest"] = _digest(_canonical(full))
+    except (TypeError, ValueError) as error:
+        raise ModelFileError(f"the model cannot be described in JSON: {error}") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     try:
@@ -160,8 +177,25 @@ def write_model(
         shutil.rmtree(staging, ignore_errors=True)
 
 
+def _replaceable(path: Path) -> bool:
+    """Whether nothing but a model, or nothing at all, is lost by replacing the directory."""
+    if not path.is_dir() or {item.name for item in path.iterdir()} - {CONFIG, TENSORS}:
+        return False
+    try:
+        return json.loads((path / CONFIG).read_text())["format"] == FORMAT
+    except FileNotFoundError:
+        return not any(path.iterdir())
+    except (ValueError, TypeError, KeyError):
+        return False
+
+
 def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Read a model directory, checking version, digests, names, shapes and dtypes.
+
+    Parameters
+    ----------
+    path : str or Path
+        The directory.
 
     Returns
     -------
@@ -190,7 +224,11 @@ def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"{path} is a model of format version {config.get('version')!r}, this release "
             f"reads version {VERSION}: load it with the release that wrote it, or fit again"
         )
-    if config.get("digest") != _digest(_canonical(config)):
+    try:
+        digest = _digest(_canonical(config))
+    except ValueError:  # it holds NaN or infinity, which no model has
+        digest = ""
+    if config.get("digest") != digest:
         raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
     if config.get("tensors_sha256") != _digest(blob):
         raise ModelFileError(f"{path / TENSORS} is truncated or was changed after it was saved")
@@ -199,17 +237,33 @@ def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     except SafetensorError as error:
         raise ModelFileError(f"{path / TENSORS} cannot be read: {error}") from error
     found = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
-    if found != config["tensors"]:
-        raise ModelFileError(f"{path / TENSORS} holds {found}, expected {config['tensors']}")
+    if found != config.get("tensors"):
+        raise ModelFileError(
+            f"{path / TENSORS} holds {found}, expected {config.get('tensors')}"
+        )
     return config, tensors
 
 
 def save_estimator(model: Any, path: str | Path) -> None:
-    """Write a fitted :class:`TaskParameterizedGMM`; its method ``save`` calls this."""
-    parameters = model.get_params(deep=False)
-    for name in ("operators", "robot"):
-        parameters.pop(name)
-    if not isinstance(model.random_state, int):
+    """Write a fitted :class:`TaskParameterizedGMM`; its method ``save`` calls this.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+    path : str or Path
+        The directory.
+
+    Raises
+    ------
+    ModelFileError
+        If something is there that is no model, or an operator or robot cannot be described.
+    """
+    parameters = {
+        name: value.item() if isinstance(value, np.generic) else value
+        for name, value in model.get_params(deep=False).items()
+        if name not in ("operators", "robot")
+    }
+    if not isinstance(parameters["random_state"], int):
         parameters["random_state"] = None
     config = {
         "parameters": parameters,
@@ -227,12 +281,38 @@ def save_estimator(model: Any, path: str | Path) -> None:
 
 
 def load_estimator(cls: type[Any], path: str | Path, custom: Sequence[type] = ()) -> Any:
-    """Read a fitted :class:`TaskParameterizedGMM`; its method ``load`` calls this."""
+    """Read a fitted :class:`TaskParameterizedGMM`; its method ``load`` calls this.
+
+    Parameters
+    ----------
+    cls : type
+        The class of the model.
+    path : str or Path
+        The directory.
+    custom : sequence of type
+        User-defined operator and robot classes that the model uses.
+
+    Returns
+    -------
+    TaskParameterizedGMM
+
+    Raises
+    ------
+    ModelFileError
+        If the files are damaged, or do not fit together.
+    """
     config, tensors = read_model(path)
-    operators = [decode(item, custom) for item in config["operators"]]
-    kinematics = decode(config["kinematics"], custom)
-    robot = None if isinstance(kinematics, JointSpace) else kinematics
     try:
+        operators = [decode(item, custom) for item in config["operators"]]
+        kinematics = decode(config["kinematics"], custom)
+        robot = None if isinstance(kinematics, JointSpace) else kinematics
+        for operator in operators:
+            operator.check(kinematics, dict.fromkeys(config["frames"]))
+        if len(tensors) != 2 + 2 * len(operators) or not operators:
+            raise ModelFileError(
+                f"{path} does not fit together: {len(operators)} operators, but the tensors "
+                f"{sorted(tensors)}"
+            )
         model = cls(operators=operators, robot=robot, **config["parameters"])
         model._validate_params()
         tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
@@ -245,11 +325,16 @@ def load_estimator(cls: type[Any], path: str | Path, custom: Sequence[type] = ()
             model.covariances_,
             **model._mixture_parameters(operators, kinematics),
         )
-    except (KeyError, TypeError, ValueError) as error:
+        # it checked them; what it keeps went through their factors, and was rounded
+        model.mixture_.means_, model.mixture_.covariances_ = model.means_, model.covariances_
+        model.mixture_.weights_ = model.weights_
+        model.operators_ = tuple(operators)
+        model.kinematics_ = kinematics.to(model.time_.dtype, model.device)
+        model.frame_names_ = tuple(config["frames"])
+        for name in ("n_iter", "converged", "lower_bound"):
+            setattr(model, f"{name}_", config[name])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, ModelFileError):
+            raise
         raise ModelFileError(f"{path} does not fit together: {error}") from error
-    model.operators_ = tuple(operators)
-    model.kinematics_ = kinematics.to(model.time_.dtype, model.device)
-    model.frame_names_ = tuple(config["frames"])
-    for name in ("n_iter", "converged", "lower_bound"):
-        setattr(model, f"{name}_", config[name])
     return model

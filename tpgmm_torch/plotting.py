@@ -30,6 +30,19 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
 
     It belongs to no window, so it works without a display and needs no closing.
 
+    Parameters
+    ----------
+    rows : int
+        Number of panels.
+    title : str
+        Above all of them.
+    width, height : float
+        Of the figure, and of one panel [inch].
+
+    Returns
+    -------
+    matplotlib Figure
+
     Raises
     ------
     DependencyError
@@ -49,7 +62,14 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
 
 
 def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
-    """Mark phases of the skill: a grey band and its name for each span of time [s]."""
+    """Mark phases of the skill: a grey band with its name for each.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+    spans : mapping of str to (float, float)
+        Start and end of each phase [s].
+    """
     for name, (start, end) in spans.items():
         axes.axvspan(start, end, color="0.9", zorder=0, linewidth=0)
         axes.annotate(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.demonstrations import Demonstration, Frame, Situation
+from tpgmm_torch.demonstrations import Demonstration, Frame, Situation, as_tensor
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators import Operator
@@ -63,6 +64,8 @@ class Reproduction:
             If a situation does not fit the model.
         """
         self._check_fitted()
+        if not isinstance(X, Situation | Demonstration | Iterable):
+            raise DataError(f"predict takes a list of Situation, got {type(X).__name__}")
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
         return rollout(self._regression(), situations, self.blend, self.keep_limits, candidates)
@@ -96,7 +99,7 @@ class Reproduction:
         if not isinstance(state, RobotState):
             state = self.kinematics_.state(state)
         known = {name: frame.to(state.joints) for name, frame in (frames or {}).items()}
-        now = torch.as_tensor(time, dtype=state.joints.dtype, device=state.joints.device)
+        now = as_tensor(time, "time").to(state.joints)
         limits = (self.kinematics_.lower, self.kinematics_.upper) if self.keep_limits else None
         return self._regression().step(now, state, known, candidates, limits)
 
@@ -121,7 +124,14 @@ class Reproduction:
         Returns
         -------
         list of Trajectory
+
+        Raises
+        ------
+        DataError
+            If ``n_samples`` is no positive integer, and as :meth:`predict` does.
         """
+        if not isinstance(n_samples, Integral) or n_samples < 1:
+            raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
         [mean] = self.predict([situation], candidates=False)
         draws = check_random_state(random_state).standard_normal(
             (n_samples, mean.joints.shape[-1])

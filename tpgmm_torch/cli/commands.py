@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-__all__ = ["Commands"]
+__all__ = ["explain"]
 
 #: Each entry point is a typer app or a function, added under its name.
 ENTRY_POINTS = "tpgmm.commands"
@@ -38,10 +38,12 @@ class Commands(TyperGroup):
         prog_name: str | None = None,
         complete_var: str | None = None,
         standalone_mode: bool = True,
+        windows_expand_args: bool = True,
         **extra: Any,
     ) -> Any:
         """Run with arguments and exit; as in click, ``standalone_mode=False`` returns."""
-        run = partial(super().main, args, prog_name, complete_var, False, **extra)
+        given = (args, prog_name, complete_var, False, windows_expand_args)
+        run = partial(super().main, *given, **extra)
         if not standalone_mode:
             return run()
         with _warnings_in_one_line():

@@ -22,20 +22,18 @@ app = typer.Typer(help="Look at a LeRobot data set: what is in it, and what is w
 @app.command(epilog="Example: tpgmm dataset info out/demo/dataset")
 def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
-    from rich.console import Console
-    from rich.table import Table
-
     from tpgmm_datasets import describe_lerobot
 
     found = describe_lerobot(path)
     for name, value in _summary(found).items():
         typer.echo(f"{name:<10} {value}")
-    table = Table("column", "value", "unit", "from", "to", box=None, pad_edge=False)
-    for column in found.columns:
-        for row in _rows(column):
-            table.add_row(*row)
+    rows = [("column", "type", "value", "unit", "from", "to")]
+    rows += [row for column in found.columns for row in _rows(column)]
+    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     typer.echo()
-    Console(soft_wrap=True).print(table, markup=False)
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
+        typer.echo("  ".join(cells).rstrip())
     for problem in found.problems:
         typer.echo(f"problem: {problem}")
 
@@ -110,12 +108,13 @@ def _summary(found: DatasetInfo) -> dict[str, object]:
     }
 
 
-def _rows(column: ColumnInfo) -> Iterator[tuple[str, str, str, str, str]]:
+def _rows(column: ColumnInfo) -> Iterator[tuple[str, str, str, str, str, str]]:
     """A row per value; the key stands in the first."""
     width = len(column.low or column.names or column.units or (0,))
     for i in range(width):
         yield (
-            f"{column.key} ({column.dtype})" if i == 0 else "",
+            column.key if i == 0 else "",
+            column.dtype if i == 0 else "",
             column.names[i] if column.names else str(i),
             column.units[i] if column.units else "",
             f"{column.low[i]:.4g}" if column.low else "",

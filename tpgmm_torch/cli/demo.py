@@ -17,17 +17,20 @@ __all__ = ["app"]
 
 app = typer.Typer()
 
-#: Heading, entry of the metrics, figures shown, and their format.
+#: Heading, entry of the metrics, figures shown, digits behind the point.
 COLUMNS = (
-    ("grasp\nmm", "grasp position error [mm]", ("median", "p95"), ".2f"),
-    ("grasp\ndeg", "grasp orientation error [deg]", ("median", "p95"), ".2f"),
-    ("shoulder\nRMSE rad", "shoulder RMSE [rad]", ("median", "p95"), ".3f"),
-    ("freq.\n%", "frequency error [%]", ("median", "p95"), ".1f"),
-    ("ampl.\n%", "amplitude error [%]", ("median", "p95"), ".1f"),
-    ("first\nstep rad", "first step [rad]", ("max",), ".3f"),
-    ("beyond\nlimits rad", "beyond joint limits [rad]", ("max",), ".2g"),
-    ("speed\nrad/s", "joint speed [rad/s]", ("max",), ".2f"),
-    ("accel.\nrad/s^2", "joint acceleration [rad/s^2]", ("median", "max"), ".0f"),
+    ("grasp\nmm", "grasp position error [mm]", ("median", "p95"), 2),
+    ("grasp\ndeg", "grasp orientation error [deg]", ("median", "p95"), 2),
+    ("shoulder\nRMSE rad", "shoulder RMSE [rad]", ("median", "p95"), 3),
+    ("freq.\n%", "frequency error [%]", ("median", "p95"), 1),
+    ("ampl.\n%", "amplitude error [%]", ("median", "p95"), 1),
+    ("first\nstep", "first step [rad]", ("max",), 3),
+    ("beyond\nlimit", "beyond joint limits [rad]", ("max",), 3),
+    ("speed\nrad/s", "joint speed [rad/s]", ("max",), 2),
+    ("accel.\nrad/s^2", "joint acceleration [rad/s^2]", ("median", "max"), 1),
+)
+CAPTION = (
+    "median/95th percentile; first step and limits (rad) and speed: worst; accel.: median/worst"
 )
 ORIENTATION = "grasp orientation error [deg]"
 
@@ -71,7 +74,8 @@ def demo(
             report=report,
             skill=BottleShaking(rate=rate),
         ).run()
-    console.print(table(metrics["rows"], metrics["demonstrations"]))
+    shown = table(metrics["rows"], metrics["demonstrations"])
+    Console(width=max(console.width, 100)).print(shown)
     for line in summary(metrics):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     console.print(
@@ -103,13 +107,12 @@ def _progress(console: Console, stages: int) -> Iterator[Callable[[str], None]]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("starting", total=stages, completed=-1)
+        task = bar.add_task("starting", total=stages)
 
         def report(text: str) -> None:
             bar.update(task, description=text, advance=1)
 
         yield report
-        bar.update(task, description="done", completed=stages)
 
 
 def table(rows: Mapping[str, Mapping[str, Any]], demonstrations: Mapping[str, Any]) -> Table:
@@ -126,28 +129,22 @@ def table(rows: Mapping[str, Mapping[str, Any]], demonstrations: Mapping[str, An
     from rich.table import Table
 
     shown = Table(
-        box=SIMPLE_HEAD,
-        padding=0,
-        pad_edge=False,
-        caption="median / 95th percentile; steps, limits and speed: worst; "
-        "acceleration: median / worst",
-        caption_justify="left",
+        box=SIMPLE_HEAD, padding=0, pad_edge=False, caption=CAPTION, caption_justify="left"
     )
-    shown.add_column("")
+    shown.add_column("", no_wrap=True)
     for heading, *_ in COLUMNS:
         shown.add_column(heading, justify="right", no_wrap=True)
     for name, row in {**rows, "demonstrations": demonstrations}.items():
-        cells = [_cell(row.get(key), parts, style) for _, key, parts, style in COLUMNS]
+        cells = [_cell(row.get(key), parts, digits) for _, key, parts, digits in COLUMNS]
         shown.add_row(name.replace(", ", ",\n"), *cells)
     return shown
 
 
-def _cell(value: Any, parts: tuple[str, ...], style: str) -> str:
+def _cell(value: Any, parts: tuple[str, ...], digits: int) -> str:
     if value is None:
         return "-"
-    if isinstance(value, Mapping):
-        return "/".join(format(value[part], style) for part in parts)
-    return format(value, style)
+    numbers = [value[part] for part in parts] if isinstance(value, Mapping) else [value]
+    return "/".join(f"{number:.{digits if number < 10 else 0}f}" for number in numbers)
 
 
 def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
@@ -160,8 +157,9 @@ def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
     """
     for name, share in metrics["share of information on the shoulders"].items():
         yield f"share of the information on the shoulders, {name}: {100 * share:.1f} %"
-    rows = metrics["rows"]
-    full, ablated = next(iter(rows.values())), rows.get("position only")
-    if ablated is not None:
-        ratio = ablated[ORIENTATION]["median"] / full[ORIENTATION]["median"]
-        yield f"without orientation its error at the grasp is {ratio:.0f} times as large"
+    full, ablated = next(iter(metrics["rows"].values())), metrics["rows"]["position only"]
+    ratio = ablated[ORIENTATION]["median"] / full[ORIENTATION]["median"]
+    yield f"orientation error at the grasp if positions alone are learned: {ratio:.3g} times"
+    for name, measures in metrics["alignment"].items():
+        figures = ", ".join(f"{measure} {value:.3g}" for measure, value in measures.items())
+        yield f"alignment, {name}: {figures}"

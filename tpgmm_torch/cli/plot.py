@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -66,14 +67,14 @@ def plot(
     [trajectory] = fitted.predict([Situation.of(demonstrations[0])])
     shown: list[tuple[Any, Any, Any]] = [(trajectory, demonstrations[0].frames, {})]
     drawings: dict[str, Figure] = {}
+    labels = [fill(format_operator(operator), 60) for operator in fitted.operators_]
     for index, operator in enumerate(fitted.operators_):
         names = coordinate_names(operator, kinematics)
-        drawing = figure(len(names), format_operator(operator), height=1.3)
+        drawing = figure(len(names), labels[index], height=1.3)
         for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
             plot_local(axes, fitted, index, column, demonstrations, shown)
             axes.set_ylabel(name, fontsize="small")
         drawings[f"operator_{index + 1}.png"] = drawing
-    labels = [format_operator(operator) for operator in fitted.operators_]
     for name in chosen:
         drawing = figure(1, f"{name}: what each operator asks for, and the result", height=3.2)
         plot_candidates(drawing.axes[0], trajectory, name, labels)

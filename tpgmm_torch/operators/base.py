@@ -109,6 +109,13 @@ class Operator(ABC):
         """Where unit quaternions begin among the local coordinates; none by default."""
         return ()
 
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Standard deviations below which agreement in a coordinate means nothing.
+
+        Their squares are added to the diagonal of the local covariances; zero by default.
+        """
+        return (0.0,) * self.dimension(kinematics)
+
     def links(self) -> tuple[str, ...]:
         """Links of the robot whose pose is needed; none by default."""
         return ()

@@ -17,12 +17,26 @@ __all__ = ["Canonical"]
 class Canonical(Operator):
     """The joints themselves: ``A = I``, ``b = 0``; local data are ``q_t`` (section III-C).
 
+    Parameters
+    ----------
+    tolerance : float, default=0.005
+        Standard deviation that is added to the local covariances [rad or m]. In a few
+        demonstrations the joints seem to keep relations exactly that they keep by chance, or
+        only near the demonstrated situations; these would contradict the task elsewhere.
+        0 takes them at their word, as the paper does.
+
     Examples
     --------
     >>> from tpgmm_torch import Canonical
     >>> Canonical()
-    Canonical()
+    Canonical(tolerance=0.005)
     """
+
+    tolerance: float = 0.005
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """The tolerance, for every joint."""
+        return (self.tolerance,) * self.dimension(kinematics)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """The number of joints."""

@@ -100,6 +100,10 @@ class Stack(Operator):
             column += operator.dimension(kinematics)
         return tuple(starts)
 
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Those of the members, side by side."""
+        return tuple(t for o in self.operators for t in o.tolerances(kinematics))
+
     def links(self) -> tuple[str, ...]:
         """All links of the members."""
         return tuple(dict.fromkeys(name for o in self.operators for name in o.links()))

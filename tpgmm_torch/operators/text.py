@@ -8,6 +8,7 @@ and ``canonical`` the joints themselves.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Operator
@@ -18,6 +19,11 @@ from tpgmm_torch.operators.stack import Stack
 
 __all__ = ["format_operator", "parse_operator"]
 
+#: By kind, the operator in the base frame and the one seen from a frame.
+KINDS: dict[str, tuple[Callable[[str], Operator], Callable[[str, str], Operator]]] = {
+    "position": (AbsolutePosition, RelativePosition),
+    "orientation": (AbsoluteOrientation, RelativeOrientation),
+}
 TERM = re.compile(
     r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)(@(?P<frame>[^\s:@+]+))?"
 )
@@ -66,14 +72,8 @@ def _term(term: str, text: str) -> list[Operator]:
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
     kind, link, frame = match["kind"], match["link"], match["frame"]
-    operators: list[Operator] = []
-    if kind in ("position", "pose"):
-        operators.append(RelativePosition(link, frame) if frame else AbsolutePosition(link))
-    if kind in ("orientation", "pose"):
-        operators.append(
-            RelativeOrientation(link, frame) if frame else AbsoluteOrientation(link)
-        )
-    return operators
+    pairs = KINDS.values() if kind == "pose" else [KINDS[kind]]
+    return [relative(link, frame) if frame else absolute(link) for absolute, relative in pairs]
 
 
 def format_operator(operator: Operator) -> str:
@@ -96,13 +96,10 @@ def format_operator(operator: Operator) -> str:
     """
     if isinstance(operator, Stack):
         return " + ".join(map(format_operator, operator.operators))
-    if isinstance(operator, Canonical):
+    if type(operator) is Canonical:
         return "canonical"
-    if isinstance(operator, AbsolutePosition | RelativePosition):
-        kind = "position"
-    elif isinstance(operator, AbsoluteOrientation | RelativeOrientation):
-        kind = "orientation"
-    else:
-        return repr(operator)
-    frame = "".join(f"@{name}" for name in operator.references())
-    return f"{kind}:{operator.link}{frame}"
+    for kind, classes in KINDS.items():
+        if type(operator) in classes:
+            frame = "".join(f"@{name}" for name in operator.references())
+            return f"{kind}:{operator.links()[0]}{frame}"
+    return repr(operator)

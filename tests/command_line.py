@@ -1,0 +1,25 @@
+"""Running the command ``tpgmm`` inside a test."""
+
+from typer.testing import CliRunner
+
+from tpgmm_torch.cli.application import app
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def output(*arguments):
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refusal(*arguments):
+    """The one line on stderr."""
+    result = run(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    [line] = result.stderr.splitlines()
+    assert line.startswith("tpgmm: ")
+    return line

@@ -1,0 +1,49 @@
+"""Commands that other distributions add to ``tpgmm``."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+import typer
+
+from tests.command_line import output, run
+from tpgmm_torch.cli import commands
+
+
+def greet(name: str = "you") -> None:
+    """Greet."""
+    typer.echo(f"hello {name}")
+
+
+greeting = typer.Typer()
+greeting.command()(greet)
+nonsense = 1
+
+
+@pytest.fixture
+def plugins(monkeypatch):
+    entries = {"greet": "greet", "welcome": "greeting", "odd": "nonsense", "gone": "absent"}
+    found = [
+        EntryPoint(name, f"{__name__}:{value}", commands.ENTRY_POINTS)
+        for name, value in entries.items()
+    ]
+    found.append(EntryPoint("fit", f"{__name__}:greet", commands.ENTRY_POINTS))
+    monkeypatch.setattr(commands, "entry_points", lambda group: found)
+
+
+def test_plugins_add_commands(plugins):
+    for name in ("greet", "welcome"):
+        assert output(name, "--name", "me") == "hello me\n"
+    assert "Learn a skill" in output("fit", "--help")
+
+
+def test_a_broken_plugin_is_one_line_and_spares_the_others(plugins):
+    result = run("--help")
+    assert result.exit_code == 0
+    assert "welcome" in result.stdout
+    lines = result.stderr.splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("tpgmm: warning: the command 'gone' of a plugin cannot be")
+    assert "'odd'" in lines[1]
+    result = run("gone")
+    assert result.exit_code == 2
+    assert "No such command 'gone'" in result.stderr
