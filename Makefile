@@ -15,7 +15,7 @@ help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-12s %s\n", $$1, $$2 }' Makefile
 
 demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
-	$(BIN)/tpgmm demo --out out/demo
+	OMP_NUM_THREADS=1 $(BIN)/tpgmm demo --out out/demo
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)

@@ -229,7 +229,9 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         """
         self._validate_params()
         demonstrations = check_demonstrations(X)
-        operators = tuple(self.operators or (Canonical(),))
+        operators = (Canonical(),) if self.operators is None else tuple(self.operators)
+        if not operators:
+            raise DataError("operators is empty: give at least one, for example [Canonical()]")
         for operator in operators:
             if not isinstance(operator, Operator):
                 raise DataError(f"operators holds Operator objects, got {operator!r}")

@@ -20,7 +20,7 @@ app = typer.Typer()
 #: Heading, entry of the metrics, figures shown, digits behind the point.
 COLUMNS = (
     ("grasp\nmm", "grasp position error [mm]", ("median", "p95"), 2),
-    ("grasp\ndeg", "grasp orientation error [deg]", ("median", "p95"), 2),
+    ("grasp\ndeg", "grasp orientation error [deg]", ("median", "p95"), 3),
     ("shoulder\nRMSE rad", "shoulder RMSE [rad]", ("median", "p95"), 3),
     ("freq.\n%", "frequency error [%]", ("median", "p95"), 1),
     ("ampl.\n%", "amplitude error [%]", ("median", "p95"), 1),
@@ -58,11 +58,14 @@ def demo(
     learns them, reproduces the skill for bottle poses never seen, measures how well, and draws
     the paper's figures 3 to 6.
     """
+    import torch
     from rich.console import Console
 
     from tpgmm_datasets.bottle_experiment import BottleExperiment
     from tpgmm_datasets.bottle_shaking import BottleShaking
 
+    # the matrices are small: a second thread on a busy machine only spins
+    torch.set_num_threads(1)
     console = Console()
     with _progress(console, BottleExperiment.STAGES) as report:
         metrics = BottleExperiment(
@@ -79,7 +82,8 @@ def demo(
     for line in summary(metrics):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     console.print(
-        f"{metrics['seconds']:.0f} s; data set, model, figures and metrics.json in {out}",
+        f"seed {random_state}, {metrics['seconds']:.0f} s; "
+        f"data set, model, figures and metrics.json in {out}",
         markup=False,
         highlight=False,
         soft_wrap=True,
