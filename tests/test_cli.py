@@ -51,7 +51,8 @@ def test_version_and_help_need_no_command():
 
 @pytest.mark.parametrize(
     "command",
-    ["demo", "fit", "reproduce", "plot", "dataset info", "dataset check", "dataset plot"],
+    ["demo", "fit", "reproduce", "plot"]
+    + [f"dataset {name}" for name in ("info", "check", "plot", "generate", "convert")],
 )
 def test_the_help_of_every_command_has_an_example(command):
     assert f"Example: tpgmm {command}" in output(*command.split(), "--help")

@@ -20,6 +20,7 @@ from tpgmm_datasets import (
     LinkPose,
     load_lerobot,
 )
+from tpgmm_datasets.layout import Feature
 from tpgmm_torch import quaternions
 from tpgmm_torch.demonstrations import Frame
 
@@ -86,7 +87,8 @@ def test_a_frame_is_constant_or_moves_and_is_chosen_by_place_or_name(root):
 def test_the_name_of_a_feature_stands_for_its_pose(root):
     named = load_lerobot(root)
     found = load_lerobot(root, frames={"bottle": "observation.environment_state"})
-    other = load_lerobot(root, frames={"flask": "observation.environment_state"})
+    renamed = FramePose("observation.environment_state", slice(0, 7))
+    other = load_lerobot(root, frames={"flask": renamed})
     for a, b, c in zip(named, found, other, strict=True):
         assert_equal([a.frames["bottle"].position], [b.frames["bottle"].position])
         assert_equal([a.frames["bottle"].position], [c.frames["flask"].position])
@@ -198,3 +200,12 @@ def test_idle_starts_and_ends_are_trimmed_but_events_stay(root):
 def test_time_is_the_grid_of_the_rate(root):
     for demonstration in load_lerobot(root):
         assert demonstration.time.tolist() == [k / FPS for k in range(len(demonstration))]
+
+
+def test_a_frame_that_is_stored_by_another_name_is_not_taken_for_it():
+    names = [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    feature = Feature("observation.environment_state", "float32", (7,), tuple(names))
+    with pytest.raises(DatasetError, match=r"'cup' is not stored there, \['bottle'\] are"):
+        FramePose("observation.environment_state").select("cup", feature)
+    named = FramePose("observation.environment_state", columns=names)
+    assert named.select("cup", feature) == list(range(7))

@@ -252,3 +252,20 @@ def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
     )
     assert result.returncode == 0, result.stderr[-3000:]
     assert "all equal" in result.stdout
+
+
+def test_units_that_are_no_angles_are_declared_and_read_back(tmp_path):
+    time = np.arange(5) / 10
+    values = np.stack((np.linspace(0, 1, 5), np.linspace(0, 90, 5)), axis=1)
+    demonstration = Demonstration(time, values, joint_names=("elbow", "gripper"))
+    with pytest.raises(DatasetError, match="units gives 'finger' the unit 'raw'"):
+        save_lerobot([demonstration], tmp_path / "a", fps=10, task="t", units={"finger": "raw"})
+    with pytest.raises(DatasetError, match="the unit 'ticks'"):
+        save_lerobot(
+            [demonstration], tmp_path / "a", fps=10, task="t", units={"elbow": "ticks"}
+        )
+    save_lerobot([demonstration], tmp_path / "a", fps=10, task="t", units={"gripper": "raw"})
+    info = json.loads((tmp_path / "a" / "meta" / "info.json").read_text())
+    assert info["features"]["observation.state"]["info"]["units"] == ["rad", "raw"]
+    [found] = load_lerobot(tmp_path / "a")
+    np.testing.assert_allclose(found.joints, values, rtol=1e-6)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from examples.leave_one_out import G1_HAND, grasp
 from tests.robot_zoo import G1_JOINTS, G1_PATH
 from tpgmm_datasets import (
     DatasetError,
@@ -39,27 +40,27 @@ def test_g1_has_nested_names_absent_videos_and_radians():
 
 
 def test_g1_joints_are_those_of_its_urdf_and_the_bottle_is_where_the_hand_closes():
-    robot = Robot.from_urdf(G1_PATH, ["right_rubber_hand"], joints=G1_JOINTS[3:])
-
-    def closing(demonstration):
-        names = demonstration.joint_names
-        fingers = [i for i, name in enumerate(names) if name.startswith("kRightHand")]
-        opening = demonstration.joints[:, fingers[:4]].sum(dim=1)
-        return float(demonstration.time[opening.diff().argmin()])
-
+    robot = Robot.from_urdf(G1_PATH, [G1_HAND], joints=G1_JOINTS[3:])
     demonstrations = load_lerobot(
         DATA / "g1_bottle",
         robot=robot,
-        events={"close": closing},
-        frames={"bottle": LinkPose("right_rubber_hand", "close")},
+        events={"close": lambda d: grasp(d)[0], "open": lambda d: grasp(d)[1]},
+        frames={"bottle": LinkPose(G1_HAND, "close")},
     )
     for demonstration in demonstrations:
         assert demonstration.joint_names == robot.joint_names
-        step = int((demonstration.time - demonstration.events["close"]).abs().argmin())
+        closing, opening = demonstration.events["close"], demonstration.events["open"]
+        # the hand closes once more at the end, when the bottle stands and the arm is back
+        assert 1 < closing < 0.6 * demonstration.duration
+        assert closing + 3 < opening < 0.9 * demonstration.duration
+        step = int((demonstration.time - closing).abs().argmin())
         state = robot.state(demonstration.joints[step])
-        position = demonstration.frames["bottle"].position
-        torch.testing.assert_close(position, state.position("right_rubber_hand"))
-        assert 0.1 < float(torch.linalg.vector_norm(position)) < 1.0
+        x, y, z = demonstration.frames["bottle"].position
+        torch.testing.assert_close(torch.stack((x, y, z)), state.position(G1_HAND))
+        # the table in front of the robot; at the end the hand is further to the right
+        assert 0.25 < x < 0.4
+        assert -0.2 < y < -0.05
+        assert 0.1 < z < 0.2
 
 
 def test_so101_says_that_it_is_not_in_radians():

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_datasets.bottle_figures import draw_figures
-from tpgmm_datasets.bottle_shaking import HANDS, SHOULDERS, BottleShaking
+from tpgmm_datasets.bottle_shaking import HANDS, SHOULDERS, TASK, BottleShaking
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
 from tpgmm_torch import (
@@ -164,7 +164,7 @@ class BottleExperiment:
         if (path / "meta" / "info.json").is_file():
             shutil.rmtree(path)
         rate = round(self.skill.rate)
-        save_lerobot(demonstrations, path, fps=rate, task="shake", robot_type="upper_body")
+        save_lerobot(demonstrations, path, fps=rate, task=TASK, robot_type="upper_body")
         return load_lerobot(
             path, robot=self.skill.robot, frames={"bottle": "observation.environment_state"}
         )

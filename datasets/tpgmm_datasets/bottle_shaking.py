@@ -29,8 +29,10 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.rollout import minimum_jerk
 
-__all__ = ["BottleShaking", "upper_body"]
+__all__ = ["TASK", "BottleShaking", "upper_body"]
 
+#: What LeRobot data sets of the skill call it.
+TASK = "shake the bottle"
 HANDS = ("l_hand", "r_hand")
 SHOULDERS = ("l_shoulder_pitch", "r_shoulder_pitch")
 #: Where the hands hold the bottle, in its frame [m], and how they are turned there.

@@ -32,29 +32,48 @@ Features = dict[str, dict[str, Any]]
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 EVENT = "event."
+#: What joints of demonstrations are in: the last is a coordinate's own scale.
+JOINT_UNITS = ("rad", "m", "raw")
 #: Fraction of a period by which the time of a step may be off the grid of ``fps``.
 TIME_TOLERANCE = 0.01
 
 
-def features_of(demonstrations: Sequence[Demonstration], dtype: str) -> Features:
+def features_of(
+    demonstrations: Sequence[Demonstration], dtype: str, units: Mapping[str, str] | None = None
+) -> Features:
     """What ``info.json`` declares for these demonstrations.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    dtype : {"float32", "float64"}
+    units : mapping of str to str, optional
+        ``"m"`` or ``"raw"`` by name, for joints that are not in radians.
 
     Raises
     ------
     DatasetError
-        If they have no joints, or a name cannot be stored.
+        If they have no joints, a name cannot be stored, or ``units`` name something else.
     """
     first = demonstrations[0]
     if first.n_joints == 0:
         raise DatasetError("demonstrations without joints cannot be stored: LeRobot needs them")
     names = None if first.joint_names is None else list(first.joint_names)
-    units = with_pose_units(names, ["rad"] * first.n_joints)
-    joints = _vector(dtype, first.n_joints, names, units)
+    given = dict(units or {})
+    for name, unit in given.items():
+        if name not in (names or ()) or unit not in JOINT_UNITS:
+            raise DatasetError(
+                f"units gives {name!r} the unit {unit!r}; the joints are {names}, "
+                f"their units in demonstrations {list(JOINT_UNITS)}"
+            )
+    listed = [given.get(name, "rad") for name in names or [""] * first.n_joints]
+    joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
     features = {STATE: joints}
     if first.frames:
         parts = [f"{frame}.{part}" for frame in first.frames for part in POSE_PARTS]
-        units = POSE_UNITS * len(first.frames)
-        features[ENVIRONMENT] = _vector(dtype, len(parts), parts, units)
+        features[ENVIRONMENT] = _vector(
+            dtype, len(parts), parts, POSE_UNITS * len(first.frames)
+        )
     for event in sorted({event for item in demonstrations for event in item.events}):
         if "/" in event or not event:
             raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")

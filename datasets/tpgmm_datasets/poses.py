@@ -11,7 +11,7 @@ import torch
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.layout import Feature
-from tpgmm_datasets.names import POSE_PARTS
+from tpgmm_datasets.names import pose_groups
 from tpgmm_torch import quaternions
 from tpgmm_torch.demonstrations import UNIT_NORM_TOLERANCE, Demonstration, Frame
 
@@ -33,7 +33,7 @@ class FramePose:
         Name of the feature.
     columns : sequence of int or str, or slice, optional
         Which of its values: the position's three, then the rotation's, by place or by name.
-        By default those that are called ``<frame>.x``, ..., else all.
+        By default those that are called ``<frame>.x``, ...; all where none are so called.
     rotation : {"wxyz", "xyzw", "rotvec", "euler", "yaw", None}, default="wxyz"
         How the orientation is written: a quaternion, w first or last; a rotation vector;
         roll, pitch and yaw about the fixed x, y and z axes (as in URDF); yaw only; None for
@@ -69,10 +69,14 @@ class FramePose:
             places = places[self.columns]
         elif self.columns is not None:
             places = [self._place(column, feature) for column in self.columns]
-        elif feature.names and self.rotation == "wxyz":
-            own = [f"{name}.{part}" for part in POSE_PARTS]
-            if set(own) <= set(feature.names):
-                places = [feature.names.index(part) for part in own]
+        elif self.rotation == "wxyz" and (stored := pose_groups(feature.names)):
+            if name not in stored:
+                raise DatasetError(
+                    f"frame {name!r} is not stored there, {sorted(stored)} are. To take one of "
+                    "them by another name, give FramePose(..., columns=[...])",
+                    column=self.feature,
+                )
+            places = list(stored[name])
         if len(places) != needed:
             raise DatasetError(
                 f"frame {name!r} needs {needed} values (position, rotation as "

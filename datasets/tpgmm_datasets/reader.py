@@ -55,9 +55,10 @@ def load_lerobot(
         assumes radians and refuses what cannot be radians.
     frames : mapping of str to str, FramePose, LinkPose or Frame, optional
         Where the pose of each frame is: in a feature (its name alone stands for x y z and a
-        quaternion w x y z, constant from the first row on), where a link is at an event, or
-        given. The default is every pose that the names of ``observation.environment_state``
-        tell of (``bottle.x`` ... ``bottle.qz``), constant if it never changes.
+        quaternion w x y z, constant from the first row on; if the feature names the poses
+        in it, the one of this name), where a link is at an event, or given. The default is
+        every pose that the names of ``observation.environment_state`` tell of (``bottle.x``
+        ... ``bottle.qz``), constant if it never changes.
     events : mapping of str to callable, optional
         Functions from the demonstration, with all values of the joint feature, to a time
         [s]. Columns ``event.*`` are found by themselves.

@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,7 @@ def save_lerobot(
     fps: int,
     task: str | Sequence[str],
     robot_type: str | None = None,
+    units: Mapping[str, str] | None = None,
     dtype: str = "float32",
     append: bool = False,
     file_megabytes: float = 100,
@@ -69,6 +70,9 @@ def save_lerobot(
         What was done, for all or for each demonstration.
     robot_type : str, optional
         Name of the robot, for the metadata.
+    units : mapping of str to str, optional
+        ``"m"`` or ``"raw"`` (a scale of its own, like a gripper's) by name, for joints that
+        are not in radians.
     dtype : {"float32", "float64"}, default="float32"
         How joints and frames are stored. LeRobot's policies read float32 in either case.
     append : bool, default=False
@@ -114,7 +118,7 @@ def save_lerobot(
         "codebase_version": "v3.0",
         "robot_type": robot_type,
         "fps": int(fps),
-        "features": features_of(demonstrations, dtype),
+        "features": features_of(demonstrations, dtype, units),
         "chunks_size": int(chunk_files),
         "data_files_size_in_mb": file_megabytes,
         "video_files_size_in_mb": 200,

@@ -1,10 +1,10 @@
-"""``tpgmm dataset``: what is in a LeRobot data set, and what is wrong with it."""
+"""``tpgmm dataset``: look at LeRobot data sets, and write them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,10 +13,18 @@ from tpgmm_torch.cli import options
 if TYPE_CHECKING:
     from tpgmm_datasets import DatasetInfo
     from tpgmm_datasets.description import ColumnInfo
+    from tpgmm_datasets.layout import Layout
+    from tpgmm_torch.demonstrations import Demonstration
 
 __all__ = ["app"]
 
-app = typer.Typer(help="Look at a LeRobot data set: what is in it, and what is wrong.")
+app = typer.Typer(help="Look at LeRobot data sets, or write one: generated, or converted.")
+
+Target = Annotated[Path, typer.Argument(help="Folder of the set to write.")]
+Append = Annotated[
+    bool, typer.Option("--append", help="Add the episodes to the set in PATH, if there is one.")
+]
+CONVERT = "Example: tpgmm dataset convert recordings/arm out/arm --units deg --rate 30"
 
 
 @app.command(epilog="Example: tpgmm dataset info out/demo/dataset")
@@ -88,6 +96,111 @@ def plot(
     out.parent.mkdir(parents=True, exist_ok=True)
     drawing.savefig(out, dpi=110)
     typer.echo(out)
+
+
+@app.command(epilog="Example: tpgmm dataset generate out/shake --n-demonstrations 20")
+def generate(
+    path: Target,
+    n_demonstrations: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 10,
+    random_state: Annotated[
+        int, typer.Option(min=0, help="Seed; appended episodes differ if it does.")
+    ] = 0,
+    rate: Annotated[int, typer.Option(min=1, help="Time steps per second.")] = 100,
+    append: Append = False,
+) -> None:
+    """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'."""
+    from tpgmm_datasets import DatasetError
+    from tpgmm_datasets.bottle_shaking import TASK, BottleShaking
+
+    if path.exists() and not append:  # the writer would say so too, ten seconds later
+        raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
+    demonstrations = BottleShaking(rate=rate).demonstrations(n_demonstrations, random_state)
+    _save(demonstrations, path, append, fps=rate, task=TASK, robot_type="upper_body")
+
+
+@app.command(epilog=CONVERT)
+def convert(
+    source: options.Dataset,
+    path: Target,
+    append: Append = False,
+    task: Annotated[
+        str | None, typer.Option(help="What is done, for all. Default: each episode's own.")
+    ] = None,
+    robot: options.RobotFile = None,
+    link: options.Links = None,
+    robot_joint: options.RobotJoints = None,
+    coordinate: options.Coordinates = None,
+    frame: options.Frames = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    rate: options.Rate = None,
+) -> None:
+    """Write a data set anew: layout v3.0, joints in radians, episodes and joints as chosen.
+
+    Reads any set that the other commands read, v2.1 too. Joints, frames and
+    events are kept, as float32; the action becomes the next joint state, and
+    pictures stay behind.
+    """
+    from tpgmm_datasets.hub import local_folder
+    from tpgmm_datasets.layout import open_layout
+
+    layout = open_layout(local_folder(source))
+    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
+    demonstrations = options.read_demonstrations(
+        source, kinematics, frame, episodes, units, joints, rate
+    )
+    tasks = [task] * len(demonstrations) if task else _tasks(layout, episodes)
+    _save(
+        demonstrations,
+        path,
+        append,
+        fps=rate or layout.fps,
+        task=tasks,
+        robot_type=layout.robot_type,
+        units=_units(layout, units, joints, demonstrations[0].joint_names),
+    )
+
+
+def _units(
+    layout: Layout, texts: Sequence[str] | None, joints: str | None, names: Sequence[str] | None
+) -> dict[str, str]:
+    """Units of the joints that are no angles once they are read: told here, or by the set."""
+    from tpgmm_datasets.joints import joint_feature
+
+    feature = layout.features[joints or joint_feature(layout)]
+    told = options.parse_units(texts or [])
+    if told == "auto":
+        told = dict(zip(feature.names or (), feature.units or (), strict=False))
+    elif isinstance(told, str):
+        told = dict.fromkeys(names or (), told)
+    stored = {"m": "m", "mm": "m", "raw": "raw"}
+    chosen = {name: stored[unit] for name, unit in told.items() if unit in stored}
+    return {name: unit for name, unit in chosen.items() if name in (names or ())}
+
+
+def _tasks(layout: Layout, episodes: str | None) -> list[str]:
+    """The task of each chosen episode, of which it must have one."""
+    from tpgmm_datasets.reader import select_episodes
+    from tpgmm_torch.exceptions import DataError
+
+    chosen = select_episodes(layout, options.parse_episodes(episodes))
+    for episode in chosen:
+        if len(episode.tasks) != 1:
+            raise DataError(
+                f"episode {episode.index} has {len(episode.tasks)} tasks, not one: give --task"
+            )
+    return [episode.tasks[0] for episode in chosen]
+
+
+def _save(
+    demonstrations: Sequence[Demonstration], path: Path, append: bool, **described: Any
+) -> None:
+    from tpgmm_datasets import save_lerobot
+
+    save_lerobot(demonstrations, path, append=append, **described)
+    rows = sum(map(len, demonstrations))
+    typer.echo(f"{len(demonstrations)} episodes, {rows} rows written to {path}")
 
 
 def _summary(found: DatasetInfo) -> dict[str, object]:

@@ -30,39 +30,10 @@ LEARNING, REPRODUCING = "Learning", "Reproduction (saved with the model)"
 def fit(
     dataset: options.Dataset,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the model goes.")],
-    robot: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URDF",
-            rich_help_panel=options.ROBOT,
-            help="The robot's URDF file; 'upper_body' is the one that comes with the package. "
-            "Without a robot, joints alone are learned.",
-        ),
-    ] = None,
-    link: Annotated[
-        list[str] | None,
-        typer.Option(
-            rich_help_panel=options.ROBOT, help="A link of interest (a hand), repeatable."
-        ),
-    ] = None,
-    robot_joint: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="PATTERN",
-            rich_help_panel=options.ROBOT,
-            help="Joints that move, repeatable, like 'left_*'; the others stand still. "
-            "Default: all.",
-        ),
-    ] = None,
-    coordinate: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME",
-            rich_help_panel=options.ROBOT,
-            help="A value that is learned like a joint but moves no link (a gripper), "
-            "repeatable.",
-        ),
-    ] = None,
+    robot: options.RobotFile = None,
+    link: options.Links = None,
+    robot_joint: options.RobotJoints = None,
+    coordinate: options.Coordinates = None,
     poses: Annotated[
         list[str] | None,
         typer.Option(

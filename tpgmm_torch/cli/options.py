@@ -73,6 +73,36 @@ Rate = Annotated[
     float | None,
     typer.Option(min=1e-3, rich_help_panel=DATA, help="Resample to so many steps per second."),
 ]
+RobotFile = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URDF",
+        rich_help_panel=ROBOT,
+        help="The robot's URDF file; 'upper_body' is the one that comes with the package. "
+        "Without a robot, joints alone.",
+    ),
+]
+Links = Annotated[
+    list[str] | None,
+    typer.Option(rich_help_panel=ROBOT, help="A link of interest (a hand), repeatable."),
+]
+RobotJoints = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="PATTERN",
+        rich_help_panel=ROBOT,
+        help="Joints that move, repeatable, like 'left_*'; the others stand still. "
+        "Default: all.",
+    ),
+]
+Coordinates = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME",
+        rich_help_panel=ROBOT,
+        help="A value that is learned like a joint but moves no link (a gripper), repeatable.",
+    ),
+]
 AlignmentMethod = Annotated[
     Literal["dtw", "barycenter", "linear", "none"],
     typer.Option(
