@@ -16,6 +16,7 @@ from tpgmm_torch.exceptions import DataError
 __all__ = [
     "affine",
     "cholesky",
+    "common_shape",
     "condition",
     "from_information",
     "information",
@@ -23,6 +24,11 @@ __all__ = [
     "moment_match",
     "product",
 ]
+
+
+def common_shape(*shapes: torch.Size) -> torch.Size:
+    """:func:`torch.broadcast_shapes`, which is slow, but not where the shapes are equal."""
+    return shapes[0] if len(set(shapes)) == 1 else torch.broadcast_shapes(*shapes)
 
 
 def cholesky(matrix: Tensor, name: str) -> Tensor:
@@ -140,7 +146,7 @@ def information(
         vector = precision @ targets
         return precision, vector, targets.mT @ vector
     n = jacobian.shape[-1]
-    batch = torch.broadcast_shapes(jacobian.shape[:-2], targets.shape[:-2], factor.shape[:-2])
+    batch = common_shape(jacobian.shape[:-2], targets.shape[:-2], factor.shape[:-2])
     right = torch.cat((jacobian.expand(*batch, -1, -1), targets.expand(*batch, -1, -1)), dim=-1)
     white = torch.linalg.solve_triangular(factor, right, upper=False)
     gram = white.mT @ white

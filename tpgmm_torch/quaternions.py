@@ -10,6 +10,8 @@ matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; t
 three rows of ``Hbar``, ``Hbar*`` of eq. (11), are :func:`vector_matrix`.
 """
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -32,6 +34,53 @@ __all__ = [
     "to_matrix",
     "vector_matrix",
 ]
+
+
+#: Which entries of q = (q_1, q_2, q_3, q_4) stand in the matrices of eq. (20), with their sign.
+LEFT = ((1, -2, -3, -4), (2, 1, -4, 3), (3, 4, 1, -2), (4, -3, 2, 1))
+RIGHT = ((1, -2, -3, -4), (2, 1, 4, -3), (3, -4, 1, 2), (4, 3, -2, 1))
+#: Which entries of a rotation matrix, counted row by row, add up to 4 q q^T - I.
+OUTER = (
+    ((1, 5, 9), (8, -6), (3, -7), (4, -2)),
+    ((8, -6), (1, -5, -9), (4, 2), (3, 7)),
+    ((3, -7), (4, 2), (-1, 5, -9), (8, 6)),
+    ((4, -2), (3, 7), (8, 6), (-1, -5, 9)),
+)
+
+
+@cache
+def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Structure constants: every function here is a product with one of these matrices.
+
+    That is a few operations where the formulas written out take dozens, and what is done at
+    each control tick costs per operation.
+    """
+
+    def linear(table: object, width: int) -> Tensor:
+        """Coefficients (width, entries) of a table of signed places."""
+        entries = [entry for row in table for entry in row]  # type: ignore[attr-defined]
+        matrix = torch.zeros(width, len(entries), dtype=dtype)
+        for column, entry in enumerate(entries):
+            for place in entry if isinstance(entry, tuple) else (entry,):
+                matrix[abs(place) - 1, column] = 1.0 if place > 0 else -1.0
+        return matrix
+
+    # a constant made while inference mode is on could not serve where gradients are wanted
+    with torch.inference_mode(False):
+        conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
+        left, right = linear(LEFT, 4), linear(RIGHT, 4)
+        # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
+        turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
+        pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
+        constants = {
+            "conjugate": conjugate,
+            "left": left,
+            "right": right,
+            "vector": right[:, 4:],
+            "rotation": pairs[..., 1:, 1:].reshape(16, 9),
+            "outer": linear(OUTER, 9),
+        }
+        return constants[name].to(device)
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
@@ -61,17 +110,7 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 4)
     """
-    w1, x1, y1, z1 = a.unbind(-1)
-    w2, x2, y2, z2 = b.unbind(-1)
-    return torch.stack(
-        (
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-        ),
-        dim=-1,
-    )
+    return (left_matrix(a) @ b[..., None])[..., 0]
 
 
 def conjugate(q: Tensor) -> Tensor:
@@ -85,7 +124,7 @@ def conjugate(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 4)
     """
-    return torch.cat((q[..., :1], -q[..., 1:]), dim=-1)
+    return q * _constant("conjugate", q.dtype, q.device)
 
 
 def left_matrix(q: Tensor) -> Tensor:
@@ -99,9 +138,7 @@ def left_matrix(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 4, 4)
     """
-    w, x, y, z = q.unbind(-1)
-    rows = (w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w)
-    return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+    return (q @ _constant("left", q.dtype, q.device)).unflatten(-1, (4, 4))
 
 
 def right_matrix(q: Tensor) -> Tensor:
@@ -115,9 +152,7 @@ def right_matrix(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 4, 4)
     """
-    w, x, y, z = q.unbind(-1)
-    rows = (w, -x, -y, -z, x, w, z, -y, y, -z, w, x, z, y, -x, w)
-    return torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
+    return (q @ _constant("right", q.dtype, q.device)).unflatten(-1, (4, 4))
 
 
 def vector_matrix(q: Tensor) -> Tensor:
@@ -133,9 +168,7 @@ def vector_matrix(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 3, 4)
     """
-    w, x, y, z = q.unbind(-1)
-    rows = (x, w, z, -y, y, -z, w, x, z, y, -x, w)
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 4))
+    return (q @ _constant("vector", q.dtype, q.device)).unflatten(-1, (3, 4))
 
 
 def normalize(q: Tensor) -> Tensor:
@@ -294,12 +327,8 @@ def to_matrix(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 3, 3)
     """
-    w, x, y, z = q.unbind(-1)
-    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
-    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
-    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
-    rows = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx)
-    return torch.stack((*rows, 1 - xx - yy), dim=-1).unflatten(-1, (3, 3))
+    pairs = (q[..., :, None] * q[..., None, :]).flatten(-2)
+    return (pairs @ _constant("rotation", q.dtype, q.device)).unflatten(-1, (3, 3))
 
 
 def from_matrix(matrix: Tensor) -> Tensor:
@@ -323,24 +352,10 @@ def from_matrix(matrix: Tensor) -> Tensor:
     """
     if matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
-    m = matrix
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    flat = matrix.flatten(-2) @ _constant("outer", matrix.dtype, matrix.device)
+    outer = flat.unflatten(-1, (4, 4)) + torch.eye(4, dtype=flat.dtype, device=flat.device)
     # column i of the symmetric matrix 4 q q^T, for q_i the largest entry
-    ww4 = 1 + xx + yy + zz
-    wx4, wy4, wz4 = (
-        m[..., 2, 1] - m[..., 1, 2],
-        m[..., 0, 2] - m[..., 2, 0],
-        m[..., 1, 0] - m[..., 0, 1],
-    )
-    xy4, xz4, yz4 = (
-        m[..., 1, 0] + m[..., 0, 1],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 2, 1] + m[..., 1, 2],
-    )
-    xx4, yy4, zz4 = 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz
-    rows = (ww4, wx4, wy4, wz4, wx4, xx4, xy4, xz4, wy4, xy4, yy4, yz4, wz4, xz4, yz4, zz4)
-    outer = torch.stack(rows, dim=-1).unflatten(-1, (4, 4))
-    largest = torch.stack((ww4, xx4, yy4, zz4), dim=-1).argmax(dim=-1)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
     index = largest[..., None, None].expand(*largest.shape, 1, 4)
     q = outer.gather(-2, index).squeeze(-2)
     q = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)

@@ -256,7 +256,7 @@ def _within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> T
 
 def _hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:
     """Signs (..., K, D) that bring each mean quaternion to the side of the present one."""
-    batch = torch.broadcast_shapes(mean.shape[:-2], present.shape[:-1])
+    batch = gaussians.common_shape(mean.shape[:-2], present.shape[:-1])
     signs = mean.new_ones(*batch, *mean.shape[-2:])
     for start in starts:
         block = slice(start, start + 4)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator
 
@@ -59,19 +60,21 @@ class Stack(Operator):
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """Jacobians and displacements stacked, matrices on the diagonal."""
         parts = [operator.linearize(state, frames) for operator in self.operators]
-        like, batch = state.joints, state.joints.shape[:-1]
+        like = state.joints
         identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
         jacobians, matrices, displacements = [], [], []
         for part in parts:
             rows = part.displacement.shape[-1]
             jacobian = identity if part.jacobian is None else part.jacobian
             matrix = identity.new_ones(rows).diag() if part.matrix is None else part.matrix
-            batch = torch.broadcast_shapes(
-                batch, jacobian.shape[:-2], matrix.shape[:-2], part.displacement.shape[:-1]
-            )
             jacobians.append(jacobian)
             matrices.append(matrix)
             displacements.append(part.displacement)
+        batch = common_shape(
+            like.shape[:-1],
+            *(matrix.shape[:-2] for matrix in (*jacobians, *matrices)),
+            *(vector.shape[:-1] for vector in displacements),
+        )
         rows, columns = sum(m.shape[-2] for m in matrices), sum(m.shape[-1] for m in matrices)
         diagonal = like.new_zeros(*batch, rows, columns)
         row = column = 0
@@ -88,7 +91,7 @@ class Stack(Operator):
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """The coordinates side by side."""
         parts = [operator.coordinates(state, frames) for operator in self.operators]
-        batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        batch = common_shape(*(part.shape[:-1] for part in parts))
         return torch.cat([part.expand(*batch, part.shape[-1]) for part in parts], dim=-1)
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
