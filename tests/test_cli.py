@@ -1,5 +1,6 @@
 """The command ``tpgmm``: what it writes, what it prints, and how it refuses."""
 
+import inspect
 import json
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from tpgmm_datasets import demonstrations_from_frame, save_lerobot
 from tpgmm_datasets.bottle_shaking import BottleShaking
 from tpgmm_torch import Demonstration, Poses, TaskParameterizedGMM
 from tpgmm_torch.cli.fit import default_operators
+from tpgmm_torch.cli.fit import fit as fit_command
 from tpgmm_torch.operators.text import format_operator
 
 PNG = b"\x89PNG"
@@ -264,3 +266,12 @@ def test_unknown_joints_and_files_in_the_way_are_refused(dataset, fitted, tmp_pa
     assert "exists and is not a saved model" in line
     line = refusal("dataset", "plot", dataset, "--out", tmp_path / "file" / "d.png")
     assert str(tmp_path / "file") in line
+
+
+def test_fit_has_the_estimators_defaults():
+    options = inspect.signature(fit_command).parameters
+    estimator = inspect.signature(TaskParameterizedGMM).parameters
+    shared = options.keys() & estimator.keys() - {"robot", "operators", "device", "dtype"}
+    assert len(shared) > 8
+    for name in shared - {"random_state"}:
+        assert options[name].default == estimator[name].default, name

@@ -13,36 +13,14 @@ from hypothesis import strategies as st
 from sklearn.mixture import GaussianMixture
 from torch.distributions import MultivariateNormal
 
-from tpgmm_torch.exceptions import ConvergenceWarning, DegenerateComponentWarning
+from tests.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
+from tpgmm_torch.exceptions import DegenerateComponentWarning
 from tpgmm_torch.mixture import BlockGaussianMixture
 from tpgmm_torch.sufficient_statistics import (
     PackedStatistics,
     WhitenedStatistics,
     statistics,
 )
-
-COVARIANCE_TYPES = ("full", "tied", "diag", "spherical")
-WIDTHS = (2, 3)
-
-
-def fitted(model, X, *categories):
-    """Fit and return the model; only warnings of the given categories may come."""
-    with warnings.catch_warnings():
-        for category in categories or (ConvergenceWarning,):
-            warnings.simplefilter("ignore", category)
-        return model.fit(X)
-
-
-@pytest.fixture
-def clusters():
-    """Three anisotropic clusters, unequal columns, (300, 5)."""
-    rng = np.random.RandomState(0)
-    parts = [rng.randn(100, 5) @ rng.randn(5, 5) + 4 * rng.randn(5) for _ in range(3)]
-    return np.concatenate(parts) * [1.0, 10.0, 0.1, 1.0, 3.0] + [0.0, 100.0, 0.0, -5.0, 0.0]
-
-
-def split(X, widths=WIDTHS):
-    return np.split(X, np.cumsum(widths)[:-1], axis=-1)
 
 
 @pytest.fixture

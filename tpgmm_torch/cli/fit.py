@@ -73,7 +73,7 @@ def fit(
             rich_help_panel=LEARNING,
             help="Added to the covariances' diagonal, relative to each coordinate's variance.",
         ),
-    ] = 1e-6,
+    ] = 1e-5,
     tol: Annotated[
         float,
         typer.Option(
