@@ -381,3 +381,14 @@ def test_a_model_stands_on_its_files_alone(saved, tmp_path):
     [a] = TaskParameterizedGMM.load(moved).predict(handlings()[:1])
     [b] = skills.hands().predict(handlings()[:1])
     assert torch.equal(a.joints, b.joints)
+
+
+def test_a_model_saved_on_another_device_loads_where_it_is_wanted(tmp_path):
+    model = canonical()
+    model.set_params(device="meta").save(
+        tmp_path / "model"
+    )  # stands for a GPU that is not here
+    loaded = TaskParameterizedGMM.load(tmp_path / "model", device="cpu")
+    assert loaded.device == "cpu"
+    assert loaded.means_[0].device.type == "cpu"
+    assert torch.equal(loaded.means_[0], model.means_[0])

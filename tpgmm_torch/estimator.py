@@ -304,7 +304,9 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         save_estimator(self, path)
 
     @classmethod
-    def load(cls, path: str | Path, custom: Sequence[type] = ()) -> Self:
+    def load(
+        cls, path: str | Path, custom: Sequence[type] = (), device: str | None = None
+    ) -> Self:
         """Read a model that :meth:`save` wrote; nothing in it is executed.
 
         Parameters
@@ -312,13 +314,15 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         path : str or Path
         custom : sequence of type
             User-defined operator and robot classes that the model uses.
+        device : str, optional
+            Where tensors shall live; the default is where they lived when it was saved.
 
         Raises
         ------
         ModelFileError
             If it is truncated, tampered with, of another version, or does not fit together.
         """
-        model: Self = load_estimator(cls, path, custom)
+        model: Self = load_estimator(cls, path, custom, device)
         return model
 
     def _kinematics(

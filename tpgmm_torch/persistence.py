@@ -280,7 +280,9 @@ def save_estimator(model: Any, path: str | Path) -> None:
     write_model(path, config, tensors)
 
 
-def load_estimator(cls: type[Any], path: str | Path, custom: Sequence[type] = ()) -> Any:
+def load_estimator(
+    cls: type[Any], path: str | Path, custom: Sequence[type] = (), device: str | None = None
+) -> Any:
     """Read a fitted :class:`TaskParameterizedGMM`; its method ``load`` calls this.
 
     Parameters
@@ -291,6 +293,8 @@ def load_estimator(cls: type[Any], path: str | Path, custom: Sequence[type] = ()
         The directory.
     custom : sequence of type
         User-defined operator and robot classes that the model uses.
+    device : str, optional
+        Instead of the one that the model was saved from.
 
     Returns
     -------
@@ -314,6 +318,7 @@ def load_estimator(cls: type[Any], path: str | Path, custom: Sequence[type] = ()
                 f"{sorted(tensors)}"
             )
         model = cls(operators=operators, robot=robot, **config["parameters"])
+        model.device = device or model.device
         model._validate_params()
         tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
         model.weights_, model.time_ = tensors["weights"], tensors["time"]
