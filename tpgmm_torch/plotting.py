@@ -12,6 +12,7 @@ from torch import Tensor
 from tpgmm_torch.demonstrations import Demonstration, Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.local_data import local_data
 from tpgmm_torch.trajectories import Trajectory
 
 if TYPE_CHECKING:
@@ -137,22 +138,21 @@ def plot_local(
         Red; ``style`` is passed to ``Axes.plot``. Trajectories may come from other models.
     """
     chosen = model.operators_[operator]
-    shown: list[tuple[Tensor, Tensor, dict[str, Any]]] = [
-        (d.time, chosen.local(d, model.kinematics_), {"color": DEMONSTRATION, "linewidth": 0.7})
-        for d in demonstrations
+    shown: list[tuple[Demonstration, dict[str, Any]]] = [
+        (demonstration, {"color": DEMONSTRATION, "linewidth": 0.7})
+        for demonstration in demonstrations
     ]
     for trajectory, frames, style in reproductions:
         motion = Demonstration(trajectory.time, trajectory.joints, frames)
-        look = {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, **style}
-        shown.append((motion.time, chosen.local(motion, model.kinematics_), look))
-    starts = chosen.quaternion_starts(model.kinematics_)
-    blocks = [slice(start, start + 4) for start in starts if start <= column < start + 4]
-    for time, local, style in shown:
-        sign = 1.0
-        if blocks:
-            expected = model._regression().expected(operator, time.to(local))
-            sign = 1.0 if (local[:, blocks[0]] * expected[:, blocks[0]]).sum() >= 0 else -1.0
-        axes.plot(_array(time), _array(sign * local[:, column]), **style)
+        shown.append((motion, {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, **style}))
+
+    def expected(_operator: int, time: Tensor) -> Tensor:
+        return model._regression().expected(operator, time)
+
+    motions = [motion for motion, _ in shown]
+    rows = local_data(motions, [chosen], model.kinematics_, expected)
+    for row, (_, style) in zip(rows, shown, strict=True):
+        axes.plot(_array(row[:, 0]), _array(row[:, 1 + column]), **style)
     plot_components(axes, model, operator, column)
 
 

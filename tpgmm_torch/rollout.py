@@ -11,7 +11,7 @@ from tpgmm_torch.demonstrations import Frame, Situation
 from tpgmm_torch.regression import Estimate, Regression
 from tpgmm_torch.trajectories import Candidate, Trajectory
 
-__all__ = ["minimum_jerk", "rollout"]
+__all__ = ["minimum_jerk", "rollout", "stacked"]
 
 
 def minimum_jerk(fraction: Tensor) -> Tensor:
@@ -78,7 +78,7 @@ def _loop(
     candidates: bool,
 ) -> tuple[Tensor, list[Estimate]]:
     kinematics = regression.kinematics
-    frames = {name: _stacked([s.frames[name] for s in batch]) for name in batch[0].frames}
+    frames = {name: stacked([s.frames[name] for s in batch]) for name in batch[0].frames}
     start = torch.stack([situation.joints for situation in batch])
     reference, gap = start, torch.zeros_like(start)
     fade = torch.zeros_like(time) if blend == 0 else 1 - minimum_jerk((time - time[0]) / blend)
@@ -114,8 +114,14 @@ def _groups(situations: Sequence[Situation]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _stacked(frames: Sequence[Frame]) -> Frame:
-    """One frame of shape (B,), or (T, B) if any of the frames moves."""
+def stacked(frames: Sequence[Frame]) -> Frame:
+    """One frame of shape (B,), or (T, B) if any of the frames moves.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        B frames of shape () or (T,).
+    """
     steps = [len(frame.position) for frame in frames if frame.batch_shape]
     shape = (steps[0],) if steps else ()
     return Frame(

@@ -30,7 +30,6 @@ from tpgmm_datasets.writer import save_lerobot
 from tpgmm_torch import (
     Canonical,
     Demonstration,
-    Frame,
     Operator,
     RelativeOrientation,
     RelativePosition,
@@ -41,6 +40,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity, sinusoid
+from tpgmm_torch.rollout import stacked
 
 __all__ = ["BottleExperiment", "bottle_operators"]
 
@@ -129,19 +129,20 @@ class BottleExperiment:
         rows["information form, K = 10"] = measure(
             self._model(10).fit(aligned).predict(situations, candidates=False), situations
         )
+        learned = model.get_params(deep=False)
         for epsilon in EPSILONS:
             name = f"covariance form, epsilon = {epsilon:g}"
             self.report(f"reproducing, {name}")
             model.set_params(fusion="covariance", epsilon=epsilon)
             rows[name] = measure(model.predict(situations, candidates=False), situations)
-        model.set_params(fusion="information", epsilon=1e-4)
+        model.set_params(fusion=learned["fusion"], epsilon=learned["epsilon"])
         self.report("learning and reproducing without orientation")
         position_only = self._model(self.n_components, orientation=False).fit(aligned)
         ablated = position_only.predict(situations, candidates=False)
         rows["position only"] = measure(ablated, situations)
 
         self.report("learning and reproducing without time warping")
-        alignment = self._alignment(demonstrations, measure, warping, reproductions)
+        alignment = self._alignment(demonstrations, measure, warping, reproductions, situations)
 
         self.report("drawing")
         draw_figures(
@@ -175,17 +176,13 @@ class BottleExperiment:
         measure: _Measure,
         warping: DynamicTimeWarping,
         reproductions: Sequence[Trajectory],
+        situations: Sequence[Situation],
     ) -> dict[str, Any]:
         """Dynamic time warping against linear time normalisation."""
         linear = LinearTimeNormalization().fit(demonstrations)
         aligned = linear.transform(demonstrations)
-        others = (
-            self._model(self.n_components)
-            .fit(aligned)
-            .predict(
-                self.skill.situations(self.n_situations, self.seed + 1000), candidates=False
-            )
-        )
+        model = self._model(self.n_components).fit(aligned)
+        others = model.predict(situations, candidates=False)
         normalised = _Measure(self.skill, aligned)
         return {
             "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
@@ -242,7 +239,8 @@ class _Measure:
         joints = torch.stack([trajectory.joints for trajectory in trajectories])
         starts = torch.stack([situation.joints for situation in situations])
         position, orientation = self.skill.grasp_error(
-            joints[:, self.contact], _bottles(situations)
+            joints[:, self.contact],
+            stacked([situation.frames["bottle"] for situation in situations]),
         )
         shoulders = torch.stack(
             [self.skill.shoulders(trajectory) for trajectory in trajectories]
@@ -334,13 +332,6 @@ class _Measure:
                 [largest_acceleration(d) for d in demonstrations]
             ),
         }
-
-
-def _bottles(situations: Sequence[Situation]) -> Frame:
-    frames = [situation.frames["bottle"] for situation in situations]
-    return Frame(
-        torch.stack([f.position for f in frames]), torch.stack([f.orientation for f in frames])
-    )
 
 
 def _spread(values: Any) -> dict[str, float]:

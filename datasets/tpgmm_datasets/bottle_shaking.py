@@ -250,12 +250,12 @@ class BottleShaking:
         shaken = [robot.joint_names.index(name) for name in SHOULDERS]
         first = robot.state(starts)
         paths = {hand: _Path(first, hand, bottles, chests) for hand in HANDS}
+        limit = robot.velocity / self.rate
         joints, out = starts, [starts]
         for k in range(1, steps):
             progress = _progress(torch.full((n,), k / self.rate, dtype=torch.float64), ends)
             wanted = [paths[hand].at(progress) for hand in HANDS]
             step = _least_squares(robot, joints, wanted, weights, neutral, 1 / self.rate)
-            limit = robot.velocity / self.rate
             joints = torch.clamp(
                 joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
             )
@@ -273,16 +273,14 @@ class _Path:
     """Where one hand should be: minimum-jerk segments on the bottle's frame."""
 
     def __init__(self, start: RobotState, hand: str, bottle: Frame, chest: Frame) -> None:
-        self.hand = hand
+        self.hand, self.bottle, self.chest = hand, bottle, chest
         self.start = Frame(start.position(hand), start.orientation(hand))
-        self.bottle = bottle
-        self.chest = chest
+        self.approach = _attached(bottle, APPROACH_POINT[hand])
+        self.grasp = _attached(bottle, GRASP_POINT[hand])
 
     def at(self, progress: Mapping[str, Tensor]) -> Frame:
-        approach = _attached(self.bottle, APPROACH_POINT[self.hand])
-        grasp = _attached(self.bottle, GRASP_POINT[self.hand])
-        pose = _between(self.start, approach, progress["reach"])
-        pose = _between(pose, grasp, progress["close"])
+        pose = _between(self.start, self.approach, progress["reach"])
+        pose = _between(pose, self.grasp, progress["close"])
         # from the grasp on the bottle moves, and the hand with it
         carried = _between(self.bottle, self.chest, progress["bring"])
         held = _attached(carried, GRASP_POINT[self.hand])
