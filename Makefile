@@ -8,6 +8,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
 
+PACKAGES_cli := .[cli]
+PACKAGES_compare := .[cli] ./policies[evaluation]
+PACKAGES_test := .[test] ./policies[test]
+
 .PHONY: help demo test lint types check constraints clean
 .NOTPARALLEL:
 
@@ -39,8 +43,8 @@ clean: ## Remove results and caches; the environment stays
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 # A stamp is older than the files below when they ask for other packages than are installed.
-$(VENV)/.installed-%: pyproject.toml constraints.txt | $(BIN)/pip
-	$(INSTALL) --editable '.[$*]'
+$(VENV)/.installed-%: pyproject.toml policies/pyproject.toml constraints.txt | $(BIN)/pip
+	$(INSTALL) $(foreach package,$(PACKAGES_$*),--editable '$(package)')
 	@touch $@
 
 # pip is what venv writes last, so it stands for an environment that is complete. A pyenv

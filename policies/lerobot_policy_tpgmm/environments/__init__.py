@@ -1,0 +1,1 @@
+"""Simulated robots to run policies on, registered with gymnasium and LeRobot."""
