@@ -54,6 +54,13 @@ def test_durations_differ_by_more_than_fifteen_per_cent_both_ways(demonstrations
     assert max(durations) > 1.15 * nominal
 
 
+def test_a_steady_rhythm_shakes_equally_long_in_demonstrations_of_unequal_length():
+    demonstrations = BottleShaking(rate=50, steady_rhythm=True).demonstrations(4, seed=3)
+    for d in demonstrations:
+        assert d.events["rest"] - d.events["shake"] == pytest.approx(PHASES["shake"])
+    assert np.ptp([d.duration for d in demonstrations]) > 2
+
+
 def test_phases_take_different_shares_of_the_time(demonstrations):
     shares = [d.events["grasp"] / d.duration for d in demonstrations]
     assert np.ptp(shares) > 0.02

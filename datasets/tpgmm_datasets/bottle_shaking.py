@@ -86,6 +86,9 @@ class BottleShaking:
         Start postures differ by up to this in each joint [rad].
     chest_spread : float, default=0.005
         Where the bottle is brought differs by up to this in each direction [m].
+    steady_rhythm : bool, default=False
+        Whether the shaking takes its nominal 4.5 s in every demonstration, so that all have
+        one frequency: what a policy can be asked to repeat.
 
     Attributes
     ----------
@@ -99,6 +102,7 @@ class BottleShaking:
     stretch: float = 0.18
     start_spread: float = 0.05
     chest_spread: float = 0.005
+    steady_rhythm: bool = False
     robot: Robot = field(default_factory=upper_body, repr=False)
 
     def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
@@ -227,9 +231,10 @@ class BottleShaking:
         nominal = np.array(list(PHASES.values()))
         shares = nominal * rng.uniform(0.88, 1.12, (n, len(nominal)))
         total = nominal.sum() * rng.permutation(np.linspace(-1, 1, n) * self.stretch + 1)
-        return torch.from_numpy(
-            (shares / shares.sum(1, keepdims=True) * total[:, None]).cumsum(1)
-        )
+        lengths = shares / shares.sum(1, keepdims=True) * total[:, None]
+        if self.steady_rhythm:
+            lengths[:, list(PHASES).index("shake")] = PHASES["shake"]
+        return torch.from_numpy(lengths.cumsum(1))
 
     def _follow(
         self,
