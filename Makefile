@@ -12,7 +12,9 @@ PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
 PACKAGES_test := .[test] ./policies[test]
 
-.PHONY: help demo test lint types check constraints clean
+COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --out out/compare
+
+.PHONY: help demo compare test lint types docs check constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -20,6 +22,10 @@ help: ## List the targets
 
 demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 	OMP_NUM_THREADS=1 $(BIN)/tpgmm demo --out out/demo
+
+compare: $(VENV)/.installed-compare ## Compare TP-GMM with ACT, Diffusion and a naive floor; out/compare
+	$(COMPARE) --demonstrations 5,10
+	$(COMPARE) --demonstrations 10 --policies tpgmm --conditions pushes,noise,pushes+noise
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
@@ -31,7 +37,10 @@ lint: $(VENV)/.installed-test ## Check style and formatting
 types: $(VENV)/.installed-test ## Check the type hints
 	$(BIN)/python -m mypy
 
-check: lint types test ## All three
+docs: $(VENV)/.installed-test ## Build the documentation; open docs/_build/html/index.html
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+
+check: lint types test docs ## All four
 
 constraints: $(VENV)/.installed-test ## Write the versions in .venv into constraints.txt
 	{ grep '^#' constraints.txt; $(BIN)/python -m pip freeze --all --exclude-editable \
@@ -39,7 +48,7 @@ constraints: $(VENV)/.installed-test ## Write the versions in .venv into constra
 	mv constraints.new constraints.txt
 
 clean: ## Remove results and caches; the environment stays
-	rm -rf out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf docs/_build docs/_pictures docs/gallery out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 # A stamp is older than the files below when they ask for other packages than are installed.

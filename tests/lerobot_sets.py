@@ -11,7 +11,8 @@ import torch
 
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 FPS = 50
 NAMES = ("left_elbow", "right_elbow", "gripper")

@@ -14,7 +14,7 @@ from sklearn.pipeline import Pipeline
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
-from tpgmm_torch.demonstrations import Demonstration, Frame, Situation
+from tpgmm_torch.demonstrations import Demonstration, Situation
 from tpgmm_torch.exceptions import (
     DataError,
     DependencyError,
@@ -22,6 +22,7 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     UnknownNameError,
 )
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.poses import Poses
 
 NOMINAL = 13.0

@@ -15,9 +15,8 @@ from tests.command_line import output, refusal, run
 from tpgmm_datasets import demonstrations_from_frame, save_lerobot
 from tpgmm_datasets.bottle_shaking import BottleShaking
 from tpgmm_torch import Demonstration, Poses, TaskParameterizedGMM
-from tpgmm_torch.cli.fit import default_operators
 from tpgmm_torch.cli.fit import fit as fit_command
-from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.operators.text import default_operators, format_operator
 
 PNG = b"\x89PNG"
 UPPER_BODY = ("--robot", "upper_body", "--link", "l_hand", "--link", "r_hand")
@@ -48,12 +47,13 @@ def test_version_and_help_need_no_command():
     assert output("--version") == f"tpgmm-torch {version('tpgmm-torch')}\n"
     for arguments in ((), ("--help",)):
         text = output(*arguments)
-        assert all(name in text for name in ("demo", "fit", "reproduce", "plot", "dataset"))
+        for name in ("demo", "fit", "reproduce", "plot", "view", "dataset"):
+            assert name in text
 
 
 @pytest.mark.parametrize(
     "command",
-    ["demo", "fit", "reproduce", "plot"]
+    ["demo", "fit", "reproduce", "plot", "view"]
     + [f"dataset {name}" for name in ("info", "check", "plot", "generate", "convert")],
 )
 def test_the_help_of_every_command_has_an_example(command):

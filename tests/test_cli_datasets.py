@@ -65,6 +65,12 @@ def test_generated_demonstrations_are_those_of_the_skill_with_that_seed(tmp_path
     assert found.problems == ()
 
 
+def test_generated_demonstrations_may_share_one_rhythm(tmp_path):
+    output(*generate(tmp_path / "set", "--steady-rhythm"))
+    expected = BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(2, seed=0)
+    assert_same(load_lerobot(tmp_path / "set"), expected, 1e-6)
+
+
 def test_appended_episodes_follow_those_that_were_there(tmp_path):
     root = tmp_path / "set"
     for seed in (0, 1):

@@ -11,14 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import (
-    Demonstration,
-    Frame,
-    Situation,
-    as_tensor,
-    check_demonstrations,
-)
+from tpgmm_torch.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+from tpgmm_torch.frames import Frame, as_tensor
 from tpgmm_torch.trajectories import Candidate, Trajectory
 
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.frames import Frame
 
 HALF = math.sqrt(0.5)
 

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = (
     ("exceptions",),
     ("quaternions", "gaussians"),
-    ("demonstrations", "trajectories"),
+    ("frames", "demonstrations", "trajectories"),
     ("urdf", "trees", "kinematics", "robots", "poses", "joint_space"),
     ("operators", "warping", "features", "retiming", "alignment", "local_data"),
     ("block_gaussians", "sufficient_statistics"),
@@ -31,7 +31,7 @@ LAYERS = (
     ("regression", "rollout", "reproduction"),
     ("persistence", "situations"),
     ("estimator",),
-    ("metrics", "plotting"),
+    ("metrics", "plotting", "viewing"),
     ("cli",),
 )
 ORDER = [module for layer in LAYERS for module in layer]
@@ -46,6 +46,8 @@ LATE = {
     "pyarrow",
     "pytorch_kinematics",
     "tpgmm_datasets",
+    "trimesh",
+    "viser",
 }
 
 

@@ -22,7 +22,7 @@ from tpgmm_datasets import (
 )
 from tpgmm_datasets.layout import Feature
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.frames import Frame
 
 
 @pytest.fixture

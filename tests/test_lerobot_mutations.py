@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 COPIES = int(os.environ.get("TPGMM_MUTATIONS", "300"))
 

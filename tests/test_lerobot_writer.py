@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
 from tpgmm_datasets import writer as writer_module
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 FPS = 50
 
@@ -106,6 +107,40 @@ def test_action_is_the_next_joint_reference(tmp_path):
     action = np.stack(table["action"].to_numpy())
     assert (action[:-1] == state[1:]).all()
     assert (action[-1] == state[-1]).all()
+
+
+def test_actions_are_the_references_that_were_given(tmp_path):
+    first, second = (
+        demonstration(0),
+        demonstration(1).reordered(["joint_2", "joint_0", "joint_1"]),
+    )
+    references = [motion.joints + 0.5 for motion in (first, second)]
+    root = save_lerobot(
+        [first, second], tmp_path / "set", fps=FPS, task="reach", actions=references
+    )
+    for key, shift in (("observation.state", 0.0), ("action", 0.5)):
+        found = load_lerobot(root, joints=key)
+        for read, written in zip(found, (first, second), strict=True):
+            expected = written.reordered(read.joint_names).joints + shift
+            torch.testing.assert_close(read.joints, expected, rtol=0, atol=1e-6)
+
+
+def test_actions_that_do_not_fit_are_refused(tmp_path):
+    motion = demonstration()
+    for actions, message in (
+        ([], "actions of 0 and joints of 1"),
+        ([motion.joints[:, :2]], "joint_names needs 2"),
+        ([motion.joints[:5]], "T = 20"),
+        ([motion.joints * np.nan], "NaN"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_lerobot([motion], tmp_path / "set", fps=FPS, task="reach", actions=actions)
+    unnamed = Demonstration(motion.time, motion.joints)
+    with pytest.raises(DatasetError, match="3 joints and actions of 2"):
+        save_lerobot(
+            [unnamed], tmp_path / "set", fps=FPS, task="reach", actions=[motion.joints[:, :2]]
+        )
+    assert not (tmp_path / "set").exists()
 
 
 def test_many_episodes_are_split_into_files_and_chunks(tmp_path):

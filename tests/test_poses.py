@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.poses import Poses
 
 

@@ -6,7 +6,8 @@ import torch
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import LinearTimeNormalization
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.poses import Poses
 
 

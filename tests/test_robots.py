@@ -31,8 +31,8 @@ from tests.robot_zoo import (
 )
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.robots import Robot
 
 

@@ -12,7 +12,7 @@ from tests.mixtures import CASES, Case, Problem, assert_close, times
 from tests.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
 from tpgmm_torch.regression import Regression
-from tpgmm_torch.rollout import minimum_jerk, rollout
+from tpgmm_torch.rollout import Synthesis, minimum_jerk, rollout
 
 NAMES = ["the paper's", "poses in two frames"]
 EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
@@ -152,6 +152,20 @@ def test_candidates_are_kept_if_wanted(wanted):
         for candidate in trajectory.candidates:
             assert candidate.mean.shape == candidate.share.shape == (12, 17)
             assert candidate.covariance.shape == (12, 17, 17)
+
+
+@EVERY_WORLD
+def test_what_was_measured_may_stand_for_the_last_reference(case: Case):
+    problem = Problem.of(case, 3, 2)
+    regression, kinematics = problem.regression(), case.world.kinematics
+    loop = Synthesis(regression, problem.state.joints, 0.0, False)
+    for time in grid():
+        measured = loop.reference + 0.01
+        loop.step(time, problem.frames, kinematics.retract(measured))
+        expected = regression.step(
+            time, kinematics.state(kinematics.retract(measured)), problem.frames
+        )
+        assert_close(loop.reference, kinematics.retract(expected.joints))
 
 
 # The start

@@ -12,7 +12,8 @@ from tpgmm_datasets import (
     load_lerobot,
     save_lerobot,
 )
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 NAMES = ("shoulder", "elbow")
 

@@ -2,8 +2,9 @@
 
 from importlib.metadata import version
 
-from tpgmm_torch.demonstrations import Demonstration, Frame, Situation
+from tpgmm_torch.demonstrations import Demonstration, Situation
 from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.mixture import BlockGaussianMixture
 from tpgmm_torch.operators import (

@@ -52,6 +52,14 @@ class LinearTimeNormalization(Alignment):
         For each demonstration of ``fit``, its fractional time step at each time of the grid.
     joint_names_ : tuple of str or None
         Order of the joints.
+
+    Examples
+    --------
+    >>> slow = Demonstration([0.0, 2.0, 4.0], [[0.0], [1.0], [2.0]])
+    >>> quick = Demonstration([0.0, 1.0, 2.0], [[0.0], [1.0], [2.0]])
+    >>> aligned = LinearTimeNormalization().fit_transform([slow, quick])
+    >>> [one.duration for one in aligned]
+    [3.0, 3.0]
     """
 
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012

@@ -11,151 +11,13 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame, as_tensor
 
-__all__ = [
-    "Demonstration",
-    "Frame",
-    "Situation",
-    "as_tensor",
-    "check_demonstrations",
-]
-
-#: Quaternions whose norm is off by more than this are refused; below, they are rounded data
-#: (float32 recordings, a few printed digits) and brought to unit norm.
-UNIT_NORM_TOLERANCE = 1e-3
-
-
-def as_tensor(values: Any, name: str) -> Tensor:
-    """Convert what a user gives into a finite floating tensor, without sharing memory.
-
-    Parameters
-    ----------
-    values : array-like or Tensor
-        Floating tensors keep dtype, device and gradient; everything else becomes float64.
-    name : str
-        How the error message calls it.
-
-    Returns
-    -------
-    Tensor
-
-    Raises
-    ------
-    DataError
-        If it is not numeric, or holds NaN or infinity (the message says where).
-    """
-    if isinstance(values, Tensor) and not values.is_complex():
-        tensor = (values if values.is_floating_point() else values.double()).clone()
-    else:
-        try:
-            array = np.asarray(values)
-            if array.dtype.kind not in "biufO":
-                raise TypeError(f"their type is {array.dtype}")
-            tensor = torch.from_numpy(array.astype(np.float64))
-        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-            raise DataError(f"{name} must be an array of numbers: {error}") from error
-    finite = torch.isfinite(tensor)
-    if not bool(finite.all()):
-        first = torch.nonzero(~finite)[0].tolist()
-        raise DataError(
-            f"{name} holds {int((~finite).sum())} value(s) that are NaN or infinite, "
-            f"the first is {tensor[tuple(first)].item()} at index {first}"
-        )
-    return tensor
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """Pose of an object: the task parameters ``p_t``, ``eps_t`` of the paper's section II-A.
-
-    Parameters
-    ----------
-    position : array-like of shape (3,) or (..., 3)
-        Origin in the base frame [m].
-    orientation : array-like of shape (4,) or (..., 4), optional
-        Unit quaternion (w, x, y, z); the default is no rotation.
-
-    Raises
-    ------
-    ShapeError
-        If the last dimensions are not 3 and 4 or the leading ones do not match.
-    DataError
-        If a value is not finite or a quaternion is not of unit norm.
-    """
-
-    position: Tensor
-    orientation: Tensor
-
-    def __init__(self, position: Any, orientation: Any = None) -> None:
-        position = as_tensor(position, "the frame's position")
-        if position.ndim == 0 or position.shape[-1] != 3:
-            raise ShapeError(
-                f"a frame's position has shape (..., 3), got {tuple(position.shape)}"
-            )
-        if orientation is None:
-            unit = quaternions.identity(position.dtype, position.device)
-            orientation = unit.expand(*position.shape[:-1], 4)
-        else:
-            orientation = as_tensor(orientation, "the frame's orientation").to(position)
-        expected = (*position.shape[:-1], 4)
-        if tuple(orientation.shape) != expected:
-            raise ShapeError(
-                f"a frame with position of shape {tuple(position.shape)} needs an orientation "
-                f"of shape {expected}, got {tuple(orientation.shape)}"
-            )
-        norm = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
-        excess = norm.detach() - 1
-        worst = excess.abs().max() if norm.numel() else torch.zeros(())
-        if worst > UNIT_NORM_TOLERANCE:
-            raise DataError(
-                "a frame's orientation must be a unit quaternion (w, x, y, z): "
-                f"a norm is off by {worst:.3g}, the tolerance is {UNIT_NORM_TOLERANCE}"
-            )
-        # what is of unit norm but for rounding stays as it is, bit for bit
-        rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps
-        norm = norm - torch.where(rounded, excess, 0.0)
-        object.__setattr__(self, "position", position)
-        object.__setattr__(self, "orientation", orientation / norm)
-
-    @property
-    def batch_shape(self) -> torch.Size:
-        """Leading dimensions: () for one pose, (T,) for a pose per time step."""
-        return self.position.shape[:-1]
-
-    def to(self, *args: Any, **kwargs: Any) -> Frame:
-        """A copy on another device or of another dtype, like :meth:`torch.Tensor.to`."""
-        return self._from(
-            self.position.to(*args, **kwargs), self.orientation.to(*args, **kwargs)
-        )
-
-    def __getitem__(self, index: Any) -> Frame:
-        """Select along the leading dimensions."""
-        index = (*index, slice(None)) if isinstance(index, tuple) else (index, slice(None))
-        return self._from(self.position[index], self.orientation[index])
-
-    def inverse_transform(self, point: Tensor) -> Tensor:
-        """``R^T (x - p)``: points (..., 3) of the base frame, seen from this frame."""
-        return quaternions.rotate(
-            quaternions.conjugate(self.orientation), point - self.position
-        )
-
-    def transform(self, point: Tensor) -> Tensor:
-        """``R x + p``: points (..., 3) of this frame, seen from the base frame."""
-        return quaternions.rotate(self.orientation, point) + self.position
-
-    @classmethod
-    def _from(cls, position: Tensor, orientation: Tensor) -> Frame:
-        """Wrap tensors that were checked before."""
-        frame = cls.__new__(cls)
-        object.__setattr__(frame, "position", position)
-        object.__setattr__(frame, "orientation", orientation)
-        return frame
+__all__ = ["Demonstration", "Situation", "check_demonstrations"]
 
 
 def _checked_time(values: Any) -> Tensor:
@@ -228,6 +90,19 @@ class Demonstration(_PlainFrames):
     ------
     ShapeError, DataError
         If shapes do not match, a value is not finite, or time does not increase.
+
+    Examples
+    --------
+    >>> demonstration = Demonstration(
+    ...     time=[0.0, 0.1, 0.2],
+    ...     joints=[[0.0, 1.0], [0.1, 0.9], [0.2, 0.7]],
+    ...     frames={"cup": Frame([0.4, 0.0, 0.1])},
+    ...     joint_names=["shoulder", "elbow"],
+    ... )
+    >>> demonstration
+    Demonstration(3 steps, 0.20 s, 2 joints, frames=['cup'], events={})
+    >>> demonstration.reordered(["elbow"]).joints[:, 0].tolist()
+    [1.0, 0.9, 0.7]
     """
 
     time: Tensor
@@ -330,6 +205,12 @@ class Situation(_PlainFrames):
     ------
     ShapeError, DataError
         If shapes do not match, a value is not finite, or time does not increase.
+
+    Examples
+    --------
+    >>> situation = Situation(joints=[0.0, 1.0], frames={"cup": Frame([0.4, 0.0, 0.1])})
+    >>> list(situation.frames)
+    ['cup']
     """
 
     joints: Tensor

@@ -21,6 +21,7 @@ from tpgmm_torch.kinematics import Kinematics
 from tpgmm_torch.local_data import local_data
 from tpgmm_torch.mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.persistence import load_estimator, save_estimator
 from tpgmm_torch.reproduction import Reproduction
 
@@ -252,14 +253,7 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
             mixture = self.mixture_.set_params(**settings)
         mixture.fit(points)
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
-        self.frame_names_ = tuple(
-            dict.fromkeys(
-                name
-                for o in operators
-                for name in o.references()
-                if name not in kinematics.links
-            )
-        )
+        self.frame_names_ = frame_names(operators, kinematics)
         middle = sorted(demonstrations, key=lambda d: d.duration)[len(demonstrations) // 2]
         self.time_ = middle.time.to(rows[0])
         self.weights_, self.means_ = mixture.weights_, mixture.means_

@@ -47,6 +47,11 @@ class UnknownNameError(TPGMMError, KeyError):
         Where it was looked up, for example ``"the demonstration"``.
     available : iterable of str
         The names that exist there.
+
+    Examples
+    --------
+    >>> print(UnknownNameError("frame", "cup", "the demonstration", ["table", "bottle"]))
+    frame 'cup' is not in the demonstration; it has ['bottle', 'table']
     """
 
     def __init__(self, kind: str, name: str, where: str, available: Iterable[str]) -> None:

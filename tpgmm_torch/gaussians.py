@@ -101,6 +101,14 @@ def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
     ------
     DataError
         If one of the covariances is singular.
+
+    Examples
+    --------
+    >>> means = torch.tensor([[0.0], [3.0]])
+    >>> variances = torch.tensor([[[1.0]], [[2.0]]])
+    >>> mean, variance = product(means, variances)  # nearer to the firmer one
+    >>> round(float(mean), 3), round(float(variance), 3)
+    (1.0, 0.667)
     """
     precisions = torch.cholesky_inverse(cholesky(covariances, "a factor of the product"))
     precision = precisions.sum(0)
@@ -139,6 +147,15 @@ def information(
     ------
     DataError
         If ``S`` is singular.
+
+    Examples
+    --------
+    The sum of two numbers is known, their difference is not:
+
+    >>> jacobian, target = torch.tensor([[1.0, 1.0]]), torch.tensor([[2.0]])
+    >>> precision, _, _ = information(jacobian, target, torch.tensor([[0.25]]))
+    >>> precision.tolist()
+    [[4.0, 4.0], [4.0, 4.0]]
     """
     factor = cholesky(covariance, "the covariance of a projected component")
     if jacobian is None:
@@ -196,6 +213,13 @@ def condition(mean: Tensor, covariance: Tensor, n_inputs: int) -> tuple[Tensor, 
         ``Sigma_oi Sigma_ii^-1``.
     covariance : Tensor of shape (..., D - n_inputs, D - n_inputs)
         ``Sigma_oo - gain Sigma_io``.
+
+    Examples
+    --------
+    >>> covariance = torch.tensor([[1.0, 0.5], [0.5, 1.0]])
+    >>> gain, rest = condition(torch.zeros(2), covariance, n_inputs=1)
+    >>> float(gain), float(rest)
+    (0.5, 0.75)
     """
     inputs = covariance[..., :n_inputs, :n_inputs]
     cross = covariance[..., :n_inputs, n_inputs:]
@@ -218,6 +242,13 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     mean : Tensor of shape (..., D)
     covariance : Tensor of shape (..., D, D)
         Within the components and between them.
+
+    Examples
+    --------
+    >>> means, variances = torch.tensor([[-1.0], [1.0]]), torch.zeros(2, 1, 1)
+    >>> mean, covariance = moment_match(torch.tensor([0.5, 0.5]), means, variances)
+    >>> float(mean), float(covariance)
+    (0.0, 1.0)
     """
     mean = (weights[..., None] * means).sum(-2)
     apart = means - mean[..., None, :]

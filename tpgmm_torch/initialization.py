@@ -14,9 +14,9 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 
 from tpgmm_torch.block_gaussians import Chunk, Family, Parameters, Standardization
-from tpgmm_torch.demonstrations import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.expectation_maximization import expect, maximize
+from tpgmm_torch.frames import as_tensor
 
 __all__ = [
     "GivenStart",

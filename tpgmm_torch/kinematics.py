@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import as_tensor
 
 __all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]
 

@@ -86,6 +86,11 @@ def largest_velocity(motion: Trajectory | Demonstration) -> float:
     Parameters
     ----------
     motion : Trajectory or Demonstration
+
+    Examples
+    --------
+    >>> largest_velocity(Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [1.5]]))
+    2.0
     """
     speed = motion.joints.diff(dim=0) / motion.time.diff()[:, None]
     return float(speed.abs().max())
@@ -97,6 +102,11 @@ def largest_acceleration(motion: Trajectory | Demonstration) -> float:
     Parameters
     ----------
     motion : Trajectory or Demonstration
+
+    Examples
+    --------
+    >>> largest_acceleration(Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [1.5]]))
+    2.0
     """
     steps = motion.time.diff()
     speed = motion.joints.diff(dim=0) / steps[:, None]
@@ -111,7 +121,7 @@ class Sinusoid:
     Parameters
     ----------
     frequency : float
-        [Hz]
+        In hertz.
     amplitude, offset : float
         In the signal's unit.
     phase : float
@@ -147,6 +157,13 @@ def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
     ------
     ShapeError
         If there are fewer than eight points, or the shapes differ.
+
+    Examples
+    --------
+    >>> time = np.linspace(0, 3, 100)
+    >>> fit = sinusoid(time, 0.2 + 0.5 * np.sin(2 * np.pi * 1.5 * time))
+    >>> round(fit.frequency, 6), round(fit.amplitude, 6), round(fit.offset, 6)
+    (1.5, 0.5, 0.2)
     """
     t = np.asarray(torch.as_tensor(time), dtype=np.float64)
     y = np.asarray(torch.as_tensor(signal), dtype=np.float64)

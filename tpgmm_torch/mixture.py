@@ -204,7 +204,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
 
         Parameters
         ----------
-        weights, means, covariances
+        weights, means, covariances : Tensor, sequences of Tensor
             As in the attributes.
         **settings
             Parameters of the constructor.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -26,7 +27,8 @@ from tpgmm_torch.exceptions import ModelFileError
 from tpgmm_torch.joint_space import JointSpace
 from tpgmm_torch.kinematics import Kinematics
 from tpgmm_torch.mixture import BlockGaussianMixture
-from tpgmm_torch.operators import Operator, Stack
+from tpgmm_torch.operators import Canonical, Operator, Stack
+from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.poses import Poses
 from tpgmm_torch.robots import Robot
 
@@ -35,6 +37,7 @@ __all__ = [
     "encode",
     "load_estimator",
     "read_model",
+    "restore",
     "save_estimator",
     "write_model",
 ]
@@ -63,6 +66,12 @@ def encode(thing: Operator | Kinematics) -> dict[str, Any]:
     ------
     ModelFileError
         If it has no such description.
+
+    Examples
+    --------
+    >>> from tpgmm_torch import RelativePosition
+    >>> encode(RelativePosition("hand", "cup"))
+    {'type': 'RelativePosition', 'link': 'hand', 'frame': 'cup'}
     """
     name = type(thing).__name__
     if KNOWN.get(name, type(thing)) is not type(thing):
@@ -272,7 +281,7 @@ def save_estimator(model: Any, path: str | Path) -> None:
         "frames": list(model.frame_names_),
         "n_iter": model.n_iter_,
         "converged": bool(model.converged_),
-        "lower_bound": float(model.lower_bound_),
+        "lower_bound": None if math.isnan(model.lower_bound_) else float(model.lower_bound_),
     }
     tensors = {"weights": model.weights_, "time": model.time_}
     for j, (mean, covariance) in enumerate(zip(model.means_, model.covariances_, strict=True)):
@@ -280,14 +289,56 @@ def save_estimator(model: Any, path: str | Path) -> None:
     write_model(path, config, tensors)
 
 
+def restore(
+    model: Any,
+    kinematics: Kinematics,
+    weights: Tensor,
+    means: Sequence[Tensor],
+    covariances: Sequence[Tensor],
+    time: Tensor,
+) -> None:
+    """Make a :class:`TaskParameterizedGMM` a fitted one, from parameters known elsewhere.
+
+    What EM reports is not among them: ``n_iter_`` becomes 0, ``converged_`` False and
+    ``lower_bound_`` NaN.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        With its operators; fitted or not.
+    kinematics : Kinematics
+        What the operators act on.
+    weights, means, covariances, time
+        As in the attributes of the model; they are kept as they are.
+
+    Raises
+    ------
+    DataError, ShapeError
+        If they are no mixture, or do not fit the operators.
+    """
+    operators = (Canonical(),) if model.operators is None else tuple(model.operators)
+    mixture = BlockGaussianMixture.from_parameters(
+        weights, means, covariances, **model._mixture_parameters(operators, kinematics)
+    )
+    # it checked them; what it keeps went through their factors, and was rounded
+    mixture.means_, mixture.covariances_ = list(means), list(covariances)
+    mixture.weights_ = weights
+    model.mixture_, model.operators_, model.weights_ = mixture, operators, weights
+    model.means_, model.covariances_ = mixture.means_, mixture.covariances_
+    model.time_ = time
+    model.kinematics_ = kinematics.to(time.dtype, model.device)
+    model.frame_names_ = frame_names(operators, kinematics)
+    model.n_iter_, model.converged_, model.lower_bound_ = 0, False, math.nan
+
+
 def load_estimator(
-    cls: type[Any], path: str | Path, custom: Sequence[type] = (), device: str | None = None
+    kind: type[Any], path: str | Path, custom: Sequence[type] = (), device: str | None = None
 ) -> Any:
     """Read a fitted :class:`TaskParameterizedGMM`; its method ``load`` calls this.
 
     Parameters
     ----------
-    cls : type
+    kind : type
         The class of the model.
     path : str or Path
         The directory.
@@ -311,33 +362,27 @@ def load_estimator(
         kinematics = decode(config["kinematics"], custom)
         robot = None if isinstance(kinematics, JointSpace) else kinematics
         for operator in operators:
-            operator.check(kinematics, dict.fromkeys(config["frames"]))
+            operator.check(kinematics, config["frames"])
         if len(tensors) != 2 + 2 * len(operators) or not operators:
             raise ModelFileError(
                 f"{path} does not fit together: {len(operators)} operators, but the tensors "
                 f"{sorted(tensors)}"
             )
-        model = cls(operators=operators, robot=robot, **config["parameters"])
+        model = kind(operators=operators, robot=robot, **config["parameters"])
         model.device = device or model.device
         model._validate_params()
         tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
-        model.weights_, model.time_ = tensors["weights"], tensors["time"]
-        model.means_ = [tensors[f"means.{j}"] for j in range(len(operators))]
-        model.covariances_ = [tensors[f"covariances.{j}"] for j in range(len(operators))]
-        model.mixture_ = BlockGaussianMixture.from_parameters(
-            model.weights_,
-            model.means_,
-            model.covariances_,
-            **model._mixture_parameters(operators, kinematics),
+        restore(
+            model,
+            kinematics,
+            tensors["weights"],
+            [tensors[f"means.{j}"] for j in range(len(operators))],
+            [tensors[f"covariances.{j}"] for j in range(len(operators))],
+            tensors["time"],
         )
-        # it checked them; what it keeps went through their factors, and was rounded
-        model.mixture_.means_, model.mixture_.covariances_ = model.means_, model.covariances_
-        model.mixture_.weights_ = model.weights_
-        model.operators_ = tuple(operators)
-        model.kinematics_ = kinematics.to(model.time_.dtype, model.device)
-        model.frame_names_ = tuple(config["frames"])
-        for name in ("n_iter", "converged", "lower_bound"):
-            setattr(model, f"{name}_", config[name])
+        model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
+        known = config["lower_bound"] is not None
+        model.lower_bound_ = config["lower_bound"] if known else math.nan
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, ModelFileError):
             raise

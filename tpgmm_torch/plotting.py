@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.local_data import local_data
 from tpgmm_torch.trajectories import Trajectory
 
@@ -48,6 +49,13 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
     ------
     DependencyError
         If matplotlib is not installed.
+
+    Examples
+    --------
+    >>> drawing = figure(2, "two joints")
+    >>> shade(drawing.axes[0], {"reach": (0.0, 1.5)})
+    >>> len(drawing.axes)
+    2
     """
     try:
         from matplotlib.figure import Figure

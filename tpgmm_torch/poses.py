@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState, dtype_name, dtype_named
 
 __all__ = ["Poses", "PosesState"]

@@ -109,6 +109,12 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     Returns
     -------
     Tensor of shape (..., 4)
+
+    Examples
+    --------
+    >>> i, j = torch.eye(4)[1], torch.eye(4)[2]
+    >>> product(i, j).tolist()  # k
+    [0.0, 0.0, 0.0, 1.0]
     """
     return (left_matrix(a) @ b[..., None])[..., 0]
 
@@ -243,6 +249,12 @@ def exp(rotation_vector: Tensor) -> Tensor:
     Returns
     -------
     Tensor of shape (..., 4)
+
+    Examples
+    --------
+    >>> half_turn = exp(torch.tensor([0.0, 0.0, torch.pi]))
+    >>> half_turn.round(decimals=6).abs().tolist()
+    [0.0, 0.0, 0.0, 1.0]
     """
     square = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
     small = square < 1e-12

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators import Linearization, Operator
 from tpgmm_torch.trajectories import Candidate

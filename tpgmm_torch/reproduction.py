@@ -12,12 +12,13 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.demonstrations import Demonstration, Frame, Situation, as_tensor
+from tpgmm_torch.demonstrations import Demonstration, Situation
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
+from tpgmm_torch.frames import Frame, as_tensor
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression import Estimate, LocalMixture, Regression
-from tpgmm_torch.rollout import rollout
+from tpgmm_torch.rollout import Synthesis, rollout
 from tpgmm_torch.trajectories import Trajectory
 
 __all__ = ["Reproduction"]
@@ -85,7 +86,7 @@ class Reproduction:
         time : float or Tensor of the batch shape
             Now [s].
         state : RobotState, or array-like of shape (..., n_joints)
-            q_{t-1}: the last reference, or what was measured.
+            The last reference q_{t-1}, or what was measured.
         frames : mapping of str to Frame
             Object poses now, of shapes that broadcast with the batch.
         candidates : bool, default=False
@@ -94,6 +95,16 @@ class Reproduction:
         Returns
         -------
         Estimate
+
+        Examples
+        --------
+        >>> from tpgmm_torch import TaskParameterizedGMM
+        >>> time = torch.linspace(0, 1, 50, dtype=torch.float64)
+        >>> shown = [Demonstration(time, (time * end)[:, None]) for end in (0.9, 1.0, 1.1)]
+        >>> model = TaskParameterizedGMM(n_components=2).fit(shown)
+        >>> estimate = model.step(0.5, [0.4])
+        >>> round(float(estimate.joints), 2)
+        0.5
         """
         self._check_fitted()
         if not isinstance(state, RobotState):
@@ -102,6 +113,28 @@ class Reproduction:
         now = as_tensor(time, "time").to(state.joints)
         limits = (self.kinematics_.lower, self.kinematics_.upper) if self.keep_limits else None
         return self._regression().step(now, state, known, candidates, limits)
+
+    def synthesis(self, joints: Any) -> Synthesis:
+        """The loop of :meth:`predict`, to be stepped by a controller.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints)
+            Start postures.
+
+        Returns
+        -------
+        Synthesis
+            Its ``step(time, frames)`` finds the next ``reference``.
+
+        Raises
+        ------
+        ShapeError, DataError, NotFittedError
+            If the postures do not fit the robot.
+        """
+        self._check_fitted()
+        start = self.kinematics_.joint_tensor(joints)
+        return Synthesis(self._regression(), start, self.blend, self.keep_limits)
 
     def sample(
         self,

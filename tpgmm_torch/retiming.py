@@ -14,9 +14,10 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Demonstration, Frame, Situation, check_demonstrations
+from tpgmm_torch.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.features import quaternion_columns
+from tpgmm_torch.frames import Frame
 
 __all__ = ["Alignment", "retime", "seconds", "steps_at"]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame, as_tensor
 from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame, as_tensor
 from tpgmm_torch.kinematics import Kinematics, RobotState, dtype_name, dtype_named
 from tpgmm_torch.trees import MovingTree, reduce
 from tpgmm_torch.urdf import UrdfModel, read_urdf
@@ -69,7 +69,7 @@ class Robot(Kinematics):
             New links by name, each with its parent link and its pose there; also
             ``(parent, position, quaternion)``.
         dtype : torch.dtype, default=torch.float64
-            float64 or float32.
+            Or float32.
         device : torch.device or str, default="cpu"
 
         Returns
@@ -84,6 +84,16 @@ class Robot(Kinematics):
             If a link or a joint is not in the URDF.
         DependencyError
             If pytorch-kinematics is not installed.
+
+        Examples
+        --------
+        >>> urdf = '''<robot name="lift"><link name="base"/><link name="hand"/>
+        ... <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/>
+        ... <axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
+        ... </robot>'''
+        >>> robot = Robot.from_urdf(urdf, links=["hand"])
+        >>> robot.state([0.3]).position("hand").tolist()
+        [0.0, 0.0, 0.3]
         """
         model = read_urdf(urdf)
         extra = _names("coordinates", coordinates)

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch.demonstrations import Frame, Situation
+from tpgmm_torch.demonstrations import Situation
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.regression import Estimate, Regression
 from tpgmm_torch.trajectories import Candidate, Trajectory
 
-__all__ = ["minimum_jerk", "rollout", "stacked"]
+__all__ = ["Synthesis", "minimum_jerk", "rollout", "stacked"]
 
 
 def minimum_jerk(fraction: Tensor) -> Tensor:
-    """Minimum-jerk step from 0 at fraction 0 to 1 at fraction 1, flat at both ends."""
+    """Minimum-jerk step from 0 at fraction 0 to 1 at fraction 1, flat at both ends.
+
+    Parameters
+    ----------
+    fraction : Tensor
+        Of any shape; beyond 0 and 1 the step is over.
+
+    Examples
+    --------
+    >>> minimum_jerk(torch.tensor([-1.0, 0.5, 1.0])).tolist()
+    [0.0, 0.5, 1.0]
+    """
     u = fraction.clamp(0, 1)
     return u**3 * (10 - 15 * u + 6 * u**2)
 
@@ -69,6 +81,90 @@ def rollout(
     return [results[index] for index in range(len(situations))]
 
 
+class Synthesis:
+    """The loop of Algorithm 1's synthesis, one control tick at a time, for a batch of robots.
+
+    Each reference is the state q_{t-1} of the next step, unless a measured one is given.
+
+    Parameters
+    ----------
+    regression : Regression
+    start : Tensor of shape (..., n_joints)
+        The start postures.
+    blend : float
+        Seconds over which the difference between the start posture and the first reference
+        fades out.
+    keep_limits : bool
+        Whether references respect the robot's limits of position and speed.
+
+    Attributes
+    ----------
+    reference : Tensor of shape (..., n_joints)
+        The last reference; the start posture before the first step.
+    """
+
+    def __init__(
+        self, regression: Regression, start: Tensor, blend: float, keep_limits: bool
+    ) -> None:
+        self.regression, self.blend, self.keep_limits = regression, blend, keep_limits
+        self.reference, self._gap = start, torch.zeros_like(start)
+        self._first: Tensor | None = None
+        self._last: Tensor | None = None
+
+    def step(
+        self,
+        now: Tensor,
+        frames: Mapping[str, Frame],
+        measured: Tensor | None = None,
+        candidates: bool = False,
+    ) -> Estimate:
+        """Find the next ``reference``; instants must increase.
+
+        Parameters
+        ----------
+        now : Tensor
+            Scalar [s].
+        frames : mapping of str to Frame
+            Object poses now.
+        measured : Tensor of shape (..., n_joints), optional
+            In place of the last reference q_{t-1}. Speed is that of the references anyhow.
+        candidates : bool, default=False
+            Whether to return each operator's own estimate too.
+
+        Returns
+        -------
+        Estimate
+            Without the fading gap, which only the reference has.
+        """
+        kinematics, last = self.regression.kinematics, self.reference
+        gap = self._fading(now)
+        bounds = None
+        if self.keep_limits:
+            low, high = kinematics.lower, kinematics.upper
+            if self._last is not None:
+                reach = kinematics.velocity * (now - self._last)
+                # a start beyond a limit comes back as fast as the speed allows
+                low = torch.minimum(torch.maximum(low, last - reach), last + reach)
+                high = torch.maximum(torch.minimum(high, last + reach), last - reach)
+            # they are those of the estimate, to which the fading gap comes on top
+            bounds = (low, high) if gap is None else (low - gap, high - gap)
+        state = kinematics.state(last if measured is None else measured)
+        estimate = self.regression.step(now, state, frames, candidates, bounds)
+        if self._last is None:
+            self._first, self._gap = now, last - estimate.joints
+            gap = self._fading(now)
+        self._last = now
+        joints = estimate.joints if gap is None else estimate.joints + gap
+        self.reference = kinematics.retract(joints)
+        return estimate
+
+    def _fading(self, now: Tensor) -> Tensor | None:
+        """What is left of the difference at the start; None once it is nothing."""
+        if self._first is None or now - self._first >= self.blend:
+            return None
+        return (1 - minimum_jerk((now - self._first) / self.blend)) * self._gap
+
+
 def _loop(
     regression: Regression,
     batch: Sequence[Situation],
@@ -77,30 +173,14 @@ def _loop(
     keep_limits: bool,
     candidates: bool,
 ) -> tuple[Tensor, list[Estimate]]:
-    kinematics = regression.kinematics
     frames = {name: stacked([s.frames[name] for s in batch]) for name in batch[0].frames}
     start = torch.stack([situation.joints for situation in batch])
-    reference, gap = start, torch.zeros_like(start)
-    fade = torch.zeros_like(time) if blend == 0 else 1 - minimum_jerk((time - time[0]) / blend)
+    loop = Synthesis(regression, start, blend, keep_limits)
     references, estimates = [], []
     for k, now in enumerate(time):
         poses = {name: f[k] if f.position.ndim == 3 else f for name, f in frames.items()}
-        bounds = None
-        if keep_limits:
-            reach = kinematics.velocity * (now - time[k - 1]) if k else torch.inf
-            low, high = reference - reach, reference + reach
-            # a start beyond a limit comes back as fast as the speed allows; the bounds are
-            # those of the estimate, to which the fading gap comes on top
-            bounds = (
-                torch.minimum(torch.maximum(kinematics.lower, low), high) - fade[k] * gap,
-                torch.maximum(torch.minimum(kinematics.upper, high), low) - fade[k] * gap,
-            )
-        estimate = regression.step(now, kinematics.state(reference), poses, candidates, bounds)
-        if k == 0:
-            gap = start - estimate.joints
-        reference = kinematics.retract(estimate.joints + fade[k] * gap)
-        references.append(reference)
-        estimates.append(estimate)
+        estimates.append(loop.step(now, poses, candidates=candidates))
+        references.append(loop.reference)
     return torch.stack(references), estimates
 
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tpgmm_torch.demonstrations import Frame, Situation
+from tpgmm_torch.demonstrations import Situation
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame
 
 __all__ = ["read_situations"]
 
@@ -36,6 +37,17 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
     ------
     DataError
         If it is not such a file; the message says which situation is meant.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = '[{"joints": {"elbow": 0.5}, "frames": {"cup": {"position": [0.4, 0, 0]}}}]'
+    >>> with tempfile.NamedTemporaryFile("w", suffix=".json", delete_on_close=False) as file:
+    ...     _ = file.write(text)
+    ...     file.close()
+    ...     [situation] = read_situations(file.name, ["elbow"])
+    >>> situation.frames["cup"].position.tolist()
+    [0.4, 0.0, 0.0]
     """
     path = Path(path)
     try:

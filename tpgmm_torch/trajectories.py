@@ -31,7 +31,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A reproduction: the joint references of eq. (2) and Gaussian mixture regression.
+    """A reproduction: joint references over time, and where they come from.
 
     Parameters
     ----------

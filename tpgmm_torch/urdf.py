@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["Mimic", "UrdfJoint", "UrdfModel", "read_urdf"]
+__all__ = ["Mimic", "UrdfJoint", "UrdfModel", "placement", "read_urdf"]
 
 Array = NDArray[np.float64]
 
@@ -216,7 +216,7 @@ def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
             f"{sorted((*MOVABLE_TYPES, *MULTIPLE_TYPES, 'fixed'))}"
         )
     parent, child = (_end(element, name, side) for side in ("parent", "child"))
-    origin = _placement(
+    origin = placement(
         _numbers(element, name, "origin", "xyz", (0.0, 0.0, 0.0)),
         _numbers(element, name, "origin", "rpy", (0.0, 0.0, 0.0)),
     )
@@ -269,8 +269,18 @@ def _number(
     return float(_numbers(element, joint, tag, attribute, (default,))[0])
 
 
-def _placement(xyz: Array, rpy: Array) -> Array:
-    """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis."""
+def placement(xyz: Array, rpy: Array) -> Array:
+    """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis.
+
+    Parameters
+    ----------
+    xyz, rpy : ndarray of shape (3,)
+        Metres, radians.
+
+    Returns
+    -------
+    ndarray of shape (4, 4)
+    """
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     matrix = np.eye(4)
     matrix[:3, :3] = [

@@ -17,7 +17,8 @@ from tpgmm_datasets.layout import Feature, Layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.poses import FramePose, LinkPose
 from tpgmm_datasets.timing import resample, trim
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 __all__ = ["Assembly", "EventSource", "FrameSource", "frame_sources"]
 

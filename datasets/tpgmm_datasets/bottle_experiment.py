@@ -55,6 +55,12 @@ def bottle_operators(orientation: bool = True) -> list[Operator]:
     ----------
     orientation : bool, default=True
         False leaves the hands' orientations out, as the dashed lines of figure 4 do.
+
+    Examples
+    --------
+    >>> hands, joints = bottle_operators(orientation=False)
+    >>> hands
+    Stack(RelativePosition(link='l_hand', frame='bottle'), RelativePosition(link='r_hand', ...
     """
     rows: list[Operator] = []
     for hand in HANDS:

@@ -94,6 +94,13 @@ class BottleShaking:
     ----------
     robot : Robot
         The 17-joint upper body.
+
+    Examples
+    --------
+    >>> skill = BottleShaking()
+    >>> [situation] = skill.situations(1, seed=0)
+    >>> skill.robot.n_joints, list(situation.frames)
+    (17, ['bottle'])
     """
 
     rate: float = 100.0
@@ -190,9 +197,9 @@ class BottleShaking:
         Returns
         -------
         position : Tensor of shape (...)
-            [m]
+            In metres.
         orientation : Tensor of shape (...)
-            [rad]
+            In radians.
         """
         state = self.robot.state(joints)
         apart, turn = [], []

@@ -1,15 +1,16 @@
 """Which columns a demonstration becomes: the schema of the sets that this project writes.
 
-========================== ================================================================
-column                     holds
-========================== ================================================================
-observation.state          the joints q_t
-observation.environment_state  the frames, seven values each: x y z [m], then the unit
-                           quaternion w x y z; named ``bottle.x`` ... ``bottle.qz``
-event.<name>               true at the one step nearest to the event
-action                     the next joint reference, q_{t+1}; the last is repeated
-timestamp, frame_index, episode_index, index, task_index   as in every LeRobot set
-========================== ================================================================
+``observation.state``
+    The joints q_t.
+``observation.environment_state``
+    The frames, seven values each: x y z [m], then the unit quaternion w x y z; named
+    ``bottle.x`` ... ``bottle.qz``.
+``event.<name>``
+    True at the one step nearest to the event.
+``action``
+    The joint reference: as given, else the next joints q_{t+1}, the last repeated.
+``timestamp``, ``frame_index``, ``episode_index``, ``index``, ``task_index``
+    As in every LeRobot set.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from tpgmm_datasets.names import POSE_PARTS
 from tpgmm_datasets.units import POSE_UNITS, with_pose_units
 from tpgmm_torch.demonstrations import Demonstration
 
-__all__ = ["demonstration_columns", "feature_table", "features_of"]
+__all__ = ["action_column", "demonstration_columns", "feature_table", "features_of"]
 
 Array = np.ndarray[Any, Any]
 Features = dict[str, dict[str, Any]]
@@ -130,6 +131,25 @@ def demonstration_columns(
         for key in features
         if key in columns
     }
+
+
+def action_column(
+    commanded: Demonstration, number: int, features: Mapping[str, Any]
+) -> dict[str, Array]:
+    """The column ``action`` where the references are known, as the joints of ``commanded``.
+
+    Raises
+    ------
+    DatasetError
+        If there are not as many as joints.
+    """
+    feature = features[ACTION]
+    if commanded.n_joints != feature["shape"][0]:
+        raise DatasetError(
+            f"demonstration {number} has {feature['shape'][0]} joints and actions of "
+            f"{commanded.n_joints} values"
+        )
+    return {ACTION: _cast(_array(commanded.joints), feature["dtype"], ACTION, number)}
 
 
 def _array(values: Any) -> Array:

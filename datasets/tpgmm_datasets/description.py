@@ -114,6 +114,18 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
     ------
     DatasetError
         If its metadata cannot be read at all.
+
+    Examples
+    --------
+    >>> from tpgmm_datasets import save_lerobot
+    >>> from tpgmm_torch import Demonstration
+    >>> import tempfile
+    >>> shown = Demonstration([0.0, 0.1, 0.2], [[0.0], [0.5], [1.0]], joint_names=["elbow"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save_lerobot([shown], Path(folder) / "bends", fps=10, task="bend the elbow")
+    ...     found = describe_lerobot(path)
+    >>> found.version, found.lengths, found.tasks, found.problems
+    ('v3.0', (3,), ('bend the elbow',), ())
     """
     layout = open_layout(local_folder(path))
     problems = list(layout.problems)

@@ -58,7 +58,12 @@ def _words(name: str) -> tuple[str, ...]:
     return spoken or tuple(words)
 
 
-def match_names(wanted: Sequence[str], present: Sequence[str], column: str) -> dict[str, str]:
+JOINT_NAMES = "Give joint_names={'name in the data set': 'joint of the robot', ...}"
+
+
+def match_names(
+    wanted: Sequence[str], present: Sequence[str], column: str, remedy: str = JOINT_NAMES
+) -> dict[str, str]:
     """Find each wanted name among those present, whatever the spelling.
 
     An equal name comes first; else the one with the same words, where ``k`` and ``joint`` and
@@ -81,8 +86,7 @@ def match_names(wanted: Sequence[str], present: Sequence[str], column: str) -> d
         if len(fits) != 1:
             what = f"fits several values, {fits}" if fits else "is none of the values"
             raise DatasetError(
-                f"the robot's joint {name!r} {what}; they are called {list(present)}. "
-                "Give joint_names={'name in the data set': 'joint of the robot', ...}",
+                f"the robot's joint {name!r} {what}; they are called {list(present)}. {remedy}",
                 column=column,
             )
         found[fits[0]] = name

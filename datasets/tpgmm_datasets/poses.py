@@ -13,7 +13,8 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.layout import Feature
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import UNIT_NORM_TOLERANCE, Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import UNIT_NORM_TOLERANCE, Frame
 
 __all__ = ["FramePose", "LinkPose"]
 
@@ -45,6 +46,13 @@ class FramePose:
         Whether angles are stored in degrees.
     scale : float, default=1.0
         Metres per stored unit of length.
+
+    Examples
+    --------
+    A tracker that writes millimetres, and quaternions with w last:
+
+    >>> FramePose("observation.tracker", rotation="xyzw", scale=0.001).rotation
+    'xyzw'
     """
 
     feature: str
@@ -151,6 +159,11 @@ class LinkPose:
     event : str or callable
         Name of an event of the demonstration, or a function from the demonstration to a
         time [s].
+
+    Examples
+    --------
+    >>> LinkPose("right_hand", "close")
+    LinkPose(link='right_hand', event='close')
     """
 
     link: str

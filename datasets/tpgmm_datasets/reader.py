@@ -82,6 +82,17 @@ def load_lerobot(
     DatasetError
         With file, episode and column, if the set is incomplete or contradicts itself or the
         arguments.
+
+    Examples
+    --------
+    >>> from tpgmm_datasets import save_lerobot
+    >>> import tempfile
+    >>> shown = Demonstration([0.0, 0.1, 0.2], [[0.0], [0.5], [1.0]], joint_names=["elbow"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save_lerobot([shown], Path(folder) / "bends", fps=10, task="bend the elbow")
+    ...     [again] = load_lerobot(path)
+    >>> again.joint_names, again.joints[:, 0].tolist()
+    (('elbow',), [0.0, 0.5, 1.0])
     """
     selected = iter_lerobot(
         path,

@@ -11,7 +11,8 @@ import torch
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import POSE_PARTS
-from tpgmm_torch.demonstrations import Demonstration, Frame, check_demonstrations
+from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.frames import Frame
 
 __all__ = ["demonstrations_from_frame", "demonstrations_to_frame"]
 
@@ -35,6 +36,12 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
         ``table["frame"]`` the poses that change, ``bottle.x`` ... ``bottle.qz``;
         ``table["constant frame"]`` those that do not; ``table["event"]`` the time of each
         event. What a demonstration does not have is NaN.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 0.5], [[0.0], [1.0]], joint_names=["elbow"])
+    >>> demonstrations_to_frame([shown])["joint"]["elbow"].tolist()
+    [0.0, 1.0]
     """
     parts = [
         _part(demonstration, episode)
@@ -89,6 +96,12 @@ def demonstrations_from_frame(table: pd.DataFrame) -> list[Demonstration]:
     ------
     DatasetError
         If index or columns are others, or a value is missing.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 0.5], [[0.0], [1.0]], joint_names=["elbow"])
+    >>> demonstrations_from_frame(demonstrations_to_frame([shown, shown]))[1].joint_names
+    ('elbow',)
     """
     if list(table.index.names) != ["episode", "time"]:
         raise DatasetError(

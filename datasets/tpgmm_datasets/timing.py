@@ -13,7 +13,8 @@ from torch import Tensor
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import quaternion_groups
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.frames import Frame
 
 __all__ = ["resample", "row_times", "time_problems", "trim"]
 
@@ -95,6 +96,12 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
     ------
     DatasetError
         If ``rate`` is not a positive number.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [2.0]])
+    >>> resample(shown, rate=4).joints[:, 0].tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0]
     """
     if not 0 < rate < float("inf"):
         raise DatasetError(f"the rate is a number > 0, got {rate!r}")
@@ -147,6 +154,12 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     ------
     DatasetError
         If it is idle throughout.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 1.0, 2.0, 3.0], [[0.0], [0.0], [1.0], [2.0]])
+    >>> trim(shown, speed=0.1).time.tolist()
+    [0.0, 1.0, 2.0]
     """
     time = demonstration.time
     speeds = (demonstration.joints.diff(dim=0) / time.diff()[:, None]).abs().amax(dim=1)

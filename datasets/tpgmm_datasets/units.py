@@ -12,7 +12,16 @@ import numpy as np
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import pose_groups
 
-__all__ = ["POSE_UNITS", "Scale", "Unit", "Units", "convert", "guess_unit", "with_pose_units"]
+__all__ = [
+    "POSE_UNITS",
+    "Scale",
+    "Unit",
+    "Units",
+    "as_scale",
+    "convert",
+    "guess_unit",
+    "with_pose_units",
+]
 
 Array = np.ndarray[Any, Any]
 
@@ -136,7 +145,7 @@ def convert(
     names : sequence of str
         How errors call them.
     units : sequence of str or Scale
-        One of :data:`NAMED`, ``"auto"`` or a scale for each.
+        One of ``NAMED``, ``"auto"`` or a scale for each.
     column : str
         Where they come from.
     **where
@@ -151,7 +160,7 @@ def convert(
     DatasetError
         If a unit is unknown, or "auto" finds values that cannot be radians.
     """
-    scales = [_scale(unit, column) for unit in units]
+    scales = [as_scale(unit, column) for unit in units]
     if "auto" in units:
         _check_angles(values, names, units, column, where)
     converted: Array = values.astype(np.float64)
@@ -179,7 +188,21 @@ def _check_angles(
         )
 
 
-def _scale(unit: Unit, column: str) -> Scale:
+def as_scale(unit: Unit, column: str) -> Scale:
+    """The scale that a unit stands for.
+
+    Parameters
+    ----------
+    unit : str or Scale
+        One of ``NAMED``, or ``"auto"``, which is taken as it is.
+    column : str
+        Where the values come from.
+
+    Raises
+    ------
+    DatasetError
+        If it is unknown.
+    """
     if isinstance(unit, Scale):
         return unit
     if unit == "auto":

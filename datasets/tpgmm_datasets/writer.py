@@ -8,6 +8,7 @@ import shutil
 import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,12 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from tpgmm_datasets.columns import demonstration_columns, feature_table, features_of
+from tpgmm_datasets.columns import (
+    action_column,
+    demonstration_columns,
+    feature_table,
+    features_of,
+)
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.files import FileSeries
 from tpgmm_datasets.layout import Layout, open_layout
@@ -43,6 +49,7 @@ def save_lerobot(
     *,
     fps: int,
     task: str | Sequence[str],
+    actions: Sequence[Any] | None = None,
     robot_type: str | None = None,
     units: Mapping[str, str] | None = None,
     dtype: str = "float32",
@@ -68,6 +75,9 @@ def save_lerobot(
         Steps per second; LeRobot stores a whole number.
     task : str or sequence of str
         What was done, for all or for each demonstration.
+    actions : sequence of array-like of shape (T, n_joints), optional
+        The references that were commanded at each step of each demonstration, its joints
+        then being what was measured. The default is the joints one step ahead.
     robot_type : str, optional
         Name of the robot, for the metadata.
     units : mapping of str to str, optional
@@ -90,15 +100,25 @@ def save_lerobot(
     Raises
     ------
     DatasetError
-        If the folder exists, time does not follow ``fps``, or the episodes do not fit to the
-        set they are appended to.
+        If the folder exists, time does not follow ``fps``, actions do not fit to the
+        demonstrations, or the episodes to the set they are appended to.
 
     Notes
     -----
     All is written into a folder beside ``path``, which then takes its place: an interrupted
     write leaves the old set, or none where there was none.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> shown = Demonstration([0.0, 0.1, 0.2], [[0.0], [0.5], [1.0]], joint_names=["elbow"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save_lerobot([shown], Path(folder) / "bends", fps=10, task="bend the elbow")
+    ...     sorted(item.name for item in path.iterdir())
+    ['data', 'meta']
     """
-    demonstrations = check_demonstrations(demonstrations)
+    given, demonstrations = demonstrations, check_demonstrations(demonstrations)
+    commanded = _commanded(given, actions)
     path = Path(path)
     tasks = _tasks(task, len(demonstrations))
     if dtype not in ("float32", "float64"):
@@ -132,7 +152,7 @@ def save_lerobot(
         partial.mkdir(parents=True)
         if old is not None:
             _take_over(path, partial)
-        _Writer(partial, info, old).write(demonstrations, tasks)
+        _Writer(partial, info, old).write(demonstrations, tasks, commanded)
         _put_in_place(partial, path)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -146,6 +166,21 @@ def _tasks(task: str | Sequence[str], count: int) -> list[str]:
             f"task is one text or one per demonstration ({count}), not empty; got {task!r}"
         )
     return tasks
+
+
+def _commanded(
+    demonstrations: Sequence[Demonstration], actions: Sequence[Any] | None
+) -> Sequence[Demonstration | None]:
+    """The references as demonstrations: with the same names, and checked as those are."""
+    if actions is None:
+        return [None] * len(demonstrations)
+    if len(actions) != len(demonstrations):
+        raise DatasetError(
+            f"there are actions of {len(actions)} and joints of {len(demonstrations)} "
+            "demonstrations"
+        )
+    pairs = zip(demonstrations, actions, strict=True)
+    return check_demonstrations([replace(item, joints=action) for item, action in pairs])
 
 
 def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
@@ -217,16 +252,29 @@ class _Writer:
         self.data = FileSeries(root, info["data_path"], *limits, metadata=declared)
         self.meta = FileSeries(root, EPISODES_PATH, *limits)
 
-    def write(self, demonstrations: Sequence[Demonstration], tasks: Sequence[str]) -> None:
+    def write(
+        self,
+        demonstrations: Sequence[Demonstration],
+        tasks: Sequence[str],
+        commanded: Sequence[Demonstration | None],
+    ) -> None:
         with self.data, self.meta:
-            for number, (item, task) in enumerate(zip(demonstrations, tasks, strict=True)):
-                self._episode(item, number, task)
+            for number, episode in enumerate(
+                zip(demonstrations, tasks, commanded, strict=True)
+            ):
+                self._episode(number, *episode)
                 if len(self.pending) == FLUSH_EPISODES:
                     self._flush()
             self._flush()
         self._tables()
 
-    def _episode(self, demonstration: Demonstration, number: int, task: str) -> None:
+    def _episode(
+        self,
+        number: int,
+        demonstration: Demonstration,
+        task: str,
+        commanded: Demonstration | None,
+    ) -> None:
         features = self.info["features"]
         if task not in self.tasks:
             self.tasks.append(task)
@@ -235,7 +283,10 @@ class _Writer:
             raise DatasetError(f"demonstration {number} has joint_names unlike the others")
         if first is not None:
             demonstration = demonstration.reordered(first)
+            commanded = commanded and commanded.reordered(first)
         columns = demonstration_columns(demonstration, number, features, self.info["fps"])
+        if commanded is not None:
+            columns |= action_column(commanded, number, features)
         rows = len(demonstration)
         columns["episode_index"] = np.full((rows, 1), self.episodes)
         columns["index"] = np.arange(self.rows, self.rows + rows)[:, None]

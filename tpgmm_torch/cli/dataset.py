@@ -106,6 +106,13 @@ def generate(
         int, typer.Option(min=0, help="Seed; appended episodes differ if it does.")
     ] = 0,
     rate: Annotated[int, typer.Option(min=1, help="Time steps per second.")] = 100,
+    steady_rhythm: Annotated[
+        bool,
+        typer.Option(
+            "--steady-rhythm",
+            help="Shake equally fast in all episodes, as the environment 'bottle_shaking' asks.",
+        ),
+    ] = False,
     append: Append = False,
 ) -> None:
     """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'."""
@@ -114,7 +121,8 @@ def generate(
 
     if path.exists() and not append:  # the writer would say so too, ten seconds later
         raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
-    demonstrations = BottleShaking(rate=rate).demonstrations(n_demonstrations, random_state)
+    skill = BottleShaking(rate=rate, steady_rhythm=steady_rhythm)
+    demonstrations = skill.demonstrations(n_demonstrations, random_state)
     _save(demonstrations, path, append, fps=rate, task=TASK, robot_type="upper_body")
 
 

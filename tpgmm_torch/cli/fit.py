@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tpgmm_torch.cli import options
+from tpgmm_torch.cli.formats import writer
 
 if TYPE_CHECKING:
     from tpgmm_torch.demonstrations import Demonstration
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.operators import Operator
 
 __all__ = ["app"]
 
@@ -30,6 +30,15 @@ LEARNING, REPRODUCING = "Learning", "Reproduction (saved with the model)"
 def fit(
     dataset: options.Dataset,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where the model goes.")],
+    output_format: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="tpgmm | lerobot",
+            help="'tpgmm' for Python and the other commands here; 'lerobot' for a policy that "
+            "lerobot-eval and lerobot-rollout take, if lerobot_policy_tpgmm is installed.",
+        ),
+    ] = "tpgmm",
     robot: options.RobotFile = None,
     link: options.Links = None,
     robot_joint: options.RobotJoints = None,
@@ -138,9 +147,11 @@ def fit(
     and learned as one Gaussian mixture over all of them. The model is a folder of JSON and
     safetensors that 'tpgmm reproduce' and 'tpgmm plot' take.
     """
+    from tpgmm_datasets.signals import Signals
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.operators.text import parse_operator
+    from tpgmm_torch.operators.text import default_operators, parse_operator
 
+    write = writer(output_format)
     operators = [parse_operator(text) for text in operator or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
     read = options.read_demonstrations(
@@ -165,25 +176,17 @@ def fit(
         epsilon=epsilon,
         blend=blend,
     ).fit(demonstrations)
-    model.save(out)
+    signals = Signals.of(
+        dataset,
+        kinematics,
+        joints=joints,
+        units=options.parse_units(units or ()),
+        frames=options.parse_frames(frame or ()),
+        rate=rate,
+    )
+    write(model, out, signals)
     _report(model, read, demonstrations)
     typer.echo(f"saved            {out}")
-
-
-def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
-    """All links seen from all frames (from the base without frames) as one stack; the joints.
-
-    Parameters
-    ----------
-    links, frames : sequence of str
-        Their names.
-    """
-    from tpgmm_torch.operators.text import parse_operator
-
-    references = [f"@{name}" for name in frames] or [""]
-    poses = [f"pose:{link}{reference}" for reference in references for link in links]
-    texts = [" + ".join(poses), "canonical"] if poses else ["canonical"]
-    return [parse_operator(text) for text in texts]
 
 
 def _report(

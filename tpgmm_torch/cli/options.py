@@ -126,10 +126,11 @@ def read_demonstrations(
 
     Parameters
     ----------
-    dataset, frames, episodes, units, joints, rate
-        The options.
+    dataset : str
     robot : Kinematics or None
         Gives the order of the joints.
+    frames, episodes, units, joints, rate
+        The options.
     """
     from tpgmm_datasets import load_lerobot
 

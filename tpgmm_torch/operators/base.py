@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Demonstration, Frame
+from tpgmm_torch.demonstrations import Demonstration
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "Reference"]
+__all__ = ["Linearization", "Operator", "Reference", "frame_names"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,7 @@ class Operator(ABC):
             local = torch.cat((local[:, :start], block, local[:, start + 4 :]), dim=-1)
         return local
 
-    def check(self, kinematics: Kinematics, frames: Mapping[str, Frame]) -> None:
+    def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that the links and frames that are needed exist.
 
         Raises
@@ -197,3 +198,16 @@ class Operator(ABC):
                     "the demonstration alone, it is a link of the robot too: rename the frame",
                     frames,
                 )
+
+
+def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
+    """Names of the frames that a situation must have, each once.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+    kinematics : Kinematics
+        Its links are no frames.
+    """
+    references = (name for operator in operators for name in operator.references())
+    return tuple(dict.fromkeys(name for name in references if name not in kinematics.links))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator, Reference
 
@@ -20,7 +20,7 @@ __all__ = ["AbsoluteOrientation", "RelativeOrientation"]
 
 @dataclass(frozen=True)
 class AbsoluteOrientation(Operator):
-    """Orientation of a link in the base frame (eq. 14).
+    """Orientation of a link in the base frame, equation 14.
 
     ``A = J_o^+ g Hbar*(conj eps_{t-1})``, ``b = q_{t-1}``.
 
@@ -64,7 +64,7 @@ class AbsoluteOrientation(Operator):
 
 @dataclass(frozen=True)
 class RelativeOrientation(Operator):
-    """Orientation of a link seen from a frame (eq. 15).
+    """Orientation of a link seen from a frame, equation 15.
 
     ``A = J_o^+ g Hbar*(conj eps_{t-1}) H+(eps_t^(j))``, ``b = q_{t-1}``. The frame may be
     another link of the robot: the Jacobian is then ``J_o`` of the link minus that of the frame.

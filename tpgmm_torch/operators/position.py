@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.demonstrations import Frame
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator, Reference
 
@@ -16,7 +16,9 @@ __all__ = ["AbsolutePosition", "RelativePosition"]
 
 @dataclass(frozen=True)
 class AbsolutePosition(Operator):
-    """Position of a link in the base frame: ``A = J_p^+``, ``b = -J_p^+ x + q`` (eq. 4).
+    """Position of a link in the base frame, equation 4.
+
+    ``A = J_p^+``, ``b = -J_p^+ x + q``.
 
     Parameters
     ----------
@@ -51,10 +53,11 @@ class AbsolutePosition(Operator):
 
 @dataclass(frozen=True)
 class RelativePosition(Operator):
-    """Position of a link seen from a frame: ``A = J_p^+ R``, ``b = J_p^+ (p - x) + q`` (eq. 6).
+    """Position of a link seen from a frame, equation 6.
 
-    The frame may be another link of the robot (one hand relative to the other): both then
-    move with the joints, and the Jacobian is the relative one.
+    ``A = J_p^+ R``, ``b = J_p^+ (p - x) + q``. The frame may be another link of the robot (one
+    hand relative to the other): both then move with the joints, and the Jacobian is the
+    relative one.
 
     Parameters
     ----------

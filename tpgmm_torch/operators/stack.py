@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpgmm_torch.demonstrations import Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.frames import Frame
 from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator

@@ -8,7 +8,7 @@ and ``canonical`` the joints themselves.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Operator
@@ -17,7 +17,7 @@ from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrien
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import Stack
 
-__all__ = ["format_operator", "parse_operator"]
+__all__ = ["default_operators", "format_operator", "parse_operator"]
 
 #: By kind, the operator in the base frame and the one seen from a frame.
 KINDS: dict[str, tuple[Callable[[str], Operator], Callable[[str, str], Operator]]] = {
@@ -59,7 +59,7 @@ def parse_operator(text: str) -> Operator:
     >>> parse_operator("position:l_hand@bottle")
     RelativePosition(link='l_hand', frame='bottle')
     >>> parse_operator("pose:l_hand + canonical").operators[2]
-    Canonical()
+    Canonical(tolerance=0.005)
     """
     operators = [operator for term in text.split("+") for operator in _term(term.strip(), text)]
     return operators[0] if len(operators) == 1 else Stack(*operators)
@@ -74,6 +74,20 @@ def _term(term: str, text: str) -> list[Operator]:
     kind, link, frame = match["kind"], match["link"], match["frame"]
     pairs = KINDS.values() if kind == "pose" else [KINDS[kind]]
     return [relative(link, frame) if frame else absolute(link) for absolute, relative in pairs]
+
+
+def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
+    """All links seen from all frames (from the base without frames) as one stack; the joints.
+
+    Parameters
+    ----------
+    links, frames : sequence of str
+        Their names.
+    """
+    references = [f"@{name}" for name in frames] or [""]
+    poses = [f"pose:{link}{reference}" for reference in references for link in links]
+    texts = [" + ".join(poses), "canonical"] if poses else ["canonical"]
+    return [parse_operator(text) for text in texts]
 
 
 def format_operator(operator: Operator) -> str:

@@ -15,6 +15,6 @@ def upper_body_urdf() -> str:
     Returns
     -------
     str
-        The text, as :meth:`tpgmm_torch.robots.Robot.from_urdf` takes it.
+        The text, as :meth:`tpgmm_torch.Robot.from_urdf` takes it.
     """
     return resources.files(__name__).joinpath("upper_body.urdf").read_text(encoding="utf-8")

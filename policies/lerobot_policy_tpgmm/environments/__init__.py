@@ -1,1 +1,154 @@
-"""Simulated robots to run policies on, registered with gymnasium and LeRobot."""
+"""Simulated robots to run policies on, registered with gymnasium and LeRobot.
+
+They load late: importing this package needs neither MuJoCo nor gym-aloha.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_policy_tpgmm.control_rate import rate_processors
+from lerobot_policy_tpgmm.environments.aloha_robot import JOINTS, OBJECTS
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = ["AlohaStateConfig", "BottleShakingConfig"]
+
+_PACKAGE = "lerobot_policy_tpgmm"
+
+gym.register(
+    id=f"{_PACKAGE}/BottleShaking-v0",
+    entry_point=f"{_PACKAGE}.environments.bottle_shaking:BottleShakingEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/AlohaState-v0",
+    entry_point=f"{_PACKAGE}.environments.aloha_state:AlohaStateEnv",
+)
+
+
+def _features(n_joints: int, n_objects: int = 1) -> dict[str, PolicyFeature]:
+    return {
+        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n_joints,)),
+        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(n_joints,)),
+        "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(7 * n_objects,)),
+    }
+
+
+def _features_map() -> dict[str, str]:
+    return {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+
+
+@EnvConfig.register_subclass("bottle_shaking")
+@dataclass
+class BottleShakingConfig(EnvConfig):
+    """``--env.type=bottle_shaking``.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, mode, episode_length, pushes, noise, track, frequency, amplitude
+        Options of
+        :class:`~lerobot_policy_tpgmm.environments.bottle_shaking.BottleShakingEnv`;
+        its own defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "BottleShaking-v0"
+    fps: int = 100
+    mode: str = "dynamic"
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    track: bool = False
+    frequency: float | None = None
+    amplitude: float | None = None
+    render_mode: str = "rgb_array"
+    render_width: int = 320
+    render_height: int = 240
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))
+    features_map: dict[str, str] = field(default_factory=_features_map)
+
+    @property
+    def package_name(self) -> str:
+        """Where gymnasium's name is registered."""
+        return _PACKAGE
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        names = (
+            *("fps", "mode", "episode_length", "pushes", "noise", "track", "frequency"),
+            *("amplitude", "render_mode", "render_width", "render_height"),
+        )
+        options = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in options.items() if value is not None}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Tell the policy the rate of actions."""
+        return rate_processors(self.fps)
+
+
+@EnvConfig.register_subclass("aloha_state")
+@dataclass
+class AlohaStateConfig(EnvConfig):
+    """``--env.type=aloha_state``.
+
+    Parameters
+    ----------
+    task : {"transfer_cube", "insertion"}, default="transfer_cube"
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot; the features follow from the task.
+    fps, episode_length, yaw_range, track, stop_at_success
+        Options of
+        :class:`~lerobot_policy_tpgmm.environments.aloha_state.AlohaStateEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "transfer_cube"
+    fps: int = 50
+    episode_length: int | None = None
+    yaw_range: float | None = None
+    track: bool = False
+    stop_at_success: bool = True
+    render_mode: str = "rgb_array"
+    render_width: int = 320
+    render_height: int = 240
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=_features_map)
+
+    def __post_init__(self) -> None:
+        if self.task not in OBJECTS:
+            raise UnknownNameError("task", str(self.task), "aloha_state", OBJECTS)
+        if not self.features:
+            self.features = _features(len(JOINTS), len(OBJECTS[self.task]))
+
+    @property
+    def package_name(self) -> str:
+        """Where gymnasium's name is registered."""
+        return _PACKAGE
+
+    @property
+    def gym_id(self) -> str:
+        """The one environment that has both tasks."""
+        return f"{_PACKAGE}/AlohaState-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        names = (
+            *("task", "fps", "episode_length", "yaw_range", "track", "stop_at_success"),
+            *("render_mode", "render_width", "render_height"),
+        )
+        options = {name: getattr(self, name) for name in names}
+        return {name: value for name, value in options.items() if value is not None}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Tell the policy the rate of actions."""
+        return rate_processors(self.fps)

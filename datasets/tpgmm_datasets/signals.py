@@ -1,0 +1,120 @@
+"""What a data set calls its signals: what a policy that was learned from it must know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Self
+
+from tpgmm_datasets.assembly import FrameSource, frame_sources
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.hub import local_folder
+from tpgmm_datasets.joints import JointColumns, joint_feature
+from tpgmm_datasets.layout import Feature, open_layout
+from tpgmm_datasets.names import match_names
+from tpgmm_datasets.poses import FramePose
+from tpgmm_datasets.units import Scale, Units, as_scale
+
+__all__ = ["Signals"]
+
+STATE, ACTION = "observation.state", "action"
+ENVIRONMENT = "observation.environment_state"
+REMEDY = "A policy observes each joint, and gives an action for it"
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Names, units and rate of states and actions.
+
+    Parameters
+    ----------
+    fps : float
+        Steps per second of the demonstrations.
+    state_names, action_names, environment_names : tuple of str or None
+        Entries of ``observation.state`` (of the joints' feature, where there is none), of
+        ``action`` and of ``observation.environment_state``; None where the set does not name
+        them.
+    units : mapping of str to (float, float)
+        Factor and offset that bring a stored value to radians or metres, by joint; those
+        that are left out are so stored.
+    frames : mapping of str to tuple of int
+        Where frames are in ``observation.environment_state``, as position and quaternion
+        (w, x, y, z) in metres.
+    """
+
+    fps: float
+    state_names: tuple[str, ...] | None
+    action_names: tuple[str, ...] | None
+    environment_names: tuple[str, ...] | None
+    units: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    frames: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        path: str,
+        robot: Any = None,
+        *,
+        joints: str | None = None,
+        units: Units = "auto",
+        frames: Mapping[str, FrameSource] | None = None,
+        rate: float | None = None,
+    ) -> Self:
+        """Read the metadata of a data set.
+
+        Parameters
+        ----------
+        path, robot, joints, units, frames, rate
+            What :func:`load_lerobot` was given.
+
+        Raises
+        ------
+        DatasetError
+            If the data set cannot be read, or state and action have different units.
+        """
+        layout = open_layout(local_folder(path))
+        source = layout.feature(joints or joint_feature(layout))
+        state = layout.features.get(STATE, source)
+        action = layout.features.get(ACTION)
+        environment = layout.features.get(ENVIRONMENT)
+        columns = JointColumns.choose(source, None, units, robot)
+        scales = {
+            name: as_scale(unit, source.key)
+            for name, unit in zip(columns.names or (), columns.units, strict=False)
+            if robot is None or name in robot.joint_names
+        }
+        for feature in (state, action):
+            if feature is not None and feature is not source:
+                _check_units(feature, scales)
+        places = {
+            name: tuple(source.select(name, environment))
+            for name, source in frame_sources(layout, frames).items()
+            if isinstance(source, FramePose) and environment and _plain(source)
+        }
+        return cls(
+            rate or layout.fps,
+            state.names,
+            action.names if action else None,
+            environment.names if environment else None,
+            {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
+            places,
+        )
+
+
+def _plain(source: FramePose) -> bool:
+    return source.feature == ENVIRONMENT and source.rotation == "wxyz" and source.scale == 1
+
+
+def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:
+    """What else holds the joints declares the same units, if any."""
+    if not feature.names or not feature.units:
+        return
+    declared = dict(zip(feature.names, feature.units, strict=True))
+    for entry, joint in match_names(list(scales), feature.names, feature.key, REMEDY).items():
+        unit = declared[entry]
+        if unit != "raw" and as_scale(unit, feature.key) != scales[joint]:
+            raise DatasetError(
+                f"{entry!r} is in {unit!r}, but {joint!r} was read in another unit: a policy "
+                "needs one for states and actions",
+                column=feature.key,
+            )

@@ -1,0 +1,78 @@
+"""Short names lead to the API reference: types in docstrings, and roles like :class:`Robot`."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from docutils import nodes
+from numpydoc.xref import DEFAULT_LINKS
+from sphinx import addnodes
+from sphinx.application import Sphinx
+from sphinx.config import Config
+from sphinx.environment import BuildEnvironment
+from sphinx.util.nodes import make_refnode
+
+import tpgmm_datasets
+import tpgmm_torch
+
+__all__ = ["setup"]
+
+
+def _types(app: Sphinx, config: Config) -> None:
+    """Names that numpydoc links where they stand as a type."""
+    config.numpydoc_xref_aliases = (
+        {name: name for name in DEFAULT_LINKS}  # nobody needs a link from "int"
+        | {name: f"tpgmm_torch.{name}" for name in tpgmm_torch.__all__}
+        | {name: f"tpgmm_datasets.{name}" for name in tpgmm_datasets.__all__}
+        | {"Tensor": "torch.Tensor"}
+    )
+
+
+def _by_last_part(
+    app: Sphinx, env: BuildEnvironment, node: Any, text: nodes.TextElement
+) -> nodes.Element | None:
+    """The one object of the reference whose name ends like this."""
+    if node.get("refdomain") != "py":
+        return None
+    domain = env.domains.python_domain
+    target = node["reftarget"]
+    if node["reftype"] == "attr" and target not in domain.objects:
+        target = target.rpartition(".")[0]  # fields are explained where their class is
+    ending = f".{target}"
+    found = {
+        name: entry
+        for name, entry in domain.objects.items()
+        if f".{name}".endswith(ending) and not entry.aliased
+    }
+    if len(found) != 1:
+        return None
+    [(name, entry)] = found.items()
+    return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, [text], name)
+
+
+def _other_name(app: Sphinx, document: nodes.document) -> None:
+    """Let anchors answer to the other of two names, in the package and in the module.
+
+    The source pages call all objects of a module alike: by the package if one of them is
+    documented as the package's, by the module otherwise.
+    """
+    for signature in document.findall(addnodes.desc_signature):
+        module, name = signature.get("module"), signature.get("fullname")
+        if not module or not name:
+            continue
+        package = module.partition(".")[0]
+        value = getattr(sys.modules.get(module), name.partition(".")[0], None)
+        home = getattr(value, "__module__", None)
+        for other in (f"{package}.{name}", f"{home}.{name}"):
+            if other not in document.ids:
+                signature["ids"].append(other)
+                document.ids[other] = signature
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """What Sphinx calls."""
+    app.connect("config-inited", _types, priority=100)  # before numpydoc
+    app.connect("doctree-read", _other_name)
+    app.connect("missing-reference", _by_last_part)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,112 @@
+"""How Sphinx builds the documentation: ``make docs``. Needs no network."""
+
+import sys
+from fnmatch import fnmatchcase
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+import torch
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE / "_ext"), str(HERE / "pictures")]
+
+import inventories  # noqa: E402
+
+torch.set_num_threads(1)  # the matrices are small
+
+project = "tpgmm-torch"
+author = "The tpgmm-torch developers"
+copyright = author
+release = version = installed_version("tpgmm-torch")
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.intersphinx",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx-mathjax-offline",
+    "sphinxcontrib.bibtex",
+    "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
+    "myst_parser",
+    "numpydoc",
+    # our own
+    "commands",
+    "internals",
+    "picturebook",
+    "report",
+    "sitelinks",
+    "ties",
+    "typelinks",
+]
+exclude_patterns = ["_build", "_ext", "pictures", "comparison", "images", "gallery/*.py"]
+nitpicky = True
+
+# Pages
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath", "tasklist"]
+myst_heading_anchors = 3
+bibtex_bibfiles = ["references.bib"]
+copybutton_prompt_text = r">>> |\.\.\. |\$ "
+copybutton_prompt_is_regexp = True
+
+# API reference
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # the docstrings tell the types, with shapes and units
+numpydoc_show_class_members = False
+numpydoc_xref_param_type = True
+numpydoc_xref_ignore = "all"  # link what is known, see typelinks
+viewcode_line_numbers = True
+intersphinx_mapping = inventories.write(HERE / "_build" / "inventories")
+
+# Gallery
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"/plot_",
+    "ignore_pattern": r"^(?!plot_)",
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": False,
+    "only_warn_on_example_error": False,
+    "capture_repr": (),
+    "image_scrapers": ("matplotlib",),
+    "remove_config_comments": True,
+    "show_memory": False,
+    "show_signature": False,
+    "write_computation_times": False,
+    "doc_module": ("tpgmm_torch",),
+    "backreferences_dir": "gallery/backreferences",
+    "inspect_global_variables": False,
+}
+
+# Site
+html_theme = "pydata_sphinx_theme"
+html_title = f"tpgmm-torch {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
+toc_object_entries_show_parents = "hide"
+# pages without siblings have nothing to navigate
+html_sidebars = {page.stem: [] for page in HERE.glob("*.md")}
+html_theme_options = {
+    "navigation_with_keys": False,
+    "show_toc_level": 2,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}
+
+
+def _of_others(
+    app: Sphinx, what: str, name: str, member: object, *_more: object
+) -> bool | None:
+    """Leave out what classes inherit from scikit-learn: it is explained there."""
+    method = name.rpartition(".")[2]
+    theirs = str(getattr(member, "__module__", "")).startswith("sklearn.")
+    return True if theirs or fnmatchcase(method, "set_*_request") else None
+
+
+def setup(app: Sphinx) -> None:
+    """What Sphinx calls."""
+    app.connect("autodoc-skip-member", _of_others)

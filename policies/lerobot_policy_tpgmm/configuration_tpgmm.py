@@ -1,0 +1,313 @@
+"""Everything that a policy is but its numbers: what ``config.json`` holds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from tpgmm_datasets.bottle_shaking import HANDS
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import Kinematics, Operator, Robot, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators.text import format_operator, parse_operator
+from tpgmm_torch.persistence import decode, encode
+
+__all__ = ["TPGMMConfig"]
+
+#: Parameters of the estimator that go into the configuration under their own names.
+HYPERPARAMETERS = (
+    "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
+    "responsibilities", "fusion", "activation", "epsilon", "prior_std", "negligible", "blend",
+    "keep_limits", "random_state", "dtype",
+)  # fmt: skip
+
+CHOICES = {
+    "feedback": ("reference", "observation"),
+    "alignment": ("dtw", "barycenter", "linear", "none"),
+    "loss": ("likelihood", "imitation"),
+}
+
+
+@PreTrainedConfig.register_subclass("tpgmm")
+@dataclass
+class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
+    """Configuration of :class:`TPGMMPolicy`, ``--policy.type=tpgmm``.
+
+    A policy that is fitted has everything here filled in; for training from a data set,
+    ``robot``, ``links`` and what differs from the defaults are enough.
+
+    Parameters
+    ----------
+    n_components, covariance_type, reg_covar, tol, max_iter, n_init, init_params, \
+    responsibilities, fusion, activation, epsilon, prior_std, negligible, blend, keep_limits, \
+    random_state, dtype
+        As for :class:`tpgmm_torch.TaskParameterizedGMM`.
+    operators : list of str or dict, optional
+        As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
+        :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
+        all links in all frames, stacked, and the joints.
+    robot : dict or str, optional
+        The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
+        the URDF in it; to begin with, the path of a URDF or ``"upper_body"``. None for
+        joints alone.
+    links, joints, coordinates : list of str, optional
+        For a robot given by its path, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links of
+        ``"upper_body"`` are its hands if none are named.
+    n_steps : int, default=0
+        T, the length of the time grid that was learned; 0 before a fit.
+    state_names, action_names, environment_names : list of str, optional
+        What the entries of ``observation.state``, ``action`` and
+        ``observation.environment_state`` are, in the order in which they come and go. Joints
+        are found among them by name. Override them for a robot that has another order than
+        the data set: LeRobot tells a policy neither.
+    units : str or dict, optional
+        Unit of the joints in states and actions: ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, or
+        ``[factor, offset]`` that bring a value to radians; for all, or by name. By default
+        what the data set declares, else radians (and metres).
+    frames : dict of str to list, optional
+        Where the seven values x y z qw qx qy qz of each frame are: positions in
+        ``observation.environment_state``, or names of entries of it or of
+        ``observation.state``. By default names like ``bottle.x`` tell, else the frames follow
+        one another in ``observation.environment_state``.
+    default_environment_state : list of float, optional
+        Taken where there is no observation of the frames.
+    follow_frames : bool, default=False
+        Read the frames at every step, instead of at the start of an episode.
+    fps : float, optional
+        Steps per second of the demonstrations.
+    control_fps : float, optional
+        Actions per second; by default ``fps``.
+    feedback : {"reference", "observation"}, default="reference"
+        What q_{t-1} is: the last reference (as in the paper), or the measured posture.
+    largest_start_gap : float or None, default=1.0
+        Refuse to begin if a joint stands further from its first reference [rad]: the order
+        or the unit is wrong then, or the robot does not stand where the skill begins.
+    chunk_size : int, default=50
+        Number of steps of ``predict_action_chunk``.
+    alignment : {"dtw", "barycenter", "linear", "none"}, default="dtw"
+        How training brings episodes onto one clock.
+    alignment_features : list of str, optional
+        What ``"dtw"`` and ``"barycenter"`` compare, as for
+        :class:`tpgmm_torch.alignment.DynamicTimeWarping`; ``["directions"]`` suits rhythms.
+    loss : {"likelihood", "imitation"}, default="likelihood"
+        What training by gradient minimises once the mixture is fitted.
+    optimizer_lr : float, default=1e-4
+        Step size of that training.
+    push_to_hub : bool, default=False
+        Whether lerobot-train uploads the policy in the end, to ``repo_id``.
+
+    Raises
+    ------
+    DataError, InvalidParameterError
+        If a value is none that exists.
+    """
+
+    n_components: int = 10
+    covariance_type: str = "full"
+    reg_covar: float = 1e-5
+    tol: float = 1e-3
+    max_iter: int = 100
+    n_init: int = 1
+    init_params: str = "time"
+    responsibilities: str = "auto"
+    fusion: str = "information"
+    activation: str = "time"
+    epsilon: float = 1e-4
+    prior_std: float = 10.0
+    negligible: float = 1e-9
+    blend: float = 1.0
+    keep_limits: bool = True
+    random_state: int | None = None
+    dtype: str = "float64"
+
+    # draccus tries the members of a union in order, and can turn anything into a str
+    operators: list[dict[str, Any] | str] | None = None
+    robot: dict[str, Any] | str | None = None
+    links: list[str] = field(default_factory=list)
+    joints: list[str] | None = None
+    coordinates: list[str] = field(default_factory=list)
+    n_steps: int = 0
+
+    state_names: list[str] | None = None
+    action_names: list[str] | None = None
+    environment_names: list[str] | None = None
+    units: dict[str, list[float] | str] | str | None = None
+    frames: dict[str, list[int | str]] | None = None
+    default_environment_state: list[float] | None = None
+    follow_frames: bool = False
+
+    fps: float | None = None
+    control_fps: float | None = None
+    feedback: str = "reference"
+    largest_start_gap: float | None = 1.0
+    chunk_size: int = 50
+
+    alignment: str = "dtw"
+    alignment_features: list[str] | None = None
+    loss: str = "likelihood"
+    optimizer_lr: float = 1e-4
+    push_to_hub: bool = False
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(
+            ("STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+        )
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise DataError(
+                    f"{name} is one of {list(choices)}, got {getattr(self, name)!r}"
+                )
+        for name in ("fps", "control_fps", "largest_start_gap"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise DataError(f"{name} is a positive number or null, got {value}")
+        for name, least in (("n_steps", 0), ("chunk_size", 1)):
+            if getattr(self, name) < least:
+                raise DataError(f"{name} is at least {least}, got {getattr(self, name)}")
+        if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
+            raise DataError(
+                "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
+                f"got {self.normalization_mapping}"
+            )
+        self.estimator(None, ())._validate_params()
+
+    @property
+    def rate(self) -> float:
+        """Actions per second.
+
+        Raises
+        ------
+        DataError
+            If neither ``control_fps`` nor ``fps`` is known.
+        """
+        rate = self.control_fps or self.fps
+        if rate is None:
+            raise DataError("the policy does not know its rate: set fps or control_fps")
+        return rate
+
+    def kinematics(self) -> Kinematics | None:
+        """The robot that ``robot`` describes, None for joints alone.
+
+        Raises
+        ------
+        ModelFileError, DataError, UnknownNameError
+            If it cannot be built.
+        """
+        if self.robot is None or isinstance(self.robot, dict):
+            return None if self.robot is None else decode(self.robot)
+        urdf, links = self.robot, self.links
+        if urdf == "upper_body":
+            urdf, links = upper_body_urdf(), links or list(HANDS)
+        return Robot.from_urdf(urdf, links, joints=self.joints, coordinates=self.coordinates)
+
+    def decoded_operators(self) -> list[Operator] | None:
+        """The operators that ``operators`` describes; None if it says nothing.
+
+        Raises
+        ------
+        ModelFileError, DataError
+            If one cannot be built.
+        """
+        if self.operators is None:
+            return None
+        return [
+            parse_operator(item) if isinstance(item, str) else decode(item)
+            for item in self.operators
+        ]
+
+    def describe(self, kinematics: Kinematics, operators: Any) -> None:
+        """Write robot and operators into the configuration, complete in themselves.
+
+        Parameters
+        ----------
+        kinematics : Kinematics
+        operators : sequence of Operator
+
+        Raises
+        ------
+        ModelFileError
+            If one of them has no description, or none that can be read back.
+        """
+        self.robot = encode(kinematics)
+        self.operators = [_description(operator) for operator in operators]
+        self.kinematics()  # what cannot be read back is refused now
+        self.decoded_operators()
+
+    def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
+        """An unfitted estimator of these hyper-parameters.
+
+        Parameters
+        ----------
+        kinematics : Kinematics or None
+        operators : sequence of Operator
+        """
+        settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
+        return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
+
+    def set_features(self, n_state: int, n_environment: int, n_action: int) -> None:
+        """Declare inputs and outputs to LeRobot.
+
+        Parameters
+        ----------
+        n_state, n_environment, n_action : int
+            Numbers of entries; no ``observation.environment_state`` if there are none.
+        """
+        self.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (n_state,))}
+        if n_environment:
+            self.input_features[OBS_ENV_STATE] = PolicyFeature(
+                FeatureType.ENV, (n_environment,)
+            )
+        self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (n_action,))}
+
+    def validate_features(self) -> None:
+        """Check that there are a state and an action.
+
+        Raises
+        ------
+        DataError
+            If one is missing.
+        """
+        for key, feature in (
+            (OBS_STATE, self.robot_state_feature),
+            (ACTION, self.action_feature),
+        ):
+            if feature is None:
+                known = sorted({**(self.input_features or {}), **(self.output_features or {})})
+                raise DataError(f"a tpgmm policy needs {key}; there are {known}")
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        """Adam, without weight decay."""
+        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0)
+
+    def get_scheduler_preset(self) -> None:
+        """No schedule."""
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the present action."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+
+
+def _description(operator: Operator) -> dict[str, Any] | str:
+    """As text, if that is the whole operator."""
+    text = format_operator(operator)
+    try:
+        return text if parse_operator(text) == operator else encode(operator)
+    except DataError:  # it has no text
+        return encode(operator)

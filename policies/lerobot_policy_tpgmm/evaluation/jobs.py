@@ -1,0 +1,175 @@
+"""Train a policy and evaluate it: the work behind the cells, one process at a time."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.envs.factory import make_env_config
+from lerobot.processor import make_default_pre_post_processors
+
+from lerobot_policy_tpgmm.evaluation.baselines import RECIPES, Training, train
+from lerobot_policy_tpgmm.evaluation.cells import Cell, Results, write_json
+from lerobot_policy_tpgmm.evaluation.episodes import Episodes
+from lerobot_policy_tpgmm.evaluation.replay import NearestPolicy
+from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
+from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.evaluation.tpgmm import fit_tpgmm
+from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = ["POLICIES", "record", "run"]
+
+#: In the order of the report.
+POLICIES = ("tpgmm", "tpgmm-position-only", *RECIPES, "nearest")
+RECORD = "training.json"
+PACKAGES = ("tpgmm-torch", "lerobot", "torch", "numpy", "gymnasium", "mujoco", "diffusers")
+
+
+def record(folder: Path, settings: Settings, n: int) -> None:
+    """Record the episodes that all policies learn from, unless they are there.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the comparison.
+    settings : Settings
+    n : int
+        How many episodes are needed for training.
+    """
+    place = folder / "episodes"
+    summary = place / "summary.json"
+    if summary.exists():
+        known = json.loads(summary.read_text(encoding="utf-8"))
+        if len(known["successes"]) >= n:
+            return
+    shutil.rmtree(place, ignore_errors=True)
+    benchmark = settings.benchmark()
+    successes = benchmark.record(place, n, settings.validation, settings.demonstration_seed)
+    write_json(summary, {"successes": successes})
+
+
+def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
+    """Train a policy, unless that is done, and evaluate it in the conditions of some cells.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the comparison.
+    settings : Settings
+    cells : sequence of Cell
+        Of one training.
+    """
+    torch.set_num_threads(1)  # the networks are small: a second thread only spins
+    directory = folder / "policies" / cells[0].training
+    if not (directory / RECORD).exists():
+        _train(folder, settings, cells[0], directory)
+    training = json.loads((directory / RECORD).read_text(encoding="utf-8"))
+    runner, results = Runner.load(directory), Results(folder / "cells")
+    for cell in cells:
+        options = settings.disturbed(cell.condition)
+        config = make_env_config(settings.benchmark().env, fps=training["fps"], **options)
+        began = time.perf_counter()
+        rows = evaluate(runner, config, settings.seeds)
+        seconds = time.perf_counter() - began
+        results.write(
+            cell,
+            {
+                "settings": {**asdict(settings), "options": options},
+                "training": training,
+                "evaluation_seconds": seconds,
+                "latency": latency(runner, config),
+                "episodes": rows,
+                "versions": {name: version(name) for name in PACKAGES},
+                "machine": machine(),
+            },
+        )
+
+
+def machine() -> dict[str, Any]:
+    """What results may depend on of the machine, without its name."""
+    return {
+        "architecture": platform.machine(),
+        "system": platform.system(),
+        "processors": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "python": platform.python_version(),
+    }
+
+
+def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> None:
+    """Write the pretrained directory in one step."""
+    partial = directory.with_name(f".{directory.name}.partial")
+    for rest in (partial, directory):  # of a run that was killed
+        shutil.rmtree(rest, ignore_errors=True)
+    began = time.perf_counter()
+    trained = _trainer(cell.policy)(folder / "episodes", settings, cell)
+    seconds = time.perf_counter() - began
+    try:
+        for part in (trained.policy, *trained.processors):
+            part.save_pretrained(partial)
+        size = sum(path.stat().st_size for path in partial.iterdir())
+        description = {
+            "fps": trained.fps,
+            "seconds": seconds,
+            "parameters": sum(p.numel() for p in trained.policy.parameters()),
+            "bytes": size,
+            "outcome": trained.outcome,
+            "recipe": trained.recipe,
+            "curve": trained.curve,
+        }
+        write_json(partial / RECORD, description)
+        partial.rename(directory)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _trainer(name: str) -> Callable[[Path, Settings, Cell], Training]:
+    if name in RECIPES:
+        return _baseline
+    if name == "nearest":
+        return _nearest
+    if name in ("tpgmm", "tpgmm-position-only"):
+        return _tpgmm
+    raise UnknownNameError("policy", name, "the comparison", POLICIES)
+
+
+def _baseline(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    training = Episodes.read(episodes / "training").first(cell.demonstrations)
+    validation = Episodes.read(episodes / "validation")
+    recipe = RECIPES[cell.policy]
+    if recipe.phase and not settings.benchmark().synchronous:
+        training, validation = training.on_common_clock(validation)
+    return train(recipe, training, validation, seed=cell.seed, budget=settings.budget)
+
+
+def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    kept = Episodes.read(episodes / "training").first(cell.demonstrations)
+    policy = NearestPolicy.fit(kept)
+    processors = make_default_pre_post_processors(policy.config)
+    return Training(policy, processors, kept.fps, outcome="kept as they are")
+
+
+def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    benchmark = settings.benchmark()
+    policy = fit_tpgmm(
+        benchmark,
+        episodes / "training",
+        cell.demonstrations,
+        cell.seed,
+        settings.n_components,
+        orientation=cell.policy == "tpgmm",
+    )
+    recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
+    processors = make_tpgmm_pre_post_processors(policy.config)
+    outcome = "learned by expectation-maximisation"
+    return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)

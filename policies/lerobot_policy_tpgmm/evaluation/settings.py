@@ -1,0 +1,112 @@
+"""What all cells of a comparison have in common."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_policy_tpgmm.evaluation.benchmarks import Benchmark, benchmark
+from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, write_json
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything on which results depend, but for what tells cells apart.
+
+    Parameters
+    ----------
+    env : str, default="bottle_shaking"
+        Name of the benchmark.
+    options : mapping, optional
+        Fields of its configuration.
+    rate : int, optional
+        Of the recorded episodes [Hz]; the default is the environment's.
+    episodes : int, default=50
+        Evaluation episodes of each cell.
+    budget : float, default=600
+        Seconds after which the training of a baseline ends, if its validation error still
+        falls.
+    validation : int, default=10
+        Held-out episodes on which baselines are validated; no policy learns from them.
+    n_components : int, optional
+        K of TP-GMM; the default is the environment's.
+    demonstration_seed, evaluation_seed : int
+        Of the demonstrations, and of the first evaluation episode.
+    """
+
+    env: str = "bottle_shaking"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    rate: int | None = None
+    episodes: int = 50
+    budget: float = 600.0
+    validation: int = 10
+    n_components: int | None = None
+    demonstration_seed: int = 0
+    evaluation_seed: int = 100_000
+
+    @property
+    def seeds(self) -> range:
+        """Of the evaluation episodes."""
+        return range(self.evaluation_seed, self.evaluation_seed + self.episodes)
+
+    def benchmark(self) -> Benchmark:
+        """The environment that is meant."""
+        return benchmark(self.env, self.rate, self.options)
+
+    def disturbed(self, condition: str) -> dict[str, Any]:
+        """The environment's options in a condition.
+
+        Parameters
+        ----------
+        condition : str
+            ``nominal``, or disturbances joined by ``+``.
+
+        Raises
+        ------
+        UnknownNameError
+            If the environment has no such disturbance.
+        """
+        benchmark = self.benchmark()
+        known, options = benchmark.disturbances, benchmark.options
+        for name in () if condition == NOMINAL else condition.split("+"):
+            if name not in known:
+                where = f"the conditions of {self.env}"
+                raise UnknownNameError("disturbance", name, where, {NOMINAL, *known})
+            options = {**options, **known[name]}
+        return options
+
+    def keep(self, path: Path) -> None:
+        """Write to a file, or check that it says the same.
+
+        Parameters
+        ----------
+        path : Path
+
+        Raises
+        ------
+        DataError
+            If the file belongs to a comparison with other settings.
+        """
+        own = asdict(self)
+        if not path.exists():
+            write_json(path, own)
+            return
+        try:
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise DataError(f"{path} is not JSON: {error}") from error
+        differ = [key for key in {**own, **found} if own.get(key) != found.get(key)]
+        if differ:
+            raise DataError(
+                f"{path.parent} holds results with other settings: "
+                + "; ".join(
+                    f"{key} was {found.get(key)!r}, now {own.get(key)!r}" for key in differ
+                )
+                + ". Take another folder, or the settings of before"
+            )

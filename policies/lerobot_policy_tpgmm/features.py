@@ -1,0 +1,268 @@
+"""Between the entries of LeRobot's features and the model's joints and frames.
+
+A data set, a robot and a URDF each have their own order, names and units. Here joints are
+found by name, and values converted both ways; the model works in radians and metres.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor, nn
+
+from tpgmm_datasets.names import match_names, pose_groups
+from tpgmm_datasets.units import Scale, as_scale
+from tpgmm_torch import Frame
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+
+__all__ = ["FrameFeatures", "JointFeatures"]
+
+REMEDY = (
+    "Is this policy for another robot or data set? If the names alone differ, give those that "
+    "the policy shall see, in order: --policy.state_names='[...]' --policy.action_names='[...]'"
+)
+POSE = 7
+
+
+class JointFeatures(nn.Module):
+    """Joints in ``observation.state`` and ``action``.
+
+    Parameters
+    ----------
+    joint_names : sequence of str
+        Of the model, in its order.
+    state_names : sequence of str
+        Of the entries of the state, which may have others too.
+    action_names : sequence of str
+        Of the entries of the action, each of which must be a joint.
+    units : str, mapping or None
+        As in :class:`TPGMMConfig`; by the name of an entry or of a joint.
+
+    Raises
+    ------
+    DataError
+        If a joint is missing, ambiguous or too many, or a unit is unknown.
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        state_names: Sequence[str],
+        action_names: Sequence[str],
+        units: Mapping[str, Sequence[float] | str] | str | None,
+    ) -> None:
+        super().__init__()
+        self.joint_names, self.state_names = tuple(joint_names), tuple(state_names)
+        in_state = match_names(joint_names, state_names, OBS_STATE, REMEDY)
+        in_action = match_names(joint_names, action_names, ACTION, REMEDY)
+        extra = [name for name in action_names if name not in in_action]
+        if extra:
+            raise DataError(
+                f"the action has the entries {extra}, which are no joints of the model; it has "
+                f"{list(joint_names)}. Learn them too (coordinates=...), or leave them out of "
+                "action_names if the robot can do without"
+            )
+        _check_units(units, {*state_names, *action_names, *joint_names})
+        entry = {joint: name for name, joint in in_state.items()}
+        state = [_scale(units, entry[joint], joint) for joint in joint_names]
+        action = [_scale(units, name, in_action[name]) for name in action_names]
+        self._register("columns", [self.state_names.index(entry[j]) for j in joint_names])
+        self._register("order", [self.joint_names.index(in_action[n]) for n in action_names])
+        self._register("scale", [[s.factor, s.offset] for s in state])
+        self._register("back", [[s.factor, s.offset] for s in action])
+
+    def _register(self, name: str, values: list[Any]) -> None:
+        kind = torch.long if isinstance(values[0], int) else torch.float64
+        # they follow from the configuration: not in the file
+        self.register_buffer(name, torch.tensor(values, dtype=kind), persistent=False)
+
+    scale: Tensor
+    back: Tensor
+    columns: Tensor
+    order: Tensor
+
+    def joints(self, state: Tensor) -> Tensor:
+        """Joint vectors (B, n_joints) in the model's order and units.
+
+        Parameters
+        ----------
+        state : Tensor of shape (B, n_state)
+
+        Raises
+        ------
+        ShapeError
+            If it has another size.
+        """
+        if state.ndim != 2 or state.shape[-1] != len(self.state_names):
+            raise ShapeError(
+                f"{OBS_STATE} has shape (batch, {len(self.state_names)}) for "
+                f"{list(self.state_names)}, got {tuple(state.shape)}. {REMEDY}"
+            )
+        return state[:, self.columns] * self.scale[:, 0] + self.scale[:, 1]
+
+    def action(self, joints: Tensor) -> Tensor:
+        """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
+        ordered = joints[..., self.order]
+        return ((ordered - self.back[:, 1]) / self.back[:, 0]).to(torch.float32)
+
+    def targets(self, action: Tensor) -> Tensor:
+        """What actions (..., n_action) ask of the joints ``order``, in the model's units."""
+        return action * self.back[:, 0] + self.back[:, 1]
+
+
+class FrameFeatures:
+    """Where the poses of frames are observed.
+
+    The first that is there counts: ``observation.environment_state``, entries of
+    ``observation.state``, the default.
+
+    Parameters
+    ----------
+    frame_names : sequence of str
+        The frames that the model needs.
+    places : mapping of str to sequence of int or str, optional
+        As ``frames`` in :class:`TPGMMConfig`.
+    environment_names, state_names : sequence of str, optional
+    default : sequence of float, optional
+        A whole ``observation.environment_state``.
+    n_environment : int, optional
+        Its size, if that is known otherwise than from the names.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If a place is none.
+    """
+
+    def __init__(
+        self,
+        frame_names: Sequence[str],
+        places: Mapping[str, Sequence[int | str]] | None,
+        environment_names: Sequence[str] | None,
+        state_names: Sequence[str],
+        default: Sequence[float] | None,
+        n_environment: int | None = None,
+    ) -> None:
+        for name in places or {}:
+            if name not in frame_names:
+                raise UnknownNameError("frame", name, "the model", frame_names)
+        named, stated = _named(environment_names), _named(state_names)
+        self.in_environment: dict[str, list[int]] = {}
+        self.in_state: dict[str, list[int]] = {}
+        for index, name in enumerate(frame_names):
+            environment, state = named.get(name), stated.get(name)
+            if places and name in places:
+                environment, own = _placed(name, places[name], environment_names, state_names)
+                state = own or state
+            elif environment is None and not environment_names:
+                environment = [*range(POSE * index, POSE * (index + 1))]
+            if environment is not None:
+                self.in_environment[name] = environment
+            if state is not None:
+                self.in_state[name] = state
+        self.frame_names = tuple(frame_names)
+        least = 1 + max((max(p) for p in self.in_environment.values()), default=-1)
+        self.n_environment = len(environment_names or ()) or n_environment or least
+        if self.n_environment < least:
+            raise ShapeError(
+                f"{OBS_ENV_STATE} has {self.n_environment} entries, the frames "
+                f"{list(frame_names)} are at {self.in_environment}"
+            )
+        self.default = None
+        if default is not None:
+            self.default = torch.tensor(list(default), dtype=torch.float64)
+            if len(self.default) != self.n_environment:
+                raise ShapeError(
+                    f"default_environment_state has {len(self.default)} values, "
+                    f"{OBS_ENV_STATE} has {self.n_environment}"
+                )
+
+    def frames(self, batch: Mapping[str, Any]) -> dict[str, Frame]:
+        """Poses (B,) of all frames.
+
+        Parameters
+        ----------
+        batch : mapping of str to Tensor
+            Observations.
+
+        Raises
+        ------
+        DataError, ShapeError
+            If the pose of a frame is missing, or not a pose.
+        """
+        environment = batch.get(OBS_ENV_STATE)
+        state = batch[OBS_STATE]
+        if environment is not None and environment.shape != (len(state), self.n_environment):
+            raise ShapeError(
+                f"{OBS_ENV_STATE} has shape ({len(state)}, {self.n_environment}), got "
+                f"{tuple(environment.shape)}: is this policy for another environment?"
+            )
+        return {name: self._frame(name, state, environment) for name in self.frame_names}
+
+    def _frame(self, name: str, state: Tensor, environment: Tensor | None) -> Frame:
+        if environment is not None and name in self.in_environment:
+            values = environment[:, self.in_environment[name]]
+        elif name in self.in_state:
+            values = state[:, self.in_state[name]]
+        elif self.default is not None and name in self.in_environment:
+            values = self.default[self.in_environment[name]].to(state).expand(len(state), POSE)
+        else:
+            observed = "is not there" if environment is None else "has entries of other names"
+            raise DataError(
+                f"the pose of {name!r} is missing: {OBS_ENV_STATE} {observed}, and {OBS_STATE} "
+                f"has no {name}.x ... {name}.qz. Let the robot observe it, or give "
+                "--policy.default_environment_state='[x,y,z,qw,qx,qy,qz]'"
+            )
+        values = values.to(torch.float64)
+        try:
+            return Frame(values[:, :3], values[:, 3:])
+        except DataError as error:
+            raise DataError(f"frame {name!r}: {error}") from error
+
+
+def _check_units(units: Any, known: set[str]) -> None:
+    unknown = sorted(set(units) - known) if isinstance(units, Mapping) else []
+    if unknown:
+        raise DataError(f"units are given for {unknown}; the joints are {sorted(known)}")
+
+
+def _scale(units: Any, name: str, joint: str) -> Scale:
+    unit = units or "rad"
+    if isinstance(units, Mapping):
+        unit = units.get(name, units.get(joint, "rad"))
+    if not isinstance(unit, str):
+        if len(unit) != 2 or not unit[0] or not all(map(math.isfinite, unit)):
+            raise DataError(f"the unit of {name!r} is a name or [factor, offset], got {unit!r}")
+        unit = Scale(*unit)
+    return as_scale(unit, name)
+
+
+def _named(names: Sequence[str] | None) -> dict[str, list[int]]:
+    """Poses that names tell of; LeRobot's robots put ``.pos`` behind every name."""
+    plain = [name.removesuffix(".pos") for name in names or ()]
+    return {name: list(group) for name, group in pose_groups(plain).items()}
+
+
+def _placed(
+    name: str,
+    place: Sequence[int | str],
+    environment_names: Sequence[str] | None,
+    state_names: Sequence[str],
+) -> tuple[list[int] | None, list[int] | None]:
+    """Columns of the environment's or of the robot's state."""
+    if len(place) != POSE:
+        raise DataError(f"frame {name!r} is at seven entries, x y z qw qx qy qz; got {place}")
+    if all(isinstance(entry, int) and entry >= 0 for entry in place):
+        return [int(entry) for entry in place], None
+    for where, names in enumerate((environment_names or (), state_names)):
+        if all(entry in names for entry in place):
+            columns = [list(names).index(str(entry)) for entry in place]
+            return (None, columns) if where else (columns, None)
+    raise DataError(
+        f"frame {name!r} is at {list(place)}, which are not all entries of {OBS_ENV_STATE}, "
+        f"{list(environment_names or ())}, nor of {OBS_STATE}, {list(state_names)}"
+    )

@@ -1,0 +1,317 @@
+"""The policy: a fitted mixture behind LeRobot's interface."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_policy_tpgmm.configuration_tpgmm import HYPERPARAMETERS, TPGMMConfig
+from lerobot_policy_tpgmm.control import ControlLoop
+from lerobot_policy_tpgmm.control_rate import check_rate
+from lerobot_policy_tpgmm.features import FrameFeatures, JointFeatures
+from lerobot_policy_tpgmm.learning import Learner
+from lerobot_policy_tpgmm.parameters import MixtureParameters
+from lerobot_policy_tpgmm.recorded import adopt, check_dataset
+from lerobot_policy_tpgmm.storage import read_tensors, write_files
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
+from tpgmm_torch.operators.base import frame_names
+
+__all__ = ["TPGMMPolicy"]
+
+
+class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """A task-parameterised Gaussian mixture as a LeRobot policy.
+
+    Actions are joint references. All sub-environments of a batch move through the time grid
+    in step, from :meth:`reset` on.
+
+    Parameters
+    ----------
+    config : TPGMMConfig
+    dataset_stats : dict, optional
+        Not used.
+    dataset_meta : LeRobotDatasetMetadata, optional
+        What the policy is trained on. It completes the configuration of a policy that is not
+        fitted; with a fitted one it must agree.
+    **unused
+        What else LeRobot passes.
+
+    Raises
+    ------
+    DataError, ShapeError, ModelFileError, UnknownNameError
+        If the configuration is incomplete, or contradicts itself or the data set.
+    """
+
+    config_class = TPGMMConfig
+    name = "tpgmm"
+
+    def __init__(
+        self,
+        config: TPGMMConfig,
+        dataset_stats: object = None,
+        dataset_meta: Any = None,
+        **unused: Any,
+    ) -> None:
+        super().__init__(config)
+        self.config = config
+        if dataset_meta is not None:
+            (check_dataset if config.n_steps else adopt)(config, dataset_meta)
+        kinematics, operators = config.kinematics(), config.decoded_operators()
+        if kinematics is None or operators is None:
+            raise DataError(
+                "a policy that is not fitted needs a data set to be trained on: lerobot-train "
+                "--policy.type=tpgmm --dataset.root=..., or TPGMMPolicy.from_estimator(model), "
+                "or tpgmm fit ... --format lerobot"
+            )
+        config.validate_features()
+        self.kinematics = kinematics.to(getattr(torch, config.dtype))
+        self.operators = tuple(operators)
+        required = frame_names(operators, self.kinematics)
+        for operator in operators:
+            operator.check(self.kinematics, required)
+        dimensions = [operator.dimension(self.kinematics) for operator in operators]
+        self.mixture = MixtureParameters(
+            config.n_components, dimensions, config.n_steps, getattr(torch, config.dtype)
+        )
+        names = self.kinematics.joint_names
+        state_names = config.state_names or names
+        if config.n_steps:  # the robot at hand may state more than the data set did
+            size = (len(state_names),)
+            config.input_features[OBS_STATE] = PolicyFeature(FeatureType.STATE, size)
+        self._check_size("state_names", state_names, config.robot_state_feature)
+        action_names = config.action_names or names
+        self._check_size("action_names", action_names, config.action_feature)
+        self.joints = JointFeatures(names, state_names, action_names, config.units)
+        environment = config.env_state_feature
+        self.frames = FrameFeatures(
+            required,
+            config.frames,
+            config.environment_names,
+            state_names,
+            config.default_environment_state,
+            environment.shape[0] if environment else None,
+        )
+        self._learner = None if dataset_meta is None else Learner(self, dataset_meta)
+        self.reset()
+
+    @staticmethod
+    def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
+        if tuple(feature.shape) != (len(names),):
+            raise ShapeError(
+                f"{field} are {list(names)}, {len(names)} entries, but the environment or data "
+                f"set has a feature of shape {tuple(feature.shape)}. Is this policy for "
+                f"another robot? Else name the entries in order, --policy.{field}='[...]'"
+            )
+
+    @classmethod
+    def from_estimator(
+        cls,
+        model: TaskParameterizedGMM,
+        *,
+        fps: float | None = None,
+        state_names: Sequence[str] | None = None,
+        action_names: Sequence[str] | None = None,
+        environment_names: Sequence[str] | None = None,
+        frames: Mapping[str, Sequence[int | str]] | None = None,
+        **options: Any,
+    ) -> Self:
+        """A policy that does what a fitted model does.
+
+        Parameters
+        ----------
+        model : TaskParameterizedGMM
+            Fitted.
+        fps : float, optional
+            Steps per second; by default those of the model's time grid.
+        state_names, action_names, environment_names : sequence of str, optional
+            Names of the entries of ``observation.state``, ``action`` and
+            ``observation.environment_state``; by default states and actions are the model's
+            joints in its order.
+        frames : mapping of str to sequence, optional
+            As in :class:`TPGMMConfig`.
+        **options
+            Other fields of :class:`TPGMMConfig`.
+
+        Returns
+        -------
+        TPGMMPolicy
+
+        Raises
+        ------
+        NotFittedError
+            If the model is not fitted.
+        DataError, ModelFileError
+            If names or frames do not fit the model, or it holds an operator or a robot of
+            your own, which a file cannot describe.
+        """
+        if not hasattr(model, "weights_"):
+            raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
+        kinematics, time = model.kinematics_, model.time_
+        if fps is None and len(time) > 1:
+            fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
+        settings = {name: getattr(model, name) for name in HYPERPARAMETERS}
+        if not isinstance(settings["random_state"], int):
+            settings["random_state"] = None
+        config = TPGMMConfig(
+            **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
+        )
+        config.n_steps = len(time)
+        config.state_names = list(state_names or kinematics.joint_names)
+        config.action_names = list(action_names or kinematics.joint_names)
+        config.environment_names = list(environment_names) if environment_names else None
+        config.frames = {k: list(v) for k, v in frames.items()} if frames else None
+        config.describe(kinematics, model.operators_)
+        poses = FrameFeatures(
+            model.frame_names_, config.frames, environment_names, config.state_names, None
+        )
+        config.set_features(
+            len(config.state_names), poses.n_environment, len(config.action_names)
+        )
+        policy = cls(config)
+        policy.mixture.copy_from(model)
+        return policy.eval().to(config.device)
+
+    def to_estimator(self) -> TaskParameterizedGMM:
+        """The fitted model that the policy is.
+
+        Raises
+        ------
+        NotFittedError
+            If it is not fitted.
+        """
+        device = self.mixture.time.device
+        kinematics = self.kinematics.to(device=device)
+        model = self.config.estimator(kinematics, list(self.operators))
+        model.device = str(device)
+        self.mixture.copy_to(model)
+        return model
+
+    def reset(self) -> None:
+        """Begin a new episode with the next observation."""
+        self._loop: ControlLoop | None = None
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
+        """The next joint references.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+            ``observation.state`` (B, n_state) and what the frames are read from. Only the
+            first observation after :meth:`reset` counts, unless ``feedback`` or
+            ``follow_frames`` say otherwise.
+
+        Returns
+        -------
+        Tensor of shape (B, n_action)
+            float32. After the end of the time grid it stays.
+
+        Raises
+        ------
+        DataError, ShapeError
+            If the observation is not what the policy was made for.
+        """
+        if self._loop is None:
+            self._loop = self._begin(batch)
+        return self.joints.action(self._step(self._loop, batch))
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
+        """The next ``chunk_size`` references, open loop; the episode does not advance.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+            As for :meth:`select_action`.
+
+        Returns
+        -------
+        Tensor of shape (B, chunk_size, n_action)
+        """
+        ahead = self._begin(batch) if self._loop is None else self._loop.copy()
+        references = [self._step(ahead, batch)]
+        while len(references) < self.config.chunk_size:
+            references.append(ahead.step())
+        return self.joints.action(torch.stack(references, dim=1))
+
+    def _begin(self, batch: Mapping[str, Tensor]) -> ControlLoop:
+        check_rate(batch, self.config.rate)
+        return ControlLoop(
+            self.to_estimator(),
+            self._observed(batch),
+            self.frames.frames(batch),
+            1 / self.config.rate,
+            self.config.largest_start_gap,
+        )
+
+    def _step(self, loop: ControlLoop, batch: Mapping[str, Tensor]) -> Tensor:
+        if self.config.follow_frames:
+            loop.frames = self.frames.frames(batch)
+        measured = self._observed(batch) if self.config.feedback == "observation" else None
+        return loop.step(measured)
+
+    def _observed(self, batch: Mapping[str, Tensor]) -> Tensor:
+        if OBS_STATE not in batch:
+            raise DataError(f"the policy needs {OBS_STATE}; the batch has {sorted(batch)}")
+        return self.joints.joints(batch[OBS_STATE])
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
+        """The loss of a batch of a data set; see :mod:`lerobot_policy_tpgmm.learning`.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+            As LeRobot's data loader gives it, behind the preprocessor.
+
+        Returns
+        -------
+        loss : Tensor of shape ()
+        None
+            Where other policies have more figures for the log.
+
+        Raises
+        ------
+        DataError, NotFittedError
+            If the policy was not told of a data set, or the batch cannot be learned from.
+        """
+        if self._learner is None:
+            raise DataError(
+                "training needs the data set's meta data: make_policy(config, ds_meta=...) "
+                "passes them, or TPGMMPolicy(config, dataset_meta=dataset.meta)"
+            )
+        return self._learner.loss(batch), None
+
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and use; what was collected in training is fitted by then."""
+        if not mode and self._learner is not None:
+            self._learner.end_epoch()
+        return super().train(mode)
+
+    def get_optim_params(self) -> Any:
+        """What gradient training changes: the mixture."""
+        return self.parameters()
+
+    def _save_pretrained(
+        self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
+    ) -> None:
+        if self._learner is not None:
+            self._learner.check_saveable()
+        self.to_estimator()  # refuses what could not be loaded
+        write_files(self.config, state_dict or self.state_dict(), Path(save_directory))
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: Self, model_file: str, map_location: str, strict: bool
+    ) -> Self:
+        """Strictly, whatever ``strict`` says: LeRobot itself only warns of what is missing."""
+        model.load_state_dict(read_tensors(model_file, model.state_dict()))
+        model.to_estimator()  # refuses numbers that are no mixture
+        return model

@@ -1,0 +1,59 @@
+"""``tpgmm fit ... --format lerobot``: a model as a pretrained directory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tpgmm_datasets.signals import Signals
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.exceptions import ModelFileError
+
+__all__ = ["write_pretrained"]
+
+
+def write_pretrained(model: TaskParameterizedGMM, path: Path, signals: Signals) -> None:
+    """Write the directory that LeRobot's commands take as ``--policy.path``.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Fitted.
+    path : Path
+    signals : Signals
+        Of the data set that the model was fitted to.
+
+    Raises
+    ------
+    ModelFileError
+        If something else is there.
+    DataError
+        If the data set's actions are not the model's joints.
+    """
+    if path.exists() and not _replaceable(path):
+        raise ModelFileError(
+            f"{path} exists and is not a tpgmm policy; choose another directory"
+        )
+    policy = TPGMMPolicy.from_estimator(
+        model,
+        fps=signals.fps,
+        state_names=signals.state_names,
+        action_names=signals.action_names,
+        environment_names=signals.environment_names,
+        frames={n: p for n, p in signals.frames.items() if n in model.frame_names_},
+        units={name: list(scale) for name, scale in signals.units.items()} or None,
+    )
+    policy.save_pretrained(path)
+
+
+def _replaceable(path: Path) -> bool:
+    """Whether it is empty or holds a policy of this type."""
+    if not path.is_dir():
+        return False
+    config = path / "config.json"
+    try:
+        is_policy = json.loads(config.read_text()).get("type") == TPGMMPolicy.name
+    except (OSError, ValueError, AttributeError):
+        is_policy = False
+    return is_policy or not any(path.iterdir())

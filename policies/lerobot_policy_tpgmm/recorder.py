@@ -1,0 +1,227 @@
+"""Episodes put together again from the shuffled batches of a training loop."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["EpochRecorder", "RecordedEpisode", "episode_ranges", "located"]
+
+#: What is kept of a frame.
+COLUMNS = (OBS_STATE, OBS_ENV_STATE)
+
+#: How far a timestamp may be from its place, in frames.
+OFF_GRID = 0.1
+
+
+def episode_ranges(dataset_meta: Any) -> dict[int, range]:
+    """The global indices of the frames of each episode of a LeRobot data set.
+
+    Parameters
+    ----------
+    dataset_meta : LeRobotDatasetMetadata
+    """
+    names = ("episode_index", "dataset_from_index", "dataset_to_index")
+    columns = [dataset_meta.episodes[name] for name in names]
+    return {
+        int(episode): range(int(first), int(stop))
+        for episode, first, stop in zip(*columns, strict=True)
+    }
+
+
+def located(batch: Mapping[str, Any], ranges: Mapping[int, range]) -> tuple[Tensor, Tensor]:
+    """Which frame of which episode the members of a batch are.
+
+    Parameters
+    ----------
+    batch : mapping of str to Tensor
+        As a LeRobot data loader gives it.
+    ranges : mapping of int to range
+        From :func:`episode_ranges`.
+
+    Returns
+    -------
+    episodes, steps : Tensor of shape (B,)
+        Steps count from 0 in each episode.
+
+    Raises
+    ------
+    DataError
+        If the batch does not say, or the data set has no such frame.
+    """
+    for key in ("index", "episode_index", OBS_STATE):
+        if key not in batch:
+            raise DataError(f"training needs {key!r} in each batch, which has {sorted(batch)}")
+    indices = batch["index"].detach().cpu().flatten()
+    episodes = batch["episode_index"].detach().cpu().flatten()
+    for episode, index in zip(episodes.tolist(), indices.tolist(), strict=True):
+        if index not in ranges.get(episode, ()):
+            raise DataError(
+                f"the data set that the policy was told of has no frame {index} in episode "
+                f"{episode}: give it the meta data of the set that it is trained on"
+            )
+    starts = torch.tensor([ranges[episode].start for episode in episodes.tolist()])
+    return episodes, indices - starts
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedEpisode:
+    """The frames of one episode that have come so far.
+
+    Parameters
+    ----------
+    seen : Tensor of shape (T,)
+        Whether the frame has come.
+    columns : dict of str to Tensor of shape (T, ...)
+        ``observation.state``, and ``observation.environment_state`` where there is one.
+    """
+
+    seen: Tensor
+    columns: dict[str, Tensor]
+
+    @classmethod
+    def empty(cls, length: int, like: Mapping[str, Tensor]) -> RecordedEpisode:
+        """No frames yet, of a number to come; their columns are like those of a batch."""
+        columns = {
+            key: column.new_zeros(length, *column.shape[1:]) for key, column in like.items()
+        }
+        return cls(torch.zeros(length, dtype=torch.bool), columns)
+
+    def fill(self, number: int, steps: Tensor, columns: Mapping[str, Tensor]) -> bool:
+        """Take frames in, and say whether one of them was there before.
+
+        Parameters
+        ----------
+        number : int
+            Of the episode, for errors.
+        steps : Tensor of shape (B,)
+        columns : mapping of str to Tensor of shape (B, ...)
+
+        Raises
+        ------
+        DataError
+            If a frame that was there has other values.
+        """
+        again = self.seen[steps]
+        for key, column in columns.items():
+            other = (self.columns[key][steps] != column).reshape(len(steps), -1).any(1)
+            changed = again & other
+            if changed.any():
+                raise DataError(
+                    f"{key} of frame {int(steps[changed][0])} of episode {number} has other "
+                    "values than when it came before: a tpgmm policy learns the data as they "
+                    "are, without random transforms"
+                )
+            self.columns[key][steps] = column
+        self.seen[steps] = True
+        return bool(again.any())
+
+
+@dataclass(eq=False)
+class EpochRecorder:
+    """Keeps each frame once, and knows when all are there.
+
+    The training part of a data set is not known beforehand: LeRobot tells a policy of the
+    whole set alone. An epoch is over when a frame comes again and no episode has a gap; by
+    then each of the training episodes has been seen, and no other.
+
+    Parameters
+    ----------
+    ranges : mapping of int to range
+        The global indices of the frames of each episode, from :func:`episode_ranges`.
+    fps : float
+        Frames per second.
+
+    Attributes
+    ----------
+    episodes : dict of int to RecordedEpisode
+        Those of which a frame has come.
+    """
+
+    ranges: Mapping[int, range]
+    fps: float
+    episodes: dict[int, RecordedEpisode] = field(default_factory=dict, init=False)
+    _batch_size: int = field(default=0, init=False)
+
+    def record(self, batch: Mapping[str, Any]) -> bool:
+        """Keep the frames of a batch.
+
+        Parameters
+        ----------
+        batch : mapping of str to Tensor
+            As a LeRobot data loader gives it, behind the policy's preprocessor.
+
+        Returns
+        -------
+        bool
+            Whether one of them had come before.
+
+        Raises
+        ------
+        DataError
+            If a value is not finite, a column is missing, or a frame is not in the data set,
+            comes at another time, or has other values than before.
+        """
+        numbers, steps = located(batch, self.ranges)
+        self._check(batch, numbers, steps)
+        columns = {key: batch[key].detach().cpu() for key in COLUMNS if key in batch}
+        self._batch_size = max(self._batch_size, len(steps))
+        again = False
+        for number in numbers.unique().tolist():
+            mine = numbers == number
+            part = {key: column[mine] for key, column in columns.items()}
+            if number not in self.episodes:
+                self.episodes[number] = RecordedEpisode.empty(len(self.ranges[number]), part)
+            again |= self.episodes[number].fill(number, steps[mine], part)
+        return again
+
+    def _check(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> None:
+        """Whether values are finite, and frames come at their time."""
+        for key in (*COLUMNS, ACTION):
+            finite = batch.get(key, steps).detach().cpu().isfinite().reshape(len(steps), -1)
+            bad = ~finite.all(1)
+            if bad.any():
+                number, step = int(numbers[bad][0]), int(steps[bad][0])
+                raise DataError(f"{key} holds NaN or infinity: episode {number}, frame {step}")
+        timestamps = batch.get("timestamp", steps / self.fps).detach().cpu().flatten()
+        off = (timestamps * self.fps - steps).abs() > OFF_GRID
+        if off.any():
+            raise DataError(
+                f"the frames of episode {int(numbers[off][0])} do not come at {self.fps:g} per "
+                f"second: frame {int(steps[off][0])} has the timestamp "
+                f"{float(timestamps[off][0]):.6g} s. Resample the set: "
+                f"tpgmm dataset convert SOURCE TARGET --rate {self.fps:g}"
+            )
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames that have come."""
+        return sum(int(episode.seen.sum()) for episode in self.episodes.values())
+
+    @property
+    def complete(self) -> bool:
+        """Whether there are episodes, all of them without gaps."""
+        return 0 < self.n_frames == self._expected
+
+    @property
+    def _expected(self) -> int:
+        return sum(len(self.ranges[number]) for number in self.episodes)
+
+    def __str__(self) -> str:
+        """What is there, and how many steps of training are needed."""
+        if not self.episodes:
+            return "no frame has come yet"
+        steps = math.ceil(self._expected / self._batch_size)
+        return (
+            f"{self.n_frames} of the {self._expected} frames of {len(self.episodes)} episodes "
+            f"have come: with batch_size={self._batch_size} an epoch takes at least {steps} "
+            "steps"
+        )

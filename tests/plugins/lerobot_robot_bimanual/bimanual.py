@@ -1,0 +1,57 @@
+import json
+
+from lerobot.robots import Robot
+
+from .config_bimanual import BimanualConfig
+
+
+class Bimanual(Robot):
+    """Joints are at once where they are sent; what else it observes stands still.
+
+    Names and their order are those of the file ``start``. It takes any number, of any unit.
+    """
+
+    config_class = BimanualConfig
+    name = "bimanual"
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.config, self._connected, self._actions = config, False, []
+        self._observed = json.loads(config.start.read_text())
+
+    @property
+    def observation_features(self):
+        return dict.fromkeys(self._observed, float)
+
+    @property
+    def action_features(self):
+        return {name: float for name in self._observed if not name.startswith("bottle")}
+
+    @property
+    def is_connected(self):
+        return self._connected
+
+    @property
+    def is_calibrated(self):
+        return True
+
+    def connect(self, calibrate=True):
+        self._connected = True
+
+    def calibrate(self):
+        pass
+
+    def configure(self):
+        pass
+
+    def get_observation(self):
+        return dict(self._observed)
+
+    def send_action(self, action):
+        self._actions.append(dict(action))
+        self._observed |= action
+        return action
+
+    def disconnect(self):
+        self._connected = False
+        self.config.log.write_text(json.dumps(self._actions))

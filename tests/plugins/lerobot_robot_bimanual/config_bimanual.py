@@ -1,0 +1,13 @@
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot.robots import RobotConfig
+
+
+@RobotConfig.register_subclass("bimanual")
+@dataclass(kw_only=True)
+class BimanualConfig(RobotConfig):
+    """``start`` holds what is observed by name, ``log`` will hold the actions."""
+
+    start: Path
+    log: Path

@@ -1,0 +1,137 @@
+"""``tpgmm view``: look at a motion."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tpgmm_torch.cli import options
+from tpgmm_torch.cli.reproduce import situation_of
+
+__all__ = ["app"]
+
+app = typer.Typer()
+
+LIVE = "Live"
+EXAMPLE = (
+    "Example: tpgmm view out/demo"
+    "\n\n"
+    "Example: tpgmm view out/model --dataset out/demo/dataset --episodes 0:5 --live"
+)
+
+
+@app.command(epilog=EXAMPLE)
+def view(
+    model: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR",
+            help="A model that 'tpgmm fit' saved, or what 'tpgmm demo' wrote: a folder with "
+            "model/ and dataset/.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html", help="Where the page goes; default DIR.html."),
+    ] = None,
+    dataset: Annotated[
+        str | None,
+        typer.Option(help="A LeRobot data set: demonstrated paths, and their situations."),
+    ] = None,
+    situations: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.json",
+            help="Situations, as 'tpgmm reproduce' takes them, instead of the data set's.",
+        ),
+    ] = None,
+    situation: Annotated[
+        int, typer.Option(min=0, help="Which of the situations is shown, counted from 0.")
+    ] = 0,
+    frame: options.Frames = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    rate: options.Rate = None,
+    meshes: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            exists=True,
+            file_okay=False,
+            rich_help_panel=options.ROBOT,
+            help="The robot's mesh files; without them, sticks stand for meshes.",
+        ),
+    ] = None,
+    fps: Annotated[float, typer.Option(min=1, max=200, help="Pictures per second.")] = 25.0,
+    live: Annotated[
+        bool,
+        typer.Option(
+            "--live",
+            rich_help_panel=LIVE,
+            help="Serve the page instead: objects can be moved by hand, and the skill is "
+            "reproduced anew.",
+        ),
+    ] = False,
+    host: Annotated[
+        str, typer.Option(rich_help_panel=LIVE, help="Address to listen on.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, rich_help_panel=LIVE, help="First port to try.")
+    ] = 8080,
+) -> None:
+    """Look at a motion in three dimensions.
+
+    Writes one HTML file that needs nothing else: the robot from its URDF, frames, demonstrated
+    and reproduced paths, ellipsoids of two standard deviations along the path, a time line.
+    """
+    import torch
+
+    from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.situations import read_situations
+    from tpgmm_torch.viewing import LiveView, write_motion
+
+    # the matrices are small: a second thread on a busy machine only spins
+    torch.set_num_threads(1)
+    where, place = model, out or Path(f"{model}.html")
+    if place.suffix != ".html":
+        raise DataError(f"--out ends in .html, got {str(place)!r}")
+    if (model / "model").is_dir() and (model / "dataset").is_dir():
+        where, dataset = model / "model", dataset or str(model / "dataset")
+    if situations is None and dataset is None:
+        raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
+    fitted = TaskParameterizedGMM.load(where, device="cpu")
+    demonstrations = []
+    if dataset is not None:
+        demonstrations = options.read_demonstrations(
+            dataset, fitted.kinematics_, frame, episodes, units, joints, rate
+        )
+    if situations is not None:
+        wanted = read_situations(situations, fitted.kinematics_.joint_names)
+    else:
+        wanted = [situation_of(demonstration) for demonstration in demonstrations]
+    if situation >= len(wanted):
+        raise DataError(
+            f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
+        )
+    if live:
+        at: dict[str, Any] = {"host": host, "port": port}
+        with (
+            LiveView(
+                fitted, wanted, demonstrations, first=situation, meshes=meshes, fps=fps, **at
+            ) as shown,
+            suppress(KeyboardInterrupt),
+        ):
+            typer.echo(f"open {shown.url} in a browser; stop with Ctrl-C")
+            shown.run()
+        return
+    title = f"{model.resolve().name}, situation {situation}"
+    trajectory = write_motion(
+        place, fitted, wanted[situation], demonstrations, meshes=meshes, fps=fps, title=title
+    )
+    seconds = float(trajectory.time[-1] - trajectory.time[0])
+    typer.echo(f"{seconds:.1f} s of motion, {place.stat().st_size / 1e6:.1f} MB, in {place}")

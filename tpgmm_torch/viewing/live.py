@@ -1,0 +1,173 @@
+"""A motion in the browser while the program runs: objects can be moved by hand."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.frames import Frame
+from tpgmm_torch.viewing.recording import viser_server
+from tpgmm_torch.viewing.scene import MotionScene
+
+__all__ = ["LiveView"]
+
+SPEEDS = ("0.25", "0.5", "1", "2", "4")
+
+
+class LiveView:
+    """Serve motions to a browser; a context manager.
+
+    The page has a time line, a choice of situations, and a handle on every object that stands
+    still: where it is let go, the skill is reproduced anew.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Fitted, with a robot or with tracked poses.
+    situations : sequence of Situation
+        What to reproduce for.
+    demonstrations : sequence of Demonstration, default=()
+        Whose paths are drawn beside it.
+    meshes : Path, optional
+        Folder with the files of the robot's meshes.
+    first : int, default=0
+        Which of the situations is shown first.
+    fps : float, default=25.0
+        Pictures per second.
+    host : str, default="127.0.0.1"
+        Address to listen on: this machine only, or "0.0.0.0" for all that can reach it.
+    port : int, default=8080
+        The next free one from here on; 0 for any that is free.
+
+    Attributes
+    ----------
+    url : str
+        What to open.
+    trajectory : Trajectory
+        What is shown.
+    scene : MotionScene
+    situation : Situation
+        What is shown, and where the objects are in it by now.
+    clock : float
+        The instant that is shown, from the start of the motion [s].
+
+    Raises
+    ------
+    DependencyError
+        If viser is not installed.
+    DataError
+        If the model has no links, or the robot's description cannot be drawn.
+    """
+
+    def __init__(
+        self,
+        model: TaskParameterizedGMM,
+        situations: Sequence[Situation],
+        demonstrations: Sequence[Demonstration] = (),
+        *,
+        meshes: Path | None = None,
+        first: int = 0,
+        fps: float = 25.0,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+    ) -> None:
+        self._situations, self._fps = list(situations), fps
+        self.clock = 0.0
+        self._lock = threading.RLock()
+        with ExitStack() as stack:
+            server = stack.enter_context(viser_server(host, port))
+            self.scene = MotionScene(
+                server, model, demonstrations, meshes, fps, on_drag=self.move_frame
+            )
+            self.url = f"http://{host}:{server.get_port()}"
+            self._add_controls(server.gui, first)
+            self.show(first)
+            self._resources = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        """Nothing: it runs since it was made."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        self._resources.close()
+
+    def show(self, index: int) -> None:
+        """Show one of the situations.
+
+        Parameters
+        ----------
+        index : int
+        """
+        self._reproduce(self._situations[index])
+
+    def move_frame(self, name: str, frame: Frame) -> None:
+        """Put an object elsewhere in the situation that is shown, and reproduce anew.
+
+        Parameters
+        ----------
+        name : str
+        frame : Frame
+        """
+        with self._lock:
+            frames = {**self.situation.frames, name: frame}
+            self._reproduce(replace(self.situation, frames=frames))
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Play the motion again and again.
+
+        Parameters
+        ----------
+        seconds : float, default=inf
+            For how long.
+        """
+        last = time.monotonic()
+        end = last + seconds
+        while last < end:
+            time.sleep(1 / self._fps)
+            now = time.monotonic()
+            if self._play.value:
+                self._move_to(self.clock + (now - last) * float(self._speed.value))
+            last = now
+
+    def _reproduce(self, situation: Situation) -> None:
+        with self._lock:
+            self.situation = situation
+            self.trajectory = self.scene.show(situation)
+            self._slider.max = max(float(np.ptp(self.scene.time)), 0.01)
+            self._move_to(self.clock)
+
+    def _move_to(self, clock: float) -> None:
+        """Show an instant, in seconds since the start; after the end that is the start."""
+        with self._lock:
+            instants = self.scene.time - self.scene.time[0]
+            self.clock = clock if clock <= instants[-1] else 0.0
+            at = int(np.searchsorted(instants, self.clock))
+            self.scene.move_to(min(at, len(instants) - 1))
+            self._slider.value = round(self.clock, 2)
+
+    def _add_controls(self, gui: Any, first: int) -> None:
+        self._play = gui.add_checkbox("play", True)
+        self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
+        self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+
+        self._slider.on_update(self._slid)
+        if len(self._situations) > 1:
+            numbers = [str(index) for index in range(len(self._situations))]
+            chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])
+            chosen.on_update(lambda event: self.show(int(event.target.value)))
+
+    def _slid(self, event: Any) -> None:
+        if event.client is not None:  # moved by hand, not by the clock
+            self._play.value = False
+            self._move_to(event.target.value)

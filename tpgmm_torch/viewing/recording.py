@@ -1,0 +1,150 @@
+"""A motion as one HTML file."""
+
+from __future__ import annotations
+
+import html
+import io
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.trajectories import Trajectory
+from tpgmm_torch.viewing.ellipsoids import STANDARD_DEVIATIONS
+from tpgmm_torch.viewing.scene import COLORS, MotionScene
+
+__all__ = ["viser_server", "write_motion"]
+
+#: How long the last picture stands before the motion starts again [s].
+PAUSE = 1.0
+
+
+def write_motion(
+    path: str | Path,
+    model: TaskParameterizedGMM,
+    situation: Situation,
+    demonstrations: Sequence[Demonstration] = (),
+    *,
+    meshes: Path | None = None,
+    fps: float = 25.0,
+    title: str = "tpgmm",
+) -> Trajectory:
+    """Write a reproduction as an HTML file with a time line, which needs nothing else.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; replaced if it exists.
+    model : TaskParameterizedGMM
+        Fitted, with a robot or with tracked poses.
+    situation : Situation
+        What to reproduce for.
+    demonstrations : sequence of Demonstration, default=()
+        Whose paths are drawn beside it.
+    meshes : Path, optional
+        Folder with the files of the robot's meshes.
+    fps : float, default=25.0
+        Pictures per second.
+    title : str, default="tpgmm"
+        Of the page.
+
+    Returns
+    -------
+    Trajectory
+        What the file shows.
+
+    Raises
+    ------
+    DependencyError
+        If viser is not installed.
+    DataError
+        If the model has no links, or the robot's description cannot be drawn.
+    """
+    with viser_server("127.0.0.1", 0) as server:
+        scene = MotionScene(server, model, demonstrations, meshes, fps)
+        trajectory = scene.show(situation)
+        recording = server.get_scene_serializer()
+        for picture, pause in enumerate([*np.diff(scene.time), PAUSE]):
+            scene.move_to(picture)
+            recording.insert_sleep(float(pause))
+        page = recording.as_html()
+    _write(Path(path), _entitled(page, title, bool(demonstrations)))
+    return trajectory
+
+
+@contextmanager
+def viser_server(host: str, port: int) -> Iterator[Any]:
+    """A viser server that stops in the end.
+
+    Parameters
+    ----------
+    host : str
+        Address that it listens on.
+    port : int
+        0 for any that is free.
+
+    Yields
+    ------
+    viser.ViserServer
+
+    Raises
+    ------
+    DependencyError
+        If viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise DependencyError(
+            "looking at motions needs viser: pip install 'tpgmm-torch[view]'"
+        ) from error
+    with _quiet():
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    try:
+        yield server
+    finally:
+        with _quiet():
+            server.stop()
+
+
+def _quiet() -> Any:
+    """Viser prints when it starts and stops, whatever it is told."""
+    return redirect_stdout(io.StringIO())
+
+
+def _entitled(page: str, title: str, with_demonstrations: bool) -> str:
+    """The page with a title, and a legend in a corner."""
+    entries = {
+        "reproduction": "reproduction",
+        "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
+    }
+    if with_demonstrations:
+        entries["demonstrations"] = "demonstrations"
+    lines = "".join(
+        f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
+        for kind, text in entries.items()
+    )
+    legend = (
+        '<div id="legend" style="position:fixed;left:1em;bottom:4em;z-index:10;'
+        "pointer-events:none;font:14px sans-serif;color:#333;"
+        'background:rgba(255,255,255,.8);padding:.5em">'
+        f"<b>{html.escape(title)}</b>{lines}</div>"
+    )
+    before, body, after = page.rpartition("</body>")
+    page = before + legend + body + after
+    return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
+
+
+def _write(path: Path, text: str) -> None:
+    """Write beside the destination and move there in one step."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
+        staged = Path(folder) / path.name
+        staged.write_text(text, encoding="utf-8")
+        staged.replace(path)

@@ -1,0 +1,299 @@
+"""The scene: what stands still in it, and what moves with time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.frames import Frame
+from tpgmm_torch.trajectories import Trajectory
+from tpgmm_torch.viewing.body import whole_body
+from tpgmm_torch.viewing.ellipsoids import ellipsoids
+from tpgmm_torch.viewing.solids import add_solid, unit_sphere
+
+__all__ = ["COLORS", "MotionScene"]
+
+Array = NDArray[np.float64]
+
+COLORS = {
+    "demonstrations": (120, 120, 120),
+    "reproduction": (214, 39, 40),
+    "covariance": (31, 119, 180),
+}
+#: Ellipsoids along a path, and pieces of a demonstrated path.
+ELLIPSOIDS, PIECES = 40, 150
+#: Half axes of ellipsoids that would be too thin to be drawn [m].
+THINNEST = 5e-4
+
+
+class MotionScene:
+    """A model's motion on a viser server.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        Where it is drawn.
+    model : TaskParameterizedGMM
+        Fitted, with a robot or with tracked poses.
+    demonstrations : sequence of Demonstration, default=()
+        Whose paths and frames are drawn.
+    meshes : Path, optional
+        Folder with the files of the robot's meshes.
+    fps : float, default=25.0
+        Pictures per second.
+    on_drag : callable, optional
+        Makes frames that stand still movable by hand: called with the name of one and its new
+        pose, a :class:`Frame`, when it is let go.
+
+    Attributes
+    ----------
+    time : ndarray of shape (F,)
+        Instants of the pictures that :meth:`move_to` shows [s]; empty before :meth:`show`.
+    frames : dict of str to viser.SceneNodeHandle
+        The objects that are shown.
+    server : viser.ViserServer
+
+    Raises
+    ------
+    DataError
+        If the model has no links: joints alone have no place in space.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        model: TaskParameterizedGMM,
+        demonstrations: Sequence[Demonstration] = (),
+        meshes: Path | None = None,
+        fps: float = 25.0,
+        on_drag: Callable[[str, Frame], None] | None = None,
+    ) -> None:
+        kinematics = model.kinematics_
+        if not kinematics.links:
+            raise DataError(
+                "the model knows joints only, which have no place in space: to look at its "
+                "motion, fit it with a robot and links (tpgmm fit --robot URDF --link NAME)"
+            )
+        self.server, self._scene, self._model = server, server.scene, model
+        self._fps, self._on_drag = fps, on_drag
+        self._of_interest = kinematics.links
+        self._body, self._shapes = whole_body(kinematics, meshes)
+        self._demonstrations = [one.reordered(kinematics.joint_names) for one in demonstrations]
+        self._links: list[Any] = []
+        self.frames: dict[str, Any] = {}
+        self._frame_poses: dict[str, Array] = {}
+        self.time: Array = np.zeros(0)
+
+    def show(self, situation: Situation) -> Trajectory:
+        """Reproduce the skill in a situation and draw it, in place of the one before.
+
+        Parameters
+        ----------
+        situation : Situation
+
+        Returns
+        -------
+        Trajectory
+        """
+        [trajectory] = self._model.predict([situation], candidates=False)
+        steps = _steps(trajectory.time.cpu(), self._fps)
+        state = self._body.state(trajectory.joints.cpu()[steps])
+        covariance = trajectory.covariance.cpu().to(state.joints)[steps]
+        self.time = _array(trajectory.time)[steps]
+        self._link_poses = _poses(state.positions, state.orientations)  # (F, L, 7)
+        self._frame_poses = {name: _poses_at(f, steps) for name, f in situation.frames.items()}
+        if not self._links:
+            self._set_up()
+        few = np.linspace(0, len(steps) - 1, min(ELLIPSOIDS, len(steps))).astype(int)
+        for link in self._of_interest:
+            path = _array(state.position(link))
+            self._draw_paths("reproduction", link, [path], thickness=3.5)
+            half_axes, turns = ellipsoids(state[few], covariance[few], link)
+            self._draw_ellipsoids(link, path[few], _array(half_axes), _array(turns))
+        self._replace_frames()
+        self.move_to(0)
+        return trajectory
+
+    def move_to(self, picture: int) -> None:
+        """Put everything that moves where it is at an instant.
+
+        Parameters
+        ----------
+        picture : int
+            Index into ``time``.
+        """
+        for handle, pose in zip(self._links, self._link_poses[picture], strict=True):
+            _place(handle, pose)
+        for name, poses in self._frame_poses.items():
+            if len(poses) > 1:
+                _place(self.frames[name], poses[picture])
+
+    def _set_up(self) -> None:
+        """Everything that is the same in all situations."""
+        links = range(len(self._of_interest))  # the first of the body's
+        self._demonstrated = [
+            _array(self._body.state(one.joints).positions)[:, links]
+            for one in self._demonstrations
+        ]
+        action = [self._link_poses[:, links, :3], *self._demonstrated]
+        action += [poses[..., :3] for poses in self._frame_poses.values()]
+        low, high = _bounds(action)
+        ground, top = _bounds([self._link_poses[..., :3], low, high])
+        self._size = size = max(float(np.linalg.norm(top - ground)), 0.1)
+        # mostly at the action, a little at the robot
+        middle = 0.6 * (low + high) / 2 + 0.4 * (ground + top) / 2
+        distance = max(2.1 * float(np.linalg.norm(high - low)), 1.1 * size)
+        camera = self.server.initial_camera
+        camera.look_at = middle
+        camera.position = middle + distance * np.array([0.8, 0.5, 0.35])
+        camera.fov = 0.75
+        self._scene.configure_default_lights(cast_shadow=False)
+        cell = 10.0 ** np.floor(np.log10(size / 2))
+        self._scene.add_grid(
+            "/ground",
+            *(2 * np.ceil(size / cell) * cell,) * 2,
+            cell_size=cell,
+            section_size=10 * cell,
+            cell_color=(225, 225, 225),
+            section_color=(190, 190, 190),
+            position=(*np.round(middle[:2] / cell) * cell, ground[2] - 0.02 * size),
+        )
+        self._draw_robot()
+        self._draw_demonstrations()
+
+    def _draw_robot(self) -> None:
+        for link in self._body.links:
+            handle = self._axes(f"/robot/{_node(link)}", 0.04, link in self._of_interest)
+            self._links.append(handle)
+            for number, shape in enumerate(self._shapes.get(link, ())):
+                add_solid(self._scene, f"{handle.name}/{number}", shape)
+
+    def _draw_demonstrations(self) -> None:
+        """Paths, and where objects stood, small: why paths differ."""
+        for index, link in enumerate(self._of_interest if self._demonstrated else ()):
+            paths = [path[_spread(len(path), PIECES), index] for path in self._demonstrated]
+            self._draw_paths("demonstrations", link, paths, thickness=1.2)
+        for name in self._demonstrations[0].frames if self._demonstrations else ():
+            frames = [one.frames[name] for one in self._demonstrations]
+            poses = np.stack([_poses_at(frame, torch.tensor([0]))[0] for frame in frames])
+            self._scene.add_batched_axes(
+                f"/demonstrations/{_node(name)}",
+                batched_wxyzs=poses[:, 3:],
+                batched_positions=poses[:, :3],
+                axes_length=0.025 * self._size,
+                axes_radius=0.0012 * self._size,
+            )
+
+    def _draw_paths(
+        self, kind: str, link: str, paths: Sequence[Array], thickness: float
+    ) -> None:
+        pieces = [np.stack((path[:-1], path[1:]), axis=1) for path in paths]
+        self._scene.add_line_segments(
+            f"/{kind}/{_node(link)}",
+            points=np.concatenate(pieces),
+            colors=COLORS[kind],
+            thickness=thickness,
+            thickness_units="screen",
+        )
+
+    def _draw_ellipsoids(
+        self, link: str, centres: Array, half_axes: Array, turns: Array
+    ) -> None:
+        vertices, faces = unit_sphere()
+        self._scene.add_batched_meshes_simple(
+            f"/covariance/{_node(link)}",
+            vertices,
+            faces,
+            batched_positions=centres,
+            batched_wxyzs=turns,
+            batched_scales=half_axes.clip(min=THINNEST),
+            batched_colors=COLORS["covariance"],
+            opacity=0.35,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _replace_frames(self) -> None:
+        """Objects of the situation; what is there already only changes its place."""
+        for name in self.frames.keys() - self._frame_poses.keys():
+            self.frames.pop(name).remove()
+        for name, poses in self._frame_poses.items():
+            if name not in self.frames:
+                self.frames[name] = self._add_frame(name, moves=len(poses) > 1)
+            _place(self.frames[name], poses[0])
+
+    def _add_frame(self, name: str, moves: bool) -> Any:
+        path, drag = f"/frames/{_node(name)}", self._on_drag
+        if drag is None or moves:
+            handle = self._axes(path, 0.09)
+        else:
+            handle = self._scene.add_transform_controls(
+                path, scale=0.12 * self._size, disable_sliders=True
+            )
+            self._axes(f"{path}/axes", 0.09)
+            handle.on_update(partial(_let_go, drag, name))
+        self._scene.add_label(f"{path}/label", name)
+        return handle
+
+    def _axes(self, path: str, length: float, show: bool = True) -> Any:
+        """Axes of a length, and of the radius that goes with it, for a scene of size 1."""
+        length *= self._size
+        return self._scene.add_frame(
+            path, show, axes_length=length, axes_radius=0.03 * length, origin_radius=0.0
+        )
+
+
+def _let_go(drag: Callable[[str, Frame], None], name: str, event: Any) -> None:
+    if event.phase == "end":
+        drag(name, Frame(event.target.position, event.target.wxyz))
+
+
+def _steps(time: Tensor, fps: float) -> Tensor:
+    """Which time steps are shown: the first at or after each picture's instant, the last."""
+    wanted = torch.arange(float(time[0]), float(time[-1]), 1 / fps, dtype=time.dtype)
+    found = torch.searchsorted(time, wanted)
+    return torch.cat((found, torch.tensor([len(time) - 1]))).unique()
+
+
+def _bounds(points: Sequence[Array]) -> tuple[Array, Array]:
+    """Least and greatest x, y, z."""
+    together = np.concatenate([some.reshape(-1, 3) for some in points])
+    return together.min(axis=0), together.max(axis=0)
+
+
+def _spread(length: int, most: int) -> NDArray[np.int64]:
+    return np.linspace(0, length - 1, min(length, most + 1)).astype(np.int64)
+
+
+def _poses(positions: Tensor, orientations: Tensor) -> Array:
+    return _array(torch.cat((positions, orientations), dim=-1))
+
+
+def _poses_at(frame: Frame, steps: Tensor) -> Array:
+    """(F, 7) of a frame that moves, (1, 7) of one that stands still."""
+    poses = _poses(frame.position, frame.orientation)
+    return poses[steps.numpy()] if frame.batch_shape else poses[None]
+
+
+def _place(handle: Any, pose: Array) -> None:
+    handle.position, handle.wxyz = pose[:3], pose[3:]
+
+
+def _node(name: str) -> str:
+    """A name as one step of a path in the scene."""
+    return name.replace("/", "_")
+
+
+def _array(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().double().numpy()
