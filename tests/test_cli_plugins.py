@@ -6,7 +6,8 @@ import pytest
 import typer
 
 from tests.command_line import output, run
-from tpgmm_torch.cli import commands
+from tpgmm_torch.cli import commands, formats
+from tpgmm_torch.exceptions import DataError, DependencyError
 
 
 def greet(name: str = "you") -> None:
@@ -47,3 +48,21 @@ def test_a_broken_plugin_is_one_line_and_spares_the_others(plugins):
     result = run("gone")
     assert result.exit_code == 2
     assert "No such command 'gone'" in result.stderr
+
+
+def sketch(model, path, signals):
+    """A format of a plugin."""
+
+
+def test_plugins_add_formats(monkeypatch):
+    found = [
+        EntryPoint("sketch", f"{__name__}:sketch", formats.ENTRY_POINTS),
+        EntryPoint("gone", f"{__name__}_gone:sketch", formats.ENTRY_POINTS),
+    ]
+    monkeypatch.setattr(formats, "entry_points", lambda group: found)
+    assert formats.writer("tpgmm") is None
+    assert formats.writer("sketch").__doc__ == sketch.__doc__
+    with pytest.raises(DependencyError, match=r"the plugin of format 'gone'.*cannot be loaded"):
+        formats.writer("gone")
+    with pytest.raises(DataError, match=r"there are \['gone', 'sketch', 'tpgmm'\]"):
+        formats.writer("onnx")

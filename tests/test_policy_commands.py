@@ -108,6 +108,7 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
         f"--policy.action_names={json.dumps(list(start)[:17])}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert "'r_wrist_roll.pos'" in done.stderr and "20 per second (--fps)" in done.stderr
     sent = json.loads(log.read_text())
     assert len(sent) >= 10 and list(sent[0]) == list(start)[:17]
     time = torch.arange(len(sent), dtype=torch.float64) / 20

@@ -22,6 +22,12 @@ def blue_grey(picture) -> int:
     return int(((b > r + 0.04) & (b < 0.85) & (r > 0.15)).sum())
 
 
+def yellow(picture) -> int:
+    """How many pixels have the colour of a handle under the mouse."""
+    r, g, b = np.moveaxis(picture, -1, 0)
+    return int(((r > 0.85) & (g > 0.85) & (b < 0.6)).sum())
+
+
 def draws(page) -> None:
     """Wait until the robot and the path are in the canvas."""
     end = time.monotonic() + browser.PATIENCE
@@ -90,7 +96,10 @@ def test_live_an_object_is_dragged_and_the_skill_reproduced_anew():
             seen_at(page, camera, before + d * up) for d in (0.6 * size, 0.6 * size + 0.05)
         )
         planned = view.trajectory
-        page.mouse("mouseMoved", start, buttons=0)
+        deadline = time.monotonic() + browser.PATIENCE
+        while yellow(page.screenshot()) < 10:  # pressed too early, the mouse turns the camera
+            assert time.monotonic() < deadline, "the handle does not feel the mouse"
+            page.mouse("mouseMoved", start + time.monotonic() % 2, buttons=0)
         page.mouse("mousePressed", start)
         for share in np.linspace(0, 1, 6):
             page.mouse("mouseMoved", start + share * (end - start))

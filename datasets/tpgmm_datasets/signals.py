@@ -70,7 +70,7 @@ class Signals:
         Raises
         ------
         DatasetError
-            If the data set cannot be read, or state and action have different units.
+            If the data set cannot be read, or states and actions have different units.
         """
         layout = open_layout(local_folder(path))
         source = layout.feature(joints or joint_feature(layout))
@@ -87,9 +87,9 @@ class Signals:
             if feature is not None and feature is not source:
                 _check_units(feature, scales)
         places = {
-            name: tuple(source.select(name, environment))
-            for name, source in frame_sources(layout, frames).items()
-            if isinstance(source, FramePose) and environment and _plain(source)
+            name: tuple(pose.select(name, environment))
+            for name, pose in frame_sources(layout, frames).items()
+            if isinstance(pose, FramePose) and environment and _plain(pose)
         }
         return cls(
             rate or layout.fps,
@@ -101,8 +101,8 @@ class Signals:
         )
 
 
-def _plain(source: FramePose) -> bool:
-    return source.feature == ENVIRONMENT and source.rotation == "wxyz" and source.scale == 1
+def _plain(pose: FramePose) -> bool:
+    return pose.feature == ENVIRONMENT and pose.rotation == "wxyz" and pose.scale == 1
 
 
 def _check_units(feature: Feature, scales: Mapping[str, Scale]) -> None:

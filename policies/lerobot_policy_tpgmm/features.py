@@ -48,6 +48,11 @@ class JointFeatures(nn.Module):
         If a joint is missing, ambiguous or too many, or a unit is unknown.
     """
 
+    columns: Tensor
+    order: Tensor
+    scale: Tensor
+    back: Tensor
+
     def __init__(
         self,
         joint_names: Sequence[str],
@@ -56,15 +61,16 @@ class JointFeatures(nn.Module):
         units: Mapping[str, Sequence[float] | str] | str | None,
     ) -> None:
         super().__init__()
-        self.joint_names, self.state_names = tuple(joint_names), tuple(state_names)
+        self.joint_names = tuple(joint_names)
+        self.state_names, self.action_names = tuple(state_names), tuple(action_names)
         in_state = match_names(joint_names, state_names, OBS_STATE, REMEDY)
         in_action = match_names(joint_names, action_names, ACTION, REMEDY)
         extra = [name for name in action_names if name not in in_action]
         if extra:
             raise DataError(
                 f"the action has the entries {extra}, which are no joints of the model; it has "
-                f"{list(joint_names)}. Learn them too (coordinates=...), or leave them out of "
-                "action_names if the robot can do without"
+                f"{list(joint_names)}. Learn them too; what moves no link of the URDF, like a "
+                "gripper, is one of the robot's coordinates"
             )
         _check_units(units, {*state_names, *action_names, *joint_names})
         entry = {joint: name for name, joint in in_state.items()}
@@ -79,11 +85,6 @@ class JointFeatures(nn.Module):
         kind = torch.long if isinstance(values[0], int) else torch.float64
         # they follow from the configuration: not in the file
         self.register_buffer(name, torch.tensor(values, dtype=kind), persistent=False)
-
-    scale: Tensor
-    back: Tensor
-    columns: Tensor
-    order: Tensor
 
     def joints(self, state: Tensor) -> Tensor:
         """Joint vectors (B, n_joints) in the model's order and units.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -25,6 +26,8 @@ from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
 
 __all__ = ["TPGMMPolicy"]
+
+log = logging.getLogger(__name__)
 
 
 class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -314,4 +317,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Strictly, whatever ``strict`` says: LeRobot itself only warns of what is missing."""
         model.load_state_dict(read_tensors(model_file, model.state_dict()))
         model.to_estimator()  # refuses numbers that are no mixture
+        # a robot of LeRobot tells none of this to a policy: who starts it must compare
+        log.info(
+            "observation.state is taken as %s; actions are %s, %g per second (--fps)",
+            list(model.joints.state_names),
+            list(model.joints.action_names),
+            model.config.rate,
+        )
         return model

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tpgmm_torch.cli import options
-from tpgmm_torch.cli.formats import writer
+from tpgmm_torch.cli.formats import OWN, writer
 
 if TYPE_CHECKING:
     from tpgmm_torch.demonstrations import Demonstration
@@ -38,7 +38,7 @@ def fit(
             help="'tpgmm' for Python and the other commands here; 'lerobot' for a policy that "
             "lerobot-eval and lerobot-rollout take, if lerobot_policy_tpgmm is installed.",
         ),
-    ] = "tpgmm",
+    ] = OWN,
     robot: options.RobotFile = None,
     link: options.Links = None,
     robot_joint: options.RobotJoints = None,
@@ -176,15 +176,18 @@ def fit(
         epsilon=epsilon,
         blend=blend,
     ).fit(demonstrations)
-    signals = Signals.of(
-        dataset,
-        kinematics,
-        joints=joints,
-        units=options.parse_units(units or ()),
-        frames=options.parse_frames(frame or ()),
-        rate=rate,
-    )
-    write(model, out, signals)
+    if write is None:
+        model.save(out)
+    else:
+        signals = Signals.of(
+            dataset,
+            kinematics,
+            joints=joints,
+            units=options.parse_units(units or ()),
+            frames=options.parse_frames(frame or ()),
+            rate=rate,
+        )
+        write(model, out, signals)
     _report(model, read, demonstrations)
     typer.echo(f"saved            {out}")
 

@@ -1,4 +1,4 @@
-"""The formats in which ``tpgmm fit`` writes a model: its own, and those of plugins."""
+"""Other formats in which ``tpgmm fit`` writes a model, each brought by a plugin."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-__all__ = ["writer"]
+__all__ = ["OWN", "writer"]
 
 #: Each entry point is a function of the fitted model, the folder, and the
 #: ``tpgmm_datasets.signals.Signals`` of the data set.
 ENTRY_POINTS = "tpgmm.formats"
+#: The estimator's own format, ``TaskParameterizedGMM.save``.
 OWN = "tpgmm"
 
 Writer = Callable[[Any, Path, Any], None]
 
 
-def writer(name: str) -> Writer:
-    """What writes a model in a format.
+def writer(name: str) -> Writer | None:
+    """What writes a model in a format; None for the estimator's own.
 
     Parameters
     ----------
@@ -34,7 +35,7 @@ def writer(name: str) -> Writer:
     from tpgmm_torch.exceptions import DataError, DependencyError
 
     if name == OWN:
-        return lambda model, path, signals: model.save(path)
+        return None
     plugins = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
     if name not in plugins:
         raise DataError(

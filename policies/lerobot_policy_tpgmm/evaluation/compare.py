@@ -129,6 +129,7 @@ def _finished(results: Results, cell: Cell, say: Callable[[str], None]) -> bool:
         return results.read(cell) is not None
     except DataError as error:
         say(f"{error}; the cell is run again")
+        results.path(cell).unlink()
         return False
 
 

@@ -111,9 +111,9 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
     partial = directory.with_name(f".{directory.name}.partial")
     for rest in (partial, directory):  # of a run that was killed
         shutil.rmtree(rest, ignore_errors=True)
-    began = time.perf_counter()
+    began = time.process_time()
     trained = _trainer(cell.policy)(folder / "episodes", settings, cell)
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     try:
         for part in (trained.policy, *trained.processors):
             part.save_pretrained(partial)

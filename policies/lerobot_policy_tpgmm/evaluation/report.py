@@ -33,7 +33,7 @@ def write_report(
     failures : mapping
         Cells that failed, with the reason.
     command : str
-        What was called.
+        What was called; the report lists it after those of earlier calls.
 
     Returns
     -------
@@ -49,8 +49,7 @@ def write_report(
         write_table(episodes, out / "episodes_evaluated")
         lines += Sections(out, settings, results, cells, episodes).text()
     lines += _failed(failures)
-    if command:
-        lines += ["## Command", "", "```", command, "```", ""]
+    lines += _commands(out / "commands.txt", command)
     partial = path.with_name(".report.md.partial")
     partial.write_text("\n".join(lines), encoding="utf-8")
     partial.replace(path)
@@ -62,3 +61,11 @@ def _failed(failures: Mapping[Cell, str]) -> list[str]:
         return []
     lines = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
     return ["## Cells that failed", "", *lines, ""]
+
+
+def _commands(path: Path, command: str) -> list[str]:
+    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    if command and command not in known:
+        known.append(command)
+        path.write_text("\n".join(known) + "\n", encoding="utf-8")
+    return ["## Commands", "", "```", *known, "```", ""] if known else []

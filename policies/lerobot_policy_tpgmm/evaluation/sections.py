@@ -57,8 +57,7 @@ class Sections:
         self.out, self.settings, self.results = out, settings, results
         self.cells, self.episodes = cells, episodes
         self.benchmark: Benchmark = settings.benchmark()
-        known = [name for name in DESCRIPTIONS if name in set(cells.policy)]
-        self.policies = known
+        self.policies = [name for name in DESCRIPTIONS if name in set(cells.policy)]
         self.counts = sorted(set(cells.demonstrations))
         self.conditions = list(dict.fromkeys((NOMINAL, *cells.condition)))
         self.trainings = {
@@ -122,7 +121,7 @@ class Sections:
         part = self._nominal()
         if part.empty or not criteria.keys() <= set(part.columns):
             return
-        most = self.counts[-1]
+        most = part.demonstrations.max()
         part = part[part.demonstrations == most]
         yield "## What succeeds and what fails"
         yield ""
@@ -206,13 +205,12 @@ class Sections:
         yield ""
 
     def _cost(self) -> Iterator[str]:
-        count = self.counts[-1]
-        rows = self.cells[self.cells.demonstrations == count].drop_duplicates("policy")
+        rows = self.cells.sort_values("demonstrations").groupby("policy").tail(1)
         yield "## What it costs"
         yield ""
         yield (
-            f"{count} demonstrations. An action is everything from the raw observation to the "
-            "joint references for one robot, on one thread; policies that predict chunks "
+            "With the most demonstrations. An action is everything from the raw observation to "
+            "the joint references for one robot, on one thread; policies that predict chunks "
             "compute one every so many steps and take its actions from memory in between."
         )
         yield ""
