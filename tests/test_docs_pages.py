@@ -5,6 +5,7 @@ import shlex
 import shutil
 import tomllib
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,35 @@ def demo(tmp_path_factory) -> Path:
     return folder
 
 
+def check_options(program: str, arguments: list[str]) -> None:
+    """Options of LeRobot's commands exist; other tests run them, which takes half a minute."""
+    from lerobot.configs.default import DatasetConfig, EvalConfig
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.robots import RobotConfig, so_follower
+    from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
+
+    from lerobot_policy_tpgmm import TPGMMConfig
+
+    assert so_follower  # registers the robot that the page uses
+    options = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
+    of_command = {
+        "lerobot-eval": EvalPipelineConfig,
+        "lerobot-train": TrainPipelineConfig,
+        "lerobot-rollout": RolloutConfig,
+    }
+    groups = {"policy": TPGMMConfig, "eval": EvalConfig, "dataset": DatasetConfig}
+    choices = {"env": EnvConfig, "robot": RobotConfig, "strategy": RolloutStrategyConfig}
+    for group, registry in choices.items():
+        if f"{group}.type" in options:
+            groups[group] = registry.get_choice_class(options[f"{group}.type"])
+    for option in options:
+        group, _, field = option.rpartition(".")
+        known = {f.name for f in fields(groups[group] if group else of_command[program])}
+        assert field in {*known, "type", "path"}, f"{program} has no option --{option}"
+
+
 def run(command: str) -> None:
     """Do what a line of a shell would, as far as a test can."""
     program, *arguments = shlex.split(command)
@@ -63,6 +93,8 @@ def run(command: str) -> None:
             assert requirement.extras <= set(PROJECT["optional-dependencies"]), command
     elif program == "python":
         assert (ROOT / arguments[0]).is_file(), f"no such script: {command}"
+    elif program.startswith("lerobot-"):
+        check_options(program, arguments)
     elif program == "tpgmm" and arguments[0] == "demo":  # two minutes; another test runs it
         typer.main.get_command(app).commands["demo"].make_context("demo", arguments[1:])
     elif program == "tpgmm":

@@ -294,3 +294,11 @@ def test_the_simulated_robot_is_the_one_of_the_kinematics():
             apart = np.empty(3)
             mujoco.mju_subQuat(apart, body.xquat, state.orientation(hand).numpy())
             np.testing.assert_allclose(apart, 0, atol=1e-9)
+
+
+def test_a_simulation_that_diverges_is_no_result():
+    env = made()
+    observation, _ = env.reset(seed=0)
+    env._scene.data.qvel[3] = 1e12
+    with pytest.raises(DataError, match="diverges"):
+        env.step(observation["agent_pos"])

@@ -12,6 +12,7 @@ from lerobot_policy_tpgmm.environments.bottle_shaking import (
     BottleShakingEnv,
 )
 from tpgmm_datasets.bottle_shaking import SHOULDERS, BottleShaking
+from tpgmm_torch import Frame
 from tpgmm_torch.metrics import sinusoid
 
 NAMES = skill().robot.joint_names
@@ -184,10 +185,12 @@ def test_the_bottle_goes_with_the_hands(demonstrations):
             observation, *_ = env.step(joints[k])
             if env._scene.held and mode == "dynamic":
                 pulls.append(env._scene.pull())
-        hands = env._scene.data.xpos[env._scene._hands]
-        np.testing.assert_allclose(
-            observation["environment_state"][:3], hands.mean(0), atol=2e-3
+        seen = torch.from_numpy(observation["environment_state"])
+        apart, turned = skill().grasp_error(
+            torch.from_numpy(observation["agent_pos"]), Frame(seen[:3], seen[3:])
         )
+        assert apart < 1e-3 and turned < 5e-3
+        assert np.linalg.norm(seen[:3] - pose(demonstration)[:3]) > 0.02
         assert max(pulls, default=0) < GRIP_FORCE / 5
 
 

@@ -135,9 +135,7 @@ def test_objects_are_read_at_the_start_or_followed(follow):
 def test_a_robot_that_stands_far_from_the_start_is_refused():
     observed = batch()
     observed[STATE][1, 7] += 1.8
-    message = (
-        r"'l_forearm_yaw' of robot 1 stands at .*--policy.units.*--policy.largest_start"
-    )
+    message = r"'l_forearm_yaw' of robot 1 stands at .*--policy.units.*--policy.largest_start"
     with pytest.raises(DataError, match=message):
         act(fitted(), observed, 1)
     changed(fitted(), largest_start_gap=None).select_action(observed)

@@ -92,9 +92,7 @@ def test_live_an_object_is_dragged_and_the_skill_reproduced_anew():
         draws(page)
         assert page.evaluate("document.body.innerText.includes('time [s]')")
         camera, size = view.scene.server.initial_camera, view.scene.frames["bottle"].scale
-        start, end = (
-            seen_at(page, camera, before + d * up) for d in (0.6 * size, 0.6 * size + 0.05)
-        )
+        start, end = (seen_at(page, camera, before + d * up) for d in (size, size + 0.05))
         planned = view.trajectory
         deadline = time.monotonic() + browser.PATIENCE
         while yellow(page.screenshot()) < 10:  # pressed too early, the mouse turns the camera

@@ -16,21 +16,23 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+import lerobot_policy_tpgmm
 import tpgmm_datasets
 import tpgmm_torch
 
 __all__ = ["documented", "internal_names", "modules", "setup"]
 
+PACKAGES = (tpgmm_torch, tpgmm_datasets, lerobot_policy_tpgmm)
 PAGES = Path(__file__).parents[1] / "api"
 DIRECTIVE = re.compile(r"^\.\. auto(\w+):: ([\w.]+)\n((?:   .*\n)*)", re.MULTILINE)
 CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 #: The command line has a page of its own, of its help.
-NOT_CODE = ("tpgmm_torch.cli",)
+NOT_CODE = ("tpgmm_torch.cli", "lerobot_policy_tpgmm.evaluation.command")
 
 
 def modules() -> Iterator[ModuleType]:
-    """All modules of both packages."""
-    for package in (tpgmm_torch, tpgmm_datasets):
+    """All modules of the packages."""
+    for package in PACKAGES:
         yield package
         for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
             if not found.name.startswith(NOT_CODE):
@@ -62,7 +64,7 @@ def _home(module: str, name: str) -> str:
     """Where a name is defined; for what does not know it (constants), where it is asked for."""
     value = getattr(importlib.import_module(module), name)
     home = getattr(value, "__module__", None)
-    ours = isinstance(home, str) and home.startswith((tpgmm_torch.__name__, "tpgmm_datasets"))
+    ours = isinstance(home, str) and home.startswith(tuple(p.__name__ for p in PACKAGES))
     return f"{home if ours else module}.{name}"
 
 
@@ -99,12 +101,17 @@ def _entry(module: str, name: str) -> list[str]:
 
 
 class Internals(SphinxDirective):
-    """A heading per module, and its names."""
+    """The modules of a package, and their names."""
+
+    required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
         """Have the names documented by autodoc."""
         lines = []
+        package = self.arguments[0]
         for module, names in internal_names().items():
+            if module.partition(".")[0] != package:
+                continue
             lines += [f".. rubric:: {module}", ""]
             if not (set(importlib.import_module(module).__all__) - set(names)):
                 lines += [f".. automodule:: {module}", ""]

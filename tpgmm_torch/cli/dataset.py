@@ -110,7 +110,7 @@ def generate(
         bool,
         typer.Option(
             "--steady-rhythm",
-            help="Shake equally fast in all episodes, as the environment 'bottle_shaking' asks.",
+            help="Shake equally fast in all, as the environment 'bottle_shaking' asks.",
         ),
     ] = False,
     append: Append = False,

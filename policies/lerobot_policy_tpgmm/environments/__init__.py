@@ -3,7 +3,7 @@
 They load late: importing this package needs neither MuJoCo nor gym-aloha.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import gymnasium as gym
@@ -37,13 +37,46 @@ def _features(n_joints: int, n_objects: int = 1) -> dict[str, PolicyFeature]:
     }
 
 
-def _features_map() -> dict[str, str]:
-    return {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+@dataclass
+class _StateEnvConfig(EnvConfig):
+    """An environment with joints and objects as observation, which can be drawn."""
+
+    render_mode: str = "rgb_array"
+    render_width: int = 320
+    render_height: int = 240
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
+
+    @property
+    def package_name(self) -> str:
+        """Where gymnasium's name is registered."""
+        return _PACKAGE
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        general = {setting.name for setting in fields(EnvConfig)} - {"fps"}
+        options = {
+            setting.name: getattr(self, setting.name)
+            for setting in fields(self)
+            if setting.name not in general
+        }
+        return {name: value for name, value in options.items() if value is not None}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Tell the policy the rate of actions."""
+        return rate_processors(self.fps)
 
 
 @EnvConfig.register_subclass("bottle_shaking")
 @dataclass
-class BottleShakingConfig(EnvConfig):
+class BottleShakingConfig(_StateEnvConfig):
     """``--env.type=bottle_shaking``.
 
     Parameters
@@ -52,8 +85,8 @@ class BottleShakingConfig(EnvConfig):
         As in every configuration of LeRobot.
     fps, mode, episode_length, pushes, noise, track, frequency, amplitude
         Options of
-        :class:`~lerobot_policy_tpgmm.environments.bottle_shaking.BottleShakingEnv`;
-        its own defaults where None.
+        :class:`~lerobot_policy_tpgmm.environments.bottle_shaking.BottleShakingEnv`; its own
+        defaults where None.
     render_mode, render_width, render_height
         Of the videos.
     """
@@ -67,35 +100,12 @@ class BottleShakingConfig(EnvConfig):
     track: bool = False
     frequency: float | None = None
     amplitude: float | None = None
-    render_mode: str = "rgb_array"
-    render_width: int = 320
-    render_height: int = 240
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))
-    features_map: dict[str, str] = field(default_factory=_features_map)
-
-    @property
-    def package_name(self) -> str:
-        """Where gymnasium's name is registered."""
-        return _PACKAGE
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
-        names = (
-            *("fps", "mode", "episode_length", "pushes", "noise", "track", "frequency"),
-            *("amplitude", "render_mode", "render_width", "render_height"),
-        )
-        options = {name: getattr(self, name) for name in names}
-        return {name: value for name, value in options.items() if value is not None}
-
-    def get_env_processors(self) -> tuple[Any, Any]:
-        """Tell the policy the rate of actions."""
-        return rate_processors(self.fps)
 
 
 @EnvConfig.register_subclass("aloha_state")
 @dataclass
-class AlohaStateConfig(EnvConfig):
+class AlohaStateConfig(_StateEnvConfig):
     """``--env.type=aloha_state``.
 
     Parameters
@@ -117,22 +127,12 @@ class AlohaStateConfig(EnvConfig):
     yaw_range: float | None = None
     track: bool = False
     stop_at_success: bool = True
-    render_mode: str = "rgb_array"
-    render_width: int = 320
-    render_height: int = 240
-    features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(default_factory=_features_map)
 
     def __post_init__(self) -> None:
         if self.task not in OBJECTS:
             raise UnknownNameError("task", str(self.task), "aloha_state", OBJECTS)
         if not self.features:
             self.features = _features(len(JOINTS), len(OBJECTS[self.task]))
-
-    @property
-    def package_name(self) -> str:
-        """Where gymnasium's name is registered."""
-        return _PACKAGE
 
     @property
     def gym_id(self) -> str:
@@ -142,13 +142,4 @@ class AlohaStateConfig(EnvConfig):
     @property
     def gym_kwargs(self) -> dict[str, Any]:
         """The environment's options, without those that are left to it."""
-        names = (
-            *("task", "fps", "episode_length", "yaw_range", "track", "stop_at_success"),
-            *("render_mode", "render_width", "render_height"),
-        )
-        options = {name: getattr(self, name) for name in names}
-        return {name: value for name, value in options.items() if value is not None}
-
-    def get_env_processors(self) -> tuple[Any, Any]:
-        """Tell the policy the rate of actions."""
-        return rate_processors(self.fps)
+        return {"task": self.task, **super().gym_kwargs}

@@ -42,7 +42,7 @@ POSE_LOCK = threading.Lock()
 class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
     """Transfer a cube, or insert a peg, with two ViperX arms.
 
-    Observations are ``agent_pos``, the 14 joints in the order of :attr:`joint_names` (arms
+    Observations are ``agent_pos``, the 14 joints in the order of ``joint_names`` (arms
     [rad], grippers 0 closed to 1 open), and ``environment_state``, for each object x y z [m]
     and a unit quaternion w x y z. An action is a reference for each joint, in the same scale.
     The reward is gym-aloha's stage, 0 to 4; an episode ends when it reaches 4.
@@ -203,7 +203,7 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         Parameters
         ----------
         action : array of shape (14,)
-            In the order of :attr:`joint_names`; what is out of reach is clipped.
+            In the order of ``joint_names``; what is out of reach is clipped.
 
         Returns
         -------

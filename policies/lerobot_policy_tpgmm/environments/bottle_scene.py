@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_datasets.bottle_shaking import GRASP_POINT, HANDS
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.exceptions import DataError, DependencyError
 
 try:
     import mujoco
@@ -31,7 +31,8 @@ TIMESTEP = 1e-3
 STIFFNESS, DAMPING = 1000.0, 30.0
 #: Height of the bottle's centre above its foot [m].
 FOOT = 0.11
-#: Where the table stands once it has sunk [m], and how fast it sinks [m/s].
+#: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
+#: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2
 #: Name of the model's camera.
 CAMERA = "front"
@@ -185,6 +186,11 @@ class BottleScene:
             Where the joints should be now and at the end of the next ``n`` time steps [rad].
         torques : ndarray of shape (n, 17), optional
             From outside, during each time step [N m].
+
+        Raises
+        ------
+        DataError
+            If the simulation diverges.
         """
         model, data, n = self.model, self.data, self._n
         control = references[1:] + self._lead * np.diff(references, axis=0) / TIMESTEP
@@ -193,6 +199,8 @@ class BottleScene:
             if torques is not None:
                 data.qfrc_applied[:n] = torques[i]
             mujoco.mj_step(model, data)
+        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:  # and began anew by itself
+            raise DataError(f"the simulation diverges at {references[-1].tolist()}")
         mujoco.mj_kinematics(model, data)
         if self.held:
             self._sink(len(control) * TIMESTEP)
@@ -215,7 +223,7 @@ class BottleScene:
         if self.held:
             (left, turn), (right, other) = (self._carried(e) for e in range(2))
             data.qpos[n : n + 3] = (left + right) / 2
-            data.qpos[n + 3 :] = turn + np.copysign(other, turn @ other)
+            data.qpos[n + 3 :] = turn + math.copysign(1, turn @ other) * other
             mujoco.mj_normalizeQuat(self.model, data.qpos)
             mujoco.mj_kinematics(self.model, data)
             self._sink(seconds)

@@ -227,7 +227,7 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
         ShapeError
             If the action has another shape.
         DataError
-            If it is not finite, or no episode is going on.
+            If it is not finite, no episode is going on, or the simulation diverges.
         """
         wanted = self._checked(action)
         self._move(wanted)

@@ -46,6 +46,9 @@ class Recipe:
     phase : bool
         Whether it is informed of the time; episodes should then run on a common clock.
     batch_size : int
+    jitter : float
+        Standard deviation of the noise that is added to states in training, in units of the
+        normalised state: else the posture betrays which demonstration it is from.
     averaging : float
         Decay of the moving average of the weights that is evaluated and kept.
     check_every : int
@@ -63,6 +66,7 @@ class Recipe:
     rate: int = 10
     phase: bool = False
     batch_size: int = 32
+    jitter: float = 0.0
     averaging: float = 0.995
     check_every: int = 200
     patience: int = 5
@@ -258,9 +262,10 @@ class _Learner:
         self.policy.eval()
 
     def _step(self) -> float:
-        rows = torch.randint(len(self.windows), (self.recipe.batch_size,))
+        batch = self.windows.at(torch.randint(len(self.windows), (self.recipe.batch_size,)))
+        batch[STATE] = batch[STATE] + self.recipe.jitter * torch.randn_like(batch[STATE])
         self.policy.train()
-        loss, _ = self.policy.forward(self.windows.at(rows))
+        loss, _ = self.policy.forward(batch)
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
