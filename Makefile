@@ -12,7 +12,7 @@ PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
 PACKAGES_test := .[test] ./policies[test]
 
-COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --out out/compare
+COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
 
 .PHONY: help demo compare test lint types docs check constraints clean
 .NOTPARALLEL:

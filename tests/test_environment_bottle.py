@@ -296,7 +296,8 @@ def test_the_simulated_robot_is_the_one_of_the_kinematics():
             np.testing.assert_allclose(apart, 0, atol=1e-9)
 
 
-def test_a_simulation_that_diverges_is_no_result():
+def test_a_simulation_that_diverges_is_no_result(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     env = made()
     observation, _ = env.reset(seed=0)
     env._scene.data.qvel[3] = 1e12

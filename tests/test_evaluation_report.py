@@ -123,7 +123,7 @@ def report(tmp_path_factory):
         "- From 5 demonstrations tpgmm succeeds in 100 % and ",
         "in 0 %; their intervals do not overlap.",
         "and act, the best of the others, in 90 %; their intervals overlap.",
-        "- The budget ended the training of act (10): ",
+        "- The budget ended the training of act (10: the error fell by 67 %); in brackets",
         "- Each policy was trained with one seed",
         "- `bottle_shaking-diffusion-n5-s0-nominal`: bad luck",
         "tpgmm compare --out x",

@@ -52,22 +52,24 @@ def _by_last_part(
 
 
 def _other_name(app: Sphinx, document: nodes.document) -> None:
-    """Let anchors answer to the other of two names, in the package and in the module.
+    """Let anchors answer to all names of an object, in its module and in packages around it.
 
-    The source pages call all objects of a module alike: by the package if one of them is
+    The source pages call all objects of a module alike: by a package if one of them is
     documented as the package's, by the module otherwise.
     """
     for signature in document.findall(addnodes.desc_signature):
         module, name = signature.get("module"), signature.get("fullname")
         if not module or not name:
             continue
-        package = module.partition(".")[0]
         value = getattr(sys.modules.get(module), name.partition(".")[0], None)
         home = getattr(value, "__module__", None)
-        for other in (f"{package}.{name}", f"{home}.{name}"):
+        place = home if isinstance(home, str) and home.startswith("tpgmm_") else module
+        while place:
+            other = f"{place}.{name}"
             if other not in document.ids:
                 signature["ids"].append(other)
                 document.ids[other] = signature
+            place = place.rpartition(".")[0]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

@@ -37,6 +37,9 @@ TABLE_LOW, TABLE_SPEED = -0.08, 0.2
 #: Name of the model's camera.
 CAMERA = "front"
 
+_DIVERGED = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC")
+]
 _TABLE, _PALM = 1, 2  # what collides with the bottle, as bits; nothing else collides
 
 
@@ -199,7 +202,7 @@ class BottleScene:
             if torques is not None:
                 data.qfrc_applied[:n] = torques[i]
             mujoco.mj_step(model, data)
-        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:  # and began anew by itself
+        if data.warning.number[_DIVERGED].any():  # MuJoCo then begins anew by itself
             raise DataError(f"the simulation diverges at {references[-1].tolist()}")
         mujoco.mj_kinematics(model, data)
         if self.held:

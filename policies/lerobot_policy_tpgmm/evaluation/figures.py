@@ -162,9 +162,10 @@ def draw_curves(trainings: Iterable[Mapping[str, Any]], path: Path) -> None:
         grid[0, column].set_title(policy, fontsize="medium")
         grid[0, column].set_xlabel("training steps")
         grid[1, column].set_xlabel("minutes of one processor")
+        grid[0, column].set_yscale("log")
+        grid[1, column].set_ylim(bottom=0)
         for axes in grid[:, column]:
-            axes.set_yscale("log")
-            axes.grid(alpha=0.3, which="both")
+            axes.grid(alpha=0.3)
     grid[0, 0].set_ylabel("loss (dotted: training,\nsolid: held-out episodes)")
     grid[1, 0].set_ylabel("error of the actions,\nheld-out episodes [mrad]")
     for index, count in enumerate(counts):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import wait
@@ -65,6 +66,7 @@ def run_jobs(
 
 
 def _call(function: Callable[..., None], job: tuple[Any, ...], log: Path) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         function(*job)
     except BaseException as error:
@@ -72,6 +74,14 @@ def _call(function: Callable[..., None], job: tuple[Any, ...], log: Path) -> Non
         log.write_text(traceback.format_exc(), encoding="utf-8")
         if not isinstance(error, Exception):
             raise
+        os._exit(1)
+
+
+def _end_with_parent() -> None:
+    """A job must not go on alone when its run was killed, and get in the way of the next."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
         os._exit(1)
 
 

@@ -59,7 +59,8 @@ class Sections:
         self.benchmark: Benchmark = settings.benchmark()
         self.policies = [name for name in DESCRIPTIONS if name in set(cells.policy)]
         self.counts = sorted(set(cells.demonstrations))
-        self.conditions = list(dict.fromkeys((NOMINAL, *cells.condition)))
+        disturbed = sorted(set(cells.condition) - {NOMINAL}, key=lambda name: name.count("+"))
+        self.conditions = [NOMINAL, *disturbed]
         self.trainings = {
             (r["cell"]["policy"], r["cell"]["demonstrations"], r["cell"]["seed"]): r["training"]
             for r in results
@@ -273,16 +274,15 @@ class Sections:
                 "them as independent."
             )
         yield from self._rivals()
-        budget = [
-            f"{policy} ({count})"
+        ended = [
+            f"{policy} ({count}: the error fell by {100 * _late_gain(item['curve']):.0f} %)"
             for (policy, count, _), item in self.trainings.items()
             if "budget" in item["outcome"]
         ]
-        if budget:
+        if ended:
             yield (
-                "The budget ended the training of "
-                + ", ".join(budget)
-                + ": with more time they may get better."
+                f"The budget ended the training of {', '.join(ended)}; in brackets what the "
+                "last third of the steps brought. Where that is much, more time may help."
             )
         processors = {result["machine"]["processors"] for result in self.results}
         yield (
@@ -369,8 +369,15 @@ def _rate(rows: pd.DataFrame) -> str:
 
 
 def _spread(values: pd.Series[Any], digits: int) -> str:
-    shares = values.quantile([0.5, 0.95], interpolation="higher")
-    return " / ".join(f"{value:.{digits}f}" for value in shares)
+    # not interpolated: a figure may be infinite
+    late = values.quantile(0.95, interpolation="higher")
+    return f"{values.median():.{digits}f} / {late:.{digits}f}"
+
+
+def _late_gain(curve: Sequence[Mapping[str, float]]) -> float:
+    """By which share the least error fell in the last third of a training."""
+    errors = [point["validation_error"] for point in curve]
+    return 1 - min(errors) / min(errors[: max(1, 2 * len(errors) // 3)])
 
 
 def _one(items: Mapping[Any, Any]) -> Any:
