@@ -1,10 +1,16 @@
 """What is kept of a comparison: intervals, files of cells, settings, jobs in processes."""
 
+import os
 import runpy
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from lerobot_policy_tpgmm.evaluation import processes
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.intervals import wilson
 from lerobot_policy_tpgmm.evaluation.processes import run_jobs
@@ -126,3 +132,44 @@ def test_jobs_that_fail_or_die_spare_the_others(tmp_path):
     }
     assert "Traceback" in logs[0].read_text()
     assert {path.name for path in tmp_path.glob("*.done")} == {"2.done", "4.done"}
+
+
+def test_jobs_end_with_a_run_that_is_killed(tmp_path):
+    job, pid = tmp_path / "job.py", tmp_path / "pid"
+    job.write_text(
+        "import os, pathlib, time\n"
+        f"partial = pathlib.Path({str(pid)!r} + '.partial')\n"
+        "partial.write_text(str(os.getpid()))\n"
+        f"partial.rename({str(pid)!r})\n"
+        "time.sleep(100)\n"
+    )
+    # as a module of its own, and without what jobs need: it starts quickly
+    text = (
+        "import pathlib, runpy, processes\n"
+        "processes.PRELOADED = 'json'\n"
+        f"jobs, logs = [({str(job)!r},)], [pathlib.Path({str(tmp_path / 'log')!r})]\n"
+        "list(processes.run_jobs(runpy.run_path, jobs, 1, logs))\n"
+    )
+    folder = str(Path(processes.__file__).parent)
+    environment = os.environ | {"PYTHONPATH": folder}
+    run = subprocess.Popen([sys.executable, "-c", text], env=environment)
+    assert comes_true(pid.exists)
+    run.kill()
+    run.wait()
+    assert comes_true(lambda: not is_running(int(pid.read_text())))
+
+
+def comes_true(condition):
+    for _ in range(600):
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def is_running(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

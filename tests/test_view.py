@@ -222,13 +222,20 @@ def test_without_viser_the_error_names_the_extra(monkeypatch, tmp_path):
 def test_live_the_command_serves_until_it_is_interrupted(demo):
     command = [sys.executable, "-c", "from tpgmm_torch.cli import main; main()"]
     command += ["view", str(demo), "--live", "--port", "0", "--fps", "2"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        # what a shell starts in the background would else ignore Ctrl-C
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
         try:
             line = process.stdout.readline()
             url = re.fullmatch(r"open (http://127\.0\.0\.1:\d+) in a browser.*\n", line)[1]
-            with urllib.request.urlopen(url) as answer:
+            with urllib.request.urlopen(url, timeout=60) as answer:
                 assert b"<title>Viser</title>" in answer.read()
-        finally:
             process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
-        assert process.stdout.read() == ""
+            assert process.wait(60) == 0
+            assert process.stdout.read() == ""
+        finally:
+            process.kill()

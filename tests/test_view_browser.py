@@ -90,7 +90,7 @@ def test_live_an_object_is_dragged_and_the_skill_reproduced_anew():
     ):
         page.open(view.url)
         draws(page)
-        assert page.evaluate("document.body.innerText.includes('time [s]')")
+        page.wait_for("document.body.innerText.includes('time [s]')")
         camera, size = view.scene.server.initial_camera, view.scene.frames["bottle"].scale
         start, end = (seen_at(page, camera, before + d * up) for d in (size, size + 0.05))
         planned = view.trajectory
