@@ -8,13 +8,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
 
+PACKAGES_bench := .[bench]
 PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
 PACKAGES_test := .[test] ./policies[test]
 
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
+BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare test lint types docs check constraints clean
+.PHONY: help demo compare bench test lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -26,6 +28,9 @@ demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 compare: $(VENV)/.installed-compare ## Compare TP-GMM with ACT, Diffusion and a naive floor; out/compare
 	$(COMPARE) --demonstrations 5,10
 	$(COMPARE) --demonstrations 10 --policies tpgmm --conditions pushes,noise,pushes+noise
+
+bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_ARGS="--only step"; out/bench
+	$(BENCH) --out out/bench $(BENCH_ARGS)
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
@@ -41,6 +46,10 @@ docs: $(VENV)/.installed-test ## Build the documentation; open docs/_build/html/
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 check: lint types test docs ## All four
+
+dist: $(VENV)/.installed-test ## Build both distributions, sdist and wheel, into dist
+	$(BIN)/python -m build --no-isolation --outdir dist .
+	$(BIN)/python -m build --no-isolation --outdir dist policies
 
 constraints: $(VENV)/.installed-test ## Write the versions in .venv into constraints.txt
 	{ grep '^#' constraints.txt; $(BIN)/python -m pip freeze --all --exclude-editable \

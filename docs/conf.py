@@ -91,6 +91,8 @@ toc_object_entries_show_parents = "hide"
 html_sidebars = {page.stem: [] for page in HERE.glob("*.md")}
 html_theme_options = {
     "navigation_with_keys": False,
+    "header_links_before_dropdown": 8,
+    "navbar_persistent": ["search-button"],  # the field would leave no room for the links
     "show_toc_level": 2,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],

@@ -93,7 +93,7 @@ for name, error in errors.items():
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
 for axes, title in ((left, "what the tracker says"), (middle, "each made continuous")):
-    axes.set(title=title, xlabel="time [s]", ylabel="w (black), x, y, z")
+    axes.set(title=title, xlabel="time [s]", ylabel="w (black), x (red), y, z (blue)")
 for recording in recordings:
     smooth = quaternions.continuous(recording)
     for part, color in enumerate(("black", "tab:red", "tab:green", "tab:blue")):
@@ -102,5 +102,5 @@ for recording in recordings:
 for (name, error), color in zip(errors.items(), ("tab:gray", "tab:red"), strict=True):
     right.plot(time, error, color=color, label=f"taken for {name}")
 right.set(title="error of the reproduction", xlabel="time [s]", ylabel="degrees")
-right.legend(fontsize="small")
+right.legend(fontsize="small", loc="center left")
 plt.show()

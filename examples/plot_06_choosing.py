@@ -99,9 +99,13 @@ for parameters, score in zip(table["params"], table["mean_test_score"], strict=T
 for name, values in errors.items():
     left.plot(counts, values, "o-", label=name)
 left.set(
-    title="left-out demonstrations", xlabel="K", ylabel="reproduction error [mm]", ylim=(0, 100)
+    title="left-out demonstrations",
+    xlabel="K",
+    xticks=counts,
+    ylabel="reproduction error [mm]",
+    ylim=(0, 100),
 )
 left.legend(title="operators")
 right.plot(counts, bic, "o-", color="0.3")
-right.set(title=f"BIC, {best}", xlabel="K", ylabel="lower is better")
+right.set(title=f"BIC, {best}", xlabel="K", ylabel="lower is better", xticks=counts)
 plt.show()

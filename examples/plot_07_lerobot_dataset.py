@@ -95,7 +95,7 @@ for axes, joint in zip(panels, most, strict=True):
         axes.plot(demonstration.time, demonstration.joints[:, joint], color="0.75")
     axes.plot(truth.time, truth.joints[:, joint], "k", label="left out")
     axes.plot(trajectory.time, trajectory.joints[:, joint], color="tab:red", label="model")
-    axes.set_ylabel(names[joint], fontsize="small")
+    axes.set_ylabel(f"{names[joint]} [rad]", fontsize="small")
 panels[0].legend(fontsize="small", loc="upper right")
 panels[-1].set_xlabel("time [s]")
 plt.show()

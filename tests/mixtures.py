@@ -22,7 +22,8 @@ from tpgmm_torch import (
     RobotState,
     Stack,
 )
-from tpgmm_torch.regression import Estimate, LocalMixture, Regression
+from tpgmm_torch.local_mixtures import LocalMixture
+from tpgmm_torch.regression import Estimate, Regression
 
 Rows = Callable[[oracles.At], list[oracles.Row]]
 

@@ -54,6 +54,22 @@ def test_pages_by_concept_have_every_name_of_the_package(package):
     assert wanted - internals.documented() == set()
 
 
+def test_the_page_of_the_plugin_has_what_its_users_need():
+    wanted = {
+        "configuration_tpgmm.TPGMMConfig",
+        "modeling_tpgmm.TPGMMPolicy",
+        "processor_tpgmm.make_tpgmm_pre_post_processors",
+        "environments.BottleShakingConfig",
+        "environments.AlohaStateConfig",
+        "environments.bottle_shaking.BottleShakingEnv",
+        "environments.aloha_state.AlohaStateEnv",
+        "evaluation.compare.compare",
+        "evaluation.settings.Settings",
+    }
+    shown = importlib.import_module("internals").documented()
+    assert {f"lerobot_policy_tpgmm.{name}" for name in wanted} - shown == set()
+
+
 def test_every_other_public_name_is_on_the_page_of_internals():
     internals = importlib.import_module("internals")
     left = internals.internal_names()

@@ -7,20 +7,24 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from itertools import chain
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from packaging.version import Version
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = {
-    "tpgmm_torch": ROOT / "tpgmm_torch",
-    "tpgmm_datasets": ROOT / "datasets" / "tpgmm_datasets",
+#: The folder of each distribution, and its packages.
+DISTRIBUTIONS = {
+    "tpgmm_torch": (ROOT, ("tpgmm_torch", "datasets/tpgmm_datasets")),
+    "lerobot_policy_tpgmm": (ROOT / "policies", ("lerobot_policy_tpgmm",)),
 }
 SHIPPED = {".py", ".typed", ".urdf"}
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PROJECT, PLUGIN = (
+    tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for folder in (ROOT, ROOT / "policies")
+)
 EXTRAS = PROJECT["optional-dependencies"]
 
 
@@ -53,35 +57,43 @@ def test_hugging_face_datasets_is_importable_from_the_repository_root():
     assert ROOT / "datasets" not in found.parents
 
 
-# The wheel
+# The wheels
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory) -> list[str]:
-    """Names of the files in a wheel built from this tree."""
+@pytest.fixture(scope="module", params=DISTRIBUTIONS)
+def wheel(request, tmp_path_factory) -> tuple[str, list[str], str]:
+    """A wheel built from this tree: its distribution, the names of its files, its metadata."""
     folder = tmp_path_factory.mktemp("wheel")
-    run("-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT)
+    source, _ = DISTRIBUTIONS[request.param]
+    run("-m", "build", "--wheel", "--no-isolation", "--outdir", folder, source)
     (path,) = folder.glob("*.whl")
     with zipfile.ZipFile(path) as archive:
-        return archive.namelist()
+        names = archive.namelist()
+        [about] = [name for name in names if name.endswith(".dist-info/METADATA")]
+        return request.param, names, archive.read(about).decode()
 
 
 def test_wheel_holds_exactly_the_packages_and_their_data(wheel):
+    distribution, names, _ = wheel
+    source, packages = DISTRIBUTIONS[distribution]
     expected = {
-        f"{package}/{path.relative_to(folder).as_posix()}"
-        for package, folder in PACKAGES.items()
-        for path in folder.rglob("*")
+        f"{package.rpartition('/')[2]}/{path.relative_to(source / package).as_posix()}"
+        for package in packages
+        for path in (source / package).rglob("*")
         if path.suffix in SHIPPED
     }
-    assert {"tpgmm_torch/py.typed", "tpgmm_datasets/py.typed"} <= expected
-    assert any(name.endswith(".urdf") for name in expected)
-    assert {name for name in wheel if ".dist-info/" not in name} == expected
-    assert len(wheel) == len(set(wheel))
+    assert {f"{package.rpartition('/')[2]}/py.typed" for package in packages} <= expected
+    assert any(name.endswith(".urdf") for name in expected) == (distribution == "tpgmm_torch")
+    assert {name for name in names if ".dist-info/" not in name} == expected
+    assert len(names) == len(set(names))
 
 
 def test_wheel_describes_itself(wheel):
-    about = {name.partition("/")[2] for name in wheel if ".dist-info/" in name}
+    _, names, metadata = wheel
+    about = {name.partition("/")[2] for name in names if ".dist-info/" in name}
     assert about == {"METADATA", "WHEEL", "RECORD", "entry_points.txt", "licenses/LICENSE"}
+    assert f"\nVersion: {PROJECT['version']}\n" in metadata
+    assert "\nDescription-Content-Type: text/markdown\n" in metadata
 
 
 def test_command_tpgmm_leads_to_a_function():
@@ -94,11 +106,33 @@ def test_command_tpgmm_leads_to_a_function():
 
 def test_version_is_the_same_everywhere():
     version = PROJECT["version"]
+    assert PLUGIN["version"] == version
+    for name in (PROJECT["name"], PLUGIN["name"]):
+        assert importlib.metadata.version(name) == version
+
+
+def test_the_plugin_asks_for_the_core_of_its_own_version():
+    lines = [*PLUGIN["dependencies"], *chain(*PLUGIN["optional-dependencies"].values())]
+    asked = [r for r in map(Requirement, lines) if r.name == PROJECT["name"]]
+    assert len(asked) == 2
+    assert {str(r.specifier) for r in asked} == {f"=={PROJECT['version']}"}
+    assert set().union(*(r.extras for r in asked)) <= EXTRAS.keys()
+
+
+def test_citation_and_changelog_agree_with_the_version():
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert re.findall(r"^version: (.+)$", citation, re.MULTILINE) == [version]
-    assert importlib.metadata.version("tpgmm-torch") == version
-    release = Version(version).base_version
-    assert release in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    [version] = re.findall(r"^version: (.+)$", citation, re.MULTILINE)
+    [day] = re.findall(r"^date-released: (\d{4}-\d{2}-\d{2})$", citation, re.MULTILINE)
+    changelog = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    released = re.findall(r"^## \[(\d.*)\] - (\S+)$", changelog, re.MULTILINE)
+    assert version == PROJECT["version"]
+    assert released[0] == (version, day)  # the newest first
+
+
+def test_every_distribution_has_its_licence():
+    texts = {(folder / "LICENSE").read_text("utf-8") for folder, _ in DISTRIBUTIONS.values()}
+    assert len(texts) == 1
+    assert PROJECT["license"] == PLUGIN["license"] == "Apache-2.0"
 
 
 # Requirements and constraints

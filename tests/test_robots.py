@@ -4,7 +4,6 @@ import copy
 import json
 import math
 import pickle
-import sys
 from typing import Any
 
 import mujoco
@@ -31,7 +30,7 @@ from tests.robot_zoo import (
 )
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.frames import Frame
 from tpgmm_torch.robots import Robot
 
@@ -359,8 +358,3 @@ class TestErrors:
     def test_joints_that_are_not_finite(self, value: float) -> None:
         with pytest.raises(DataError, match="NaN or infinite"):
             zoo().state([0.0, value, 0.0, 0.0, 0.0])
-
-    def test_a_missing_library_names_the_extra(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "pytorch_kinematics", None)
-        with pytest.raises(DependencyError, match=r"tpgmm-torch\[robots\]"):
-            zoo()

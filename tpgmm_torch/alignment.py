@@ -1,4 +1,4 @@
-"""Alignment in time of demonstrations of unequal duration (DESIGN 4.5).
+"""Alignment in time of demonstrations of unequal duration.
 
 Transformers in scikit-learn's sense on lists of demonstrations. What they return can be
 fitted as it is; without alignment, demonstrations are fitted on their own clocks.

@@ -29,11 +29,9 @@ __all__ = [
     "check_blocks",
 ]
 
-#: Numbers at a time when the variance is summed.
-MOMENT_CHUNK = 2**20
-
-#: Numbers that a chunk of points is expanded to: a processor's cache full, a GPU's worth.
-CHUNK_SIZE = {"cpu": 2**18, "gpu": 2**25}
+#: Numbers in float64 that a chunk of points is expanded to, in float32 twice as many: what a
+#: processor's cache can keep, and what a GPU is busy with.
+CHUNK_SIZE = {"cpu": 3 * 2**17, "gpu": 2**25}
 
 #: Least regularisation, as a share of the variance, that survives rounding.
 SMALLEST_SHARE = {torch.float64: 1e-12, torch.float32: 2e-6}
@@ -105,6 +103,22 @@ class Parameters:
         weights = unit.expand(n_components) / n_components
         return cls(weights, tuple(means), tuple(eyes))
 
+    @classmethod
+    def joined(cls, mixtures: Sequence["Parameters"]) -> "Parameters":
+        """The components of all mixtures, one after the other, with their weights as they are.
+
+        Parameters
+        ----------
+        mixtures : sequence of Parameters
+            At least one.
+        """
+        if len(mixtures) == 1:
+            return mixtures[0]
+        weights = torch.cat([mixture.weights for mixture in mixtures])
+        means = zip(*(mixture.means for mixture in mixtures), strict=True)
+        factors = zip(*(mixture.factors for mixture in mixtures), strict=True)
+        return cls(weights, tuple(map(torch.cat, means)), tuple(map(torch.cat, factors)))
+
     @property
     def covariances(self) -> tuple[Tensor, ...]:
         """Covariances per block, shape (K, D_j, D_j)."""
@@ -145,43 +159,6 @@ class Standardization:
     scales: tuple[Tensor, ...]
 
     @classmethod
-    def of_data(
-        cls, points: NDArray[np.floating], widths: Sequence[int], *, isotropic: bool
-    ) -> "Standardization":
-        """Mean and standard deviation of each column, or one deviation per block.
-
-        A constant column takes the mean variance of its block, or 1 where that is zero too.
-
-        Parameters
-        ----------
-        points : array of shape (n_samples, n_features)
-        widths : sequence of int
-            Widths of the blocks.
-        isotropic : bool
-            Scale all columns of a block alike.
-
-        Raises
-        ------
-        DataError
-            If the variance overflows.
-        """
-        parts = np.array_split(points, max(1, points.size // MOMENT_CHUNK))
-        with np.errstate(over="ignore", invalid="ignore"):
-            mean = points.mean(0, dtype=np.float64)
-            variance = sum(np.square(part - mean).sum(0) for part in parts) / len(points)
-        if not np.isfinite(variance).all():
-            raise DataError("the variance of the data overflows; divide the data by a constant")
-        largest = np.maximum(np.abs(points.max(0)), np.abs(points.min(0)))
-        # what summation leaves of a constant column is no variance
-        variance[np.sqrt(variance) <= 10 * np.finfo(np.float64).eps * largest] = 0.0
-        scales = []
-        for block in np.split(variance, np.cumsum(widths)[:-1]):
-            fallback = block.mean() or 1.0
-            constant = np.full_like(block, True, dtype=bool) if isotropic else block == 0
-            scales.append(torch.from_numpy(np.sqrt(np.where(constant, fallback, block))))
-        return cls(torch.split(torch.from_numpy(mean), list(widths)), tuple(scales))
-
-    @classmethod
     def of_mixture(cls, parameters: Parameters) -> "Standardization":
         """Mean and standard deviation of the mixture's own density."""
         weights = parameters.weights[:, None]
@@ -211,21 +188,42 @@ class Standardization:
         n_components: int,
         dtype: torch.dtype,
         group_size: int = 1,
+        order: NDArray[np.intp] | None = None,
     ) -> list[Chunk]:
-        """Standardise points (n_samples, n_features) in float64; cut between groups."""
+        """Standardise points (n_samples, n_features) in float64; cut between groups.
+
+        With ``order`` (n,) those rows, in that order.
+        """
         widths = [len(shift) + 1 for shift in self.shifts]
         packed = sum(width * (width + 1) // 2 for width in widths)
         whole = CHUNK_SIZE["cpu" if self.shifts[0].device.type == "cpu" else "gpu"]
+        whole = whole * 8 // dtype.itemsize
         size = whole // min(n_components * sum(widths), packed) // group_size + 1
         size *= group_size
         shift, scale = torch.cat(self.shifts)[:, None], torch.cat(self.scales)[:, None]
+        by_column = points.flags.f_contiguous
+        n_points = len(points) if order is None else len(order)
+        # one piece of memory for all chunks of a block: many small ones would scatter
+        stores = [shift.new_ones(width * n_points, dtype=dtype) for width in widths]
+        columns = np.empty((len(shift), min(size, n_points)))
         chunks = []
-        for start in range(0, len(points), size):
-            columns = np.array(points[start : start + size].T, dtype=np.float64, order="C")
-            standard = (torch.from_numpy(columns).to(shift.device) - shift) / scale
-            one = standard.new_ones(1, standard.shape[1])
-            blocks = torch.split(standard, [width - 1 for width in widths])
-            chunks.append(tuple(torch.cat((block, one)).to(dtype) for block in blocks))
+        for start in range(0, n_points, size):
+            stop = min(start + size, n_points)
+            part = points[start:stop].T
+            if order is not None:
+                own = order[start:stop]
+                part = points.T[:, own] if by_column else points[own].T
+            columns[:, : stop - start] = part
+            standard = torch.from_numpy(columns[:, : stop - start]).to(shift.device)
+            standard.sub_(shift).div_(scale)
+            chunk = [
+                store[width * start : width * stop].view(width, -1)
+                for store, width in zip(stores, widths, strict=True)
+            ]
+            inner = standard.split([width - 1 for width in widths])
+            for block, coordinates in zip(chunk, inner, strict=True):
+                block[:-1] = coordinates
+            chunks.append(tuple(chunk))
         return chunks
 
     def standardize(self, parameters: Parameters) -> Parameters:
@@ -349,6 +347,8 @@ class Whitener:
         Per block, in float64, what takes (x; 1) to (y; 1).
     constant : Tensor of shape (K,)
         In float64, what the log-density is at (y; 1) = 0.
+    peaks : Tensor of shape (K,)
+        In float64, what it is at the means, where (y; 1) = (0; 1).
     """
 
     def __init__(self, parameters: Parameters, dtype: torch.dtype) -> None:
@@ -367,6 +367,7 @@ class Whitener:
             # the appended 1 adds 1/2 to half the squared norm of (y; 1)
             normalizer = log_determinant + (width * math.log(2 * math.pi) - 1) / 2
             self.constant = self.constant - normalizer
+        self.peaks = self.constant - len(self.maps) / 2
         self._flat = [whitener.flatten(0, 1).to(dtype) for whitener in self.maps]
         self._column = self.constant.to(dtype)[:, None]
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Self
@@ -13,17 +14,27 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from tpgmm_torch.block_gaussians import Standardization
+from tpgmm_torch.checkpoints import Checkpoint
+from tpgmm_torch.column_moments import ColumnMoments
+from tpgmm_torch.demonstration_batches import (
+    DemonstrationBatches,
+    LearningRows,
+    check_like,
+    gather_rows,
+    rows_in_memory,
+    split_batches,
+)
 from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.distributed import ALONE, Processes
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.joint_space import JointSpace
 from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.local_data import local_data
+from tpgmm_torch.likelihood import Likelihood
 from tpgmm_torch.mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.persistence import load_estimator, save_estimator
-from tpgmm_torch.reproduction import Reproduction
+from tpgmm_torch.spool import SpooledRows
 
 __all__ = ["TaskParameterizedGMM"]
 
@@ -33,7 +44,7 @@ MIXTURE_PARAMETERS = (
 )  # fmt: skip
 
 
-class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
+class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
     """Task-parameterised Gaussian mixture over joint space and task space.
 
     One sample is one demonstration: ``X`` is a list of :class:`Demonstration`, so that
@@ -69,9 +80,9 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         from a confidence that nothing supports. "auto": "instant" where the demonstrations
         share one time grid, as after alignment, else "point".
     fusion : {"information", "covariance"}, default="information"
-        Form of the product of Gaussians (DESIGN 4.2); "covariance" is eqs (1), (2) as printed.
+        Form of the product of Gaussians; "covariance" is eqs (1), (2) as printed.
     activation : {"time", "product"}, default="time"
-        Where the mixing weights come from (DESIGN 4.3): the components' time marginal taken
+        Where the mixing weights come from: the components' time marginal taken
         once, or that of the product, as in eq. (2).
     epsilon : float, default=1e-4
         Added to the diagonal of every projected covariance by ``fusion="covariance"`` [rad^2].
@@ -209,15 +220,29 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         self.device = device
         self.verbose = verbose
 
-    def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
+    def fit(
+        self,
+        X: Iterable[Demonstration] | Iterable[Sequence[Demonstration]],
+        y: object = None,
+        *,
+        checkpoint: Checkpoint | None = None,
+        processes: Processes = ALONE,
+    ) -> Self:
         """Learn the local models by expectation-maximisation (Algorithm 1, model training).
 
         Parameters
         ----------
-        X : sequence of Demonstration
-            With the same joints and frames; aligned in time, if durations differ.
+        X : sequence of Demonstration, or iterable of such sequences
+            With the same joints and frames; aligned in time, if durations differ. Batches,
+            for example :class:`tpgmm_datasets.EpisodeBatches`, are read once, one ahead; only
+            their local data are kept, in a temporary file.
         y : ignored
             Here for scikit-learn.
+        checkpoint : Checkpoint, optional
+            Where to keep the state of EM, and to go on from if there is one.
+        processes : Processes, optional
+            Those that learn together, see :func:`~tpgmm_torch.distributed.joined_processes`;
+            X is then the share of this one, and each has the whole model.
 
         Returns
         -------
@@ -227,63 +252,69 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         ------
         DataError, ShapeError, UnknownNameError
             If demonstrations do not fit together, or with the operators and the robot.
+        ModelFileError
+            If the checkpoint is damaged, or of other data or settings.
+        DistributedError
+            If another of the processes died.
         """
         self._validate_params()
-        demonstrations = check_demonstrations(X)
         operators = (Canonical(),) if self.operators is None else tuple(self.operators)
         if not operators:
             raise DataError("operators is empty: give at least one, for example [Canonical()]")
         for operator in operators:
             if not isinstance(operator, Operator):
                 raise DataError(f"operators holds Operator objects, got {operator!r}")
-        kinematics = self._kinematics(demonstrations, operators)
-        for operator in operators:
-            operator.check(kinematics, demonstrations[0].frames)
-        rows = local_data(demonstrations, operators, kinematics)
-        group_size = self._group_size(demonstrations)
-        together = torch.cat(rows) if group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
-        points = together.cpu().numpy()
+        demonstrations, batches = split_batches(X)
+        if batches is None and processes.count == 1:
+            known = check_demonstrations(demonstrations)
+            kinematics = self._kinematics_for(known, operators)
+            gathered = rows_in_memory(
+                known, operators, kinematics, responsibilities=self.responsibilities
+            )
+            return self._learn(gathered, operators, kinematics, checkpoint)
+        walk = iter(DemonstrationBatches([demonstrations] if batches is None else batches))
+        head = next(walk, None)
+        check_like(head, processes)
+        assert head is not None
+        kinematics = self._kinematics_for(head, operators)
+        with SpooledRows() as spool:
+            gathered = gather_rows(
+                chain([head], walk), operators, kinematics, spool, processes,
+                responsibilities=self.responsibilities,
+            )  # fmt: skip
+            return self._learn(gathered, operators, kinematics, checkpoint)
+
+    def _learn(
+        self,
+        learning: LearningRows,
+        operators: tuple[Operator, ...],
+        kinematics: Kinematics,
+        checkpoint: Checkpoint | None,
+    ) -> Self:
+        """Fit the mixture to rows, and take over what it learned."""
+        moments = ColumnMoments.of_batches(learning.rows, learning.processes)
         settings = self._mixture_parameters(operators, kinematics)
         settings |= {
-            "group_size": group_size,
-            "reg_covar": self._regularization(points, operators, kinematics),
+            "group_size": learning.group_size,
+            "reg_covar": self._regularization(moments, operators, kinematics),
         }
         mixture = BlockGaussianMixture(**settings)
         if self.warm_start and hasattr(self, "mixture_"):
             mixture = self.mixture_.set_params(**settings)
-        mixture.fit(points)
+        mixture.fit_rows(
+            learning.rows,
+            moments=moments,
+            checkpoint=checkpoint,
+            processes=learning.processes,
+        )
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_ = frame_names(operators, kinematics)
-        middle = sorted(demonstrations, key=lambda d: d.duration)[len(demonstrations) // 2]
-        self.time_ = middle.time.to(rows[0])
+        self.time_ = learning.time
         self.weights_, self.means_ = mixture.weights_, mixture.means_
         self.covariances_ = mixture.covariances_
         self.n_iter_, self.converged_ = mixture.n_iter_, mixture.converged_
         self.lower_bound_ = mixture.lower_bound_
         return self
-
-    def score(self, X: Sequence[Demonstration], y: object = None) -> float:
-        """Mean log-likelihood per time step of (new) demonstrations.
-
-        It is the likelihood of the local data, so models with other operators are not
-        comparable: use :func:`tpgmm_torch.metrics.reproduction_scorer` for those.
-        """
-        lengths = [len(demonstration) for demonstration in check_demonstrations(X)]
-        return float(np.average(self.score_samples(X), weights=lengths))
-
-    def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
-        """Mean log-likelihood per time step of each demonstration, shape (n,)."""
-        return np.array([self.mixture_.score(row) for row in self._rows(X)])
-
-    def bic(self, X: Sequence[Demonstration]) -> float:
-        """Bayesian information criterion on demonstrations; lower is better."""
-        rows = np.concatenate(self._rows(X))
-        return float(self.mixture_.bic(rows))
-
-    def aic(self, X: Sequence[Demonstration]) -> float:
-        """Akaike information criterion on demonstrations; lower is better."""
-        rows = np.concatenate(self._rows(X))
-        return float(self.mixture_.aic(rows))
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
@@ -319,6 +350,15 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         model: Self = load_estimator(cls, path, custom, device)
         return model
 
+    def _kinematics_for(
+        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
+    ) -> Kinematics:
+        """What the operators act on, once it is known to have what they need."""
+        kinematics = self._kinematics(demonstrations, operators)
+        for operator in operators:
+            operator.check(kinematics, demonstrations[0].frames)
+        return kinematics
+
     def _kinematics(
         self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
     ) -> Kinematics:
@@ -335,26 +375,16 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
         names = next((d.joint_names for d in demonstrations if d.joint_names), default)
         return JointSpace(names, dtype, self.device)
 
-    def _group_size(self, demonstrations: Sequence[Demonstration]) -> int:
-        first = demonstrations[0].time
-        aligned = all(torch.equal(item.time, first) for item in demonstrations)
-        if self.responsibilities == "instant" and not aligned:
-            raise DataError(
-                "responsibilities='instant' needs demonstrations of one common time grid: "
-                "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
-            )
-        return len(demonstrations) if aligned and self.responsibilities != "point" else 1
-
     def _regularization(
         self,
-        points: NDArray[np.float64],
+        moments: ColumnMoments,
         operators: Sequence[Operator],
         kinematics: Kinematics,
     ) -> NDArray[np.float64]:
         """``reg_covar`` and the operators' tolerances, as shares of each column's variance."""
         widths = [1 + operator.dimension(kinematics) for operator in operators]
         isotropic = self.covariance_type == "spherical"
-        scales = torch.cat(Standardization.of_data(points, widths, isotropic=isotropic).scales)
+        scales = torch.cat(moments.standardization(widths, isotropic=isotropic).scales)
         tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
         return self.reg_covar + (np.concatenate(tolerances) / scales.numpy()) ** 2
 
@@ -363,15 +393,6 @@ class TaskParameterizedGMM(Reproduction, BaseEstimator):  # type: ignore[misc]
     ) -> dict[str, Any]:
         blocks = tuple(1 + operator.dimension(kinematics) for operator in operators)
         return {"blocks": blocks} | {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
-
-    def _rows(self, X: Sequence[Demonstration]) -> list[NDArray[np.float64]]:
-        self._check_fitted()
-        demonstrations = check_demonstrations(X)
-        for operator in self.operators_:
-            operator.check(self.kinematics_, demonstrations[0].frames)
-        expected = self._regression().expected
-        rows = local_data(demonstrations, self.operators_, self.kinematics_, expected)
-        return [row.cpu().numpy() for row in rows]
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

@@ -14,6 +14,7 @@ __all__ = [
     "DataError",
     "DegenerateComponentWarning",
     "DependencyError",
+    "DistributedError",
     "ModelFileError",
     "NotFittedError",
     "ShapeError",
@@ -73,6 +74,10 @@ class ModelFileError(TPGMMError, ValueError):
 
 class DependencyError(TPGMMError, ImportError):
     """An optional package is missing; the message says which extra installs it."""
+
+
+class DistributedError(TPGMMError, RuntimeError):
+    """The processes that learn a model together cannot reach each other, or one has died."""
 
 
 class ConvergenceWarning(SklearnConvergenceWarning):

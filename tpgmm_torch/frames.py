@@ -6,6 +6,8 @@ tensor is copied once into tensors, by default of float64; nothing is modified i
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +44,8 @@ def as_tensor(values: Any, name: str) -> Tensor:
     DataError
         If it is not numeric, or holds NaN or infinity (the message says where).
     """
+    if isinstance(values, float) and math.isfinite(values):
+        return torch.tensor(values, dtype=torch.float64)
     if isinstance(values, Tensor) and not values.is_complex():
         tensor = (values if values.is_floating_point() else values.double()).clone()
     else:
@@ -52,6 +56,9 @@ def as_tensor(values: Any, name: str) -> Tensor:
             tensor = torch.from_numpy(array.astype(np.float64))
         except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise DataError(f"{name} must be an array of numbers: {error}") from error
+    # every tick asks: a sum is quickly had, and is not finite if a number is not
+    if math.isfinite(tensor.detach().sum().item()):
+        return tensor
     finite = torch.isfinite(tensor)
     if not bool(finite.all()):
         first = torch.nonzero(~finite)[0].tolist()
@@ -135,6 +142,10 @@ class Frame:
         return self._from(
             self.position.to(*args, **kwargs), self.orientation.to(*args, **kwargs)
         )
+
+    def expand(self, batch: Sequence[int]) -> Frame:
+        """The same pose for all of a batch, without copying."""
+        return self._from(self.position.expand(*batch, 3), self.orientation.expand(*batch, 4))
 
     def __getitem__(self, index: Any) -> Frame:
         """Select along the leading dimensions."""

@@ -50,15 +50,16 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
     DataError
         If a matrix is not positive definite.
     """
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    if bool(info.any()):
+    try:
+        return torch.linalg.cholesky(matrix)
+    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+        info = torch.linalg.cholesky_ex(matrix).info
         bad = int((info != 0).sum())
         raise DataError(
             f"{name} is not positive definite ({bad} of {info.numel()} matrices of size "
             f"{matrix.shape[-1]}): a direction has no variance; a larger regularisation "
             "(reg_covar, or epsilon of the covariance form) gives it some"
-        )
-    return factor
+        ) from error
 
 
 def affine(
@@ -121,8 +122,8 @@ def information(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """What ``J x = y``, known with covariance ``S``, says about ``x``.
 
-    ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank
-    (DESIGN 4.2), so that sums of these terms are the product (2) of the projected Gaussians
+    ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank,
+    so that sums of these terms are the product (2) of the projected Gaussians
     (1) without any pseudo-inverse; rows may also be dependent.
 
     Parameters

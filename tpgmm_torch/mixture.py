@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.random import RandomState
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, DensityMixin
-from sklearn.utils import check_random_state
+from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import validate_data
 from torch import Tensor
@@ -21,17 +20,24 @@ from tpgmm_torch.block_gaussians import (
     Family,
     Parameters,
     Standardization,
-    Whitener,
     check_blocks,
 )
-from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
-from tpgmm_torch.expectation_maximization import ascend
-from tpgmm_torch.initialization import GivenStart, StartDrawer
+from tpgmm_torch.checkpoints import Checkpoint, Purpose
+from tpgmm_torch.column_moments import ColumnMoments
+from tpgmm_torch.distributed import ALONE, Processes, common_random_state
+from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.expectation_maximization import Run, ascend
+from tpgmm_torch.given_start import GivenStart
+from tpgmm_torch.initialization import StartDrawer, check_distinct
+from tpgmm_torch.mixture_density import MixtureDensity, on_cpu
+from tpgmm_torch.points import Points
+from tpgmm_torch.row_points import RowPoints
+from tpgmm_torch.rows import BatchedRows, Rows, StoredRows, are_batches
 
 __all__ = ["BlockGaussianMixture"]
 
 
-class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
+class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
     """Gaussian mixture whose covariance is block-diagonal, learned by EM.
 
     The columns are split into P blocks, independent of each other given the component:
@@ -223,13 +229,27 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         model._set(given.over(Parameters.standard(model.n_components, widths)))
         return model
 
-    def fit(self, X: Any, y: Any = None) -> Self:
+    def fit(
+        self,
+        X: Any,
+        y: Any = None,
+        *,
+        checkpoint: Checkpoint | None = None,
+        processes: Processes = ALONE,
+    ) -> Self:
         """Learn the mixture by EM.
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
+        X : array-like of shape (n_samples, n_features), or iterable of such arrays
+            Batches, for data larger than memory: each ``iter(X)`` has to give the same ones
+            anew, one pass per iteration of EM.
         y : Ignored
+        checkpoint : Checkpoint, optional
+            Where to keep the state of EM, and to go on from if there is one.
+        processes : Processes, optional
+            Those that learn together, see :func:`~tpgmm_torch.distributed.joined_processes`;
+            X is then the share of this one, and each has the whole result.
 
         Returns
         -------
@@ -240,124 +260,125 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         ShapeError
             If the blocks, the groups, or the arrays of the start do not fit the data.
         DataError
-            If there are fewer distinct points than components.
+            If there are fewer distinct points than components, a batch is no finite array
+            like the others, or batches can be walked through only once.
+        ModelFileError
+            If the checkpoint is damaged, or of other data or settings.
+        DistributedError
+            If another of the processes died.
         """
         self._validate_params()
+        if are_batches(X):
+            rows: Rows = BatchedRows(X, self.group_size)
+            return self.fit_rows(rows, checkpoint=checkpoint, processes=processes)
         points = validate_data(
-            self, _on_cpu(X), dtype=[np.float64, np.float32], ensure_min_samples=2
+            self, on_cpu(X), dtype=[np.float64, np.float32], ensure_min_samples=2
         )
-        widths = check_blocks(self.blocks, points.shape[1])
-        if len(points) % self.group_size:
-            raise ShapeError(f"{len(points)} rows are no multiple of {self.group_size=}")
+        rows = StoredRows(points)
+        return self.fit_rows(rows, checkpoint=checkpoint, processes=processes)
+
+    def fit_rows(
+        self,
+        rows: Rows,
+        *,
+        moments: ColumnMoments | None = None,
+        checkpoint: Checkpoint | None = None,
+        processes: Processes = ALONE,
+    ) -> Self:
+        """Learn the mixture from rows that are wherever they are; :meth:`fit` calls this.
+
+        Parameters
+        ----------
+        rows : Rows
+            Of this process.
+        moments : ColumnMoments, optional
+            Of the rows of all processes, where they are known already.
+        checkpoint : Checkpoint, optional
+        processes : Processes, optional
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ShapeError, DataError, ModelFileError, DistributedError
+            As :meth:`fit`.
+        """
+        moments = moments or ColumnMoments.of_batches(rows, processes)
+        widths = check_blocks(self.blocks, len(moments.mean))
+        if rows.n_rows % self.group_size:
+            raise ShapeError(f"{rows.n_rows} rows are no multiple of {self.group_size=}")
         isotropic = self.covariance_type == "spherical"
-        units = Standardization.of_data(points, widths, isotropic=isotropic)
+        units = moments.standardization(widths, isotropic=isotropic)
         units = units.to(torch.device(self.device))
-        dtype = getattr(torch, self.dtype)
-        chunks = units.chunks(points, self.n_components, dtype, self.group_size)
-        relative = self.regularization == "relative"
         family = Family.regularized(
-            self.covariance_type, units, self.reg_covar, relative=relative, dtype=dtype
-        )
+            self.covariance_type, units, self.reg_covar, dtype=getattr(torch, self.dtype),
+            relative=self.regularization == "relative",
+        )  # fmt: skip
+        points = self._points(rows, units, processes)
         known = (self.weights_init, self.means_init, self.covariances_init)
         if self.warm_start and hasattr(self, "weights_"):
             known = (self.weights_, self.means_, self.covariances_)
         given = GivenStart.checked(*known, self.n_components, widths).standardize(units)
-        drawer = StartDrawer(self.init_params, self.time_feature, self.n_components, chunks)
+        drawer = StartDrawer(
+            self.init_params, self.time_feature, self.n_components, rows, moments.count,
+            units, self.group_size, processes,
+        )  # fmt: skip
+        check_distinct(rows, moments.count, self.n_components, processes)
+        rng = common_random_state(self.random_state, processes)
         names = ("tol", "max_iter", "group_size", "verbose")
         settings = {name: getattr(self, name) for name in names}
-        rng = check_random_state(self.random_state)
-        runs = []
-        for attempt in range(1 if given.complete else self.n_init):
-            start = family.admit(given.over(drawer.draw(attempt, family, rng)))
-            runs.append(ascend(start, chunks, family, rng=rng, **settings))
+        runs, after = None, None
+        if checkpoint is not None:
+            purpose = Purpose.of(self._shaping(widths, known), self.reg_covar, moments)
+            runs = checkpoint.resume(purpose, processes)
+            after = checkpoint.keeper(purpose, self.max_iter, processes)
+        if runs is None:
+            drawn = (
+                [Parameters.standard(self.n_components, widths, units.shifts[0].device)]
+                if given.complete
+                else drawer.draw(self.n_init, family, rng)
+            )
+            runs = [
+                Run(family.admit(given.over(start)), RandomState(rng.randint(2**31 - 1)))
+                for start in drawn
+            ]
+        ascend(runs, points, family, after=after, **settings)
         best = max(runs, key=lambda run: run.bound)
-        self._set(units.restore(best.expectation.parameters))
+        self.n_features_in_ = sum(widths)
+        self._set(units.restore(best.parameters))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
         self.lower_bound_ = best.bound - units.log_volume
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
         for category, message in best.complaints():
-            warnings.warn(message, category, stacklevel=2)
+            warnings.warn(message, category, stacklevel=3)
         return self
+
+    def _shaping(self, widths: tuple[int, ...], known: tuple[Any, ...]) -> dict[str, Any]:
+        """The settings that a checkpoint has to share, but the regularisation."""
+        names = (
+            "n_components", "covariance_type", "tol", "regularization", "n_init", "init_params",
+            "time_feature", "group_size", "random_state", "dtype",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names} | {
+            "blocks": widths,
+            "start": [None if part is None else list(part) for part in known],
+        }
+
+    def _points(self, rows: Rows, units: Standardization, processes: Processes) -> Points:
+        """The rows standardised: kept in memory, if they are in memory anyway."""
+        in_first_block = self.time_feature < len(units.shifts[0])
+        points = RowPoints(
+            rows, rows.n_rows, units, self.n_components, getattr(torch, self.dtype),
+            group_size=self.group_size, processes=processes,
+            time_feature=self.time_feature if in_first_block else None,
+        )  # fmt: skip
+        return points.stored() if rows.in_memory else points
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
         """Fit, and return :meth:`predict` of the same points."""
         return self.fit(X).predict(X)
-
-    def score_samples(self, X: Any) -> NDArray[np.floating]:
-        """Log-density of each point.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-
-        Returns
-        -------
-        array of shape (n_samples,)
-        """
-        return _to_numpy(torch.logsumexp(joint, 0) for joint in self._log_joint(X))
-
-    def score(self, X: Any, y: Any = None) -> float:
-        """Mean log-density of the points X (n_samples, n_features)."""
-        return float(self.score_samples(X).mean(dtype=np.float64))
-
-    def predict_proba(self, X: Any) -> NDArray[np.floating]:
-        """Responsibilities of the components for each point.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-
-        Returns
-        -------
-        array of shape (n_samples, K)
-        """
-        return _to_numpy(torch.softmax(joint, 0).T for joint in self._log_joint(X))
-
-    def predict(self, X: Any) -> NDArray[np.int64]:
-        """Most probable component of each of the points X, shape (n_samples,)."""
-        return _to_numpy(joint.argmax(0) for joint in self._log_joint(X))
-
-    @property
-    def n_parameters_(self) -> int:
-        """Number of free parameters: weights, means, and covariances of all blocks."""
-        n_components, widths = len(self._fitted().weights), [m.shape[1] for m in self.means_]
-        per_block = {
-            "full": [n_components * width * (width + 1) // 2 for width in widths],
-            "tied": [width * (width + 1) // 2 for width in widths],
-            "diag": [n_components * width for width in widths],
-            "spherical": [n_components for _ in widths],
-        }[self.covariance_type]
-        return n_components - 1 + n_components * sum(widths) + sum(per_block)
-
-    def bic(self, X: Any) -> float:
-        """Bayesian information criterion on X (n_samples, n_features); lower is better."""
-        values = self.score_samples(X)
-        penalty = self.n_parameters_ * math.log(len(values))
-        return -2 * float(values.sum(dtype=np.float64)) + penalty
-
-    def aic(self, X: Any) -> float:
-        """Akaike information criterion on X (n_samples, n_features); lower is better."""
-        values = self.score_samples(X)
-        return -2 * float(values.sum(dtype=np.float64)) + 2 * self.n_parameters_
-
-    def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
-        """Draw points from the mixture.
-
-        Parameters
-        ----------
-        n_samples : int, default=1
-
-        Returns
-        -------
-        X : array of shape (n_samples, n_features)
-        labels : array of shape (n_samples,)
-            The components that they came from, in ascending order.
-        """
-        parameters = self._fitted()
-        if not isinstance(n_samples, Integral) or n_samples < 1:
-            raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
-        X, labels = parameters.sample(n_samples, check_random_state(self.random_state))
-        return X.astype(self.dtype), labels
 
     def _set(self, parameters: Parameters) -> None:
         """Set the mixture in units of the data."""
@@ -365,36 +386,3 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.weights_ = parameters.weights.to(**target)
         self.means_ = [mean.to(**target) for mean in parameters.means]
         self.covariances_ = [covariance.to(**target) for covariance in parameters.covariances]
-
-    def _fitted(self) -> Parameters:
-        """The fitted mixture in float64."""
-        if not hasattr(self, "weights_"):
-            raise NotFittedError(
-                f"this {type(self).__name__} is not fitted yet; call fit before this method"
-            )
-        return Parameters.from_covariances(
-            self.weights_.double(),
-            [mean.double() for mean in self.means_],
-            [covariance.double() for covariance in self.covariances_],
-        )
-
-    def _log_joint(self, X: Any) -> Iterator[Tensor]:
-        """Log of weight times density, (K, n), chunk by chunk."""
-        parameters = self._fitted()
-        points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
-        units = Standardization.of_mixture(parameters)
-        chunks = units.chunks(points, len(parameters.weights), self.weights_.dtype)
-        whitener = Whitener(units.standardize(parameters), self.weights_.dtype)
-        for chunk in chunks:
-            yield whitener(chunk)[0] - units.log_volume
-
-
-def _on_cpu(X: Any) -> Any:
-    """A tensor as an array, anything else as it is."""
-    return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
-
-
-def _to_numpy(chunks: Iterator[Tensor]) -> NDArray[Any]:
-    """Put the results of the chunks together."""
-    result: NDArray[Any] = torch.cat(list(chunks)).cpu().numpy()
-    return result

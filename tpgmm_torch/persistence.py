@@ -7,19 +7,13 @@ Loading reads numbers and names, never code, and refuses whatever does not fit t
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import safetensors.torch
-from safetensors import SafetensorError
 from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
@@ -31,8 +25,11 @@ from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.poses import Poses
 from tpgmm_torch.robots import Robot
+from tpgmm_torch.storage import CONFIG, Folder
 
 __all__ = [
+    "CONFIG",
+    "TENSORS",
     "decode",
     "encode",
     "load_estimator",
@@ -42,8 +39,8 @@ __all__ = [
     "write_model",
 ]
 
-FORMAT, VERSION = "tpgmm-torch model", 1
-CONFIG, TENSORS = "config.json", "model.safetensors"
+MODEL = Folder("model", 1)
+TENSORS = MODEL.tensors
 KNOWN: dict[str, type] = {
     name: getattr(builtin_operators, name)
     for name in builtin_operators.__all__
@@ -126,15 +123,6 @@ def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _canonical(config: Mapping[str, Any]) -> bytes:
-    body = {key: value for key, value in config.items() if key != "digest"}
-    return json.dumps(body, sort_keys=True, allow_nan=False).encode()
-
-
 def write_model(
     path: str | Path, config: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> None:
@@ -154,48 +142,7 @@ def write_model(
         If ``path`` exists and is no model directory, or holds other files too: it is left
         alone. If the configuration is not of JSON's values.
     """
-    path = Path(path)
-    if path.exists() and not _replaceable(path):
-        raise ModelFileError(
-            f"{path} exists and is not a saved model alone; choose another directory"
-        )
-    blob = safetensors.torch.save(
-        {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    )
-    shapes = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
-    full = {"format": FORMAT, "version": VERSION, **config}
-    full |= {"tensors": shapes, "tensors_sha256": _digest(blob)}
-    try:
-        full["digest"] = _digest(_canonical(full))
-    except (TypeError, ValueError) as error:
-        raise ModelFileError(f"the model cannot be described in JSON: {error}") from error
-    path.parent.mkdir(parents=True, exist_ok=True)
-    staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-    try:
-        (staging / "new").mkdir()
-        (staging / "new" / CONFIG).write_text(json.dumps(full, indent=1, allow_nan=False))
-        (staging / "new" / TENSORS).write_bytes(blob)
-        if path.exists():
-            path.rename(staging / "old")
-        (staging / "new").rename(path)
-    except BaseException:
-        if (staging / "old").exists() and not path.exists():
-            (staging / "old").rename(path)
-        raise
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-
-
-def _replaceable(path: Path) -> bool:
-    """Whether nothing but a model, or nothing at all, is lost by replacing the directory."""
-    if not path.is_dir() or {item.name for item in path.iterdir()} - {CONFIG, TENSORS}:
-        return False
-    try:
-        return json.loads((path / CONFIG).read_text())["format"] == FORMAT
-    except FileNotFoundError:
-        return not any(path.iterdir())
-    except (ValueError, TypeError, KeyError):
-        return False
+    MODEL.write(path, config, tensors)
 
 
 def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -216,41 +163,7 @@ def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     ModelFileError
         If a file is missing, truncated, changed, or of another version.
     """
-    path = Path(path)
-    try:
-        config = json.loads((path / CONFIG).read_text())
-        blob = (path / TENSORS).read_bytes()
-    except FileNotFoundError as error:
-        raise ModelFileError(
-            f"{path} is not a saved model: {error.filename} is missing"
-        ) from None
-    except (ValueError, OSError) as error:
-        raise ModelFileError(f"{path / CONFIG} cannot be read: {error}") from error
-    if not isinstance(config, dict) or config.get("format") != FORMAT:
-        raise ModelFileError(f"{path / CONFIG} does not describe a {FORMAT}")
-    if config.get("version") != VERSION:
-        raise ModelFileError(
-            f"{path} is a model of format version {config.get('version')!r}, this release "
-            f"reads version {VERSION}: load it with the release that wrote it, or fit again"
-        )
-    try:
-        digest = _digest(_canonical(config))
-    except ValueError:  # it holds NaN or infinity, which no model has
-        digest = ""
-    if config.get("digest") != digest:
-        raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
-    if config.get("tensors_sha256") != _digest(blob):
-        raise ModelFileError(f"{path / TENSORS} is truncated or was changed after it was saved")
-    try:
-        tensors = safetensors.torch.load(blob)
-    except SafetensorError as error:
-        raise ModelFileError(f"{path / TENSORS} cannot be read: {error}") from error
-    found = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
-    if found != config.get("tensors"):
-        raise ModelFileError(
-            f"{path / TENSORS} holds {found}, expected {config.get('tensors')}"
-        )
-    return config, tensors
+    return MODEL.read(path)
 
 
 def save_estimator(model: Any, path: str | Path) -> None:

@@ -10,8 +10,6 @@ matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; t
 three rows of ``Hbar``, ``Hbar*`` of eq. (11), are :func:`vector_matrix`.
 """
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
@@ -27,6 +25,7 @@ __all__ = [
     "log",
     "match_hemisphere",
     "normalize",
+    "of_poses",
     "product",
     "right_matrix",
     "rotate",
@@ -48,13 +47,24 @@ OUTER = (
 )
 
 
-@cache
+#: What :func:`_constant` has made.
+CONSTANTS: dict[tuple[str, torch.dtype, torch.device], Tensor] = {}
+
+
 def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Structure constants: every function here is a product with one of these matrices.
 
     That is a few operations where the formulas written out take dozens, and what is done at
     each control tick costs per operation.
     """
+    key = name, dtype, device
+    if key not in CONSTANTS:
+        CONSTANTS[key] = _structure(name, dtype).to(device)
+    return CONSTANTS[key]
+
+
+def _structure(name: str, dtype: torch.dtype) -> Tensor:
+    """Make one of the constants."""
 
     def linear(table: object, width: int) -> Tensor:
         """Coefficients (width, entries) of a table of signed places."""
@@ -72,15 +82,20 @@ def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
         # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
         turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
         pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
+        outer, eye = linear(OUTER, 9), torch.eye(4, dtype=dtype).flatten()
+        pose = torch.zeros(4, 4, 16, dtype=dtype)
+        pose[:3, :3], pose[3, 3] = outer.unflatten(0, (3, 3)), eye
         constants = {
             "conjugate": conjugate,
             "left": left,
             "right": right,
             "vector": right[:, 4:],
             "rotation": pairs[..., 1:, 1:].reshape(16, 9),
-            "outer": linear(OUTER, 9),
+            "outer": outer,
+            "eye": eye,
+            "pose": pose.flatten(0, 1),
         }
-        return constants[name].to(device)
+        return constants[name]
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
@@ -365,10 +380,28 @@ def from_matrix(matrix: Tensor) -> Tensor:
     if matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
     flat = matrix.flatten(-2) @ _constant("outer", matrix.dtype, matrix.device)
-    outer = flat.unflatten(-1, (4, 4)) + torch.eye(4, dtype=flat.dtype, device=flat.device)
-    # column i of the symmetric matrix 4 q q^T, for q_i the largest entry
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    index = largest[..., None, None].expand(*largest.shape, 1, 4)
-    q = outer.gather(-2, index).squeeze(-2)
-    q = q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)
-    return torch.where(q[..., :1] < 0, -q, q)
+    return _of_outer(flat + _constant("eye", matrix.dtype, matrix.device))
+
+
+def of_poses(poses: Tensor) -> Tensor:
+    """:func:`from_matrix` of homogeneous matrices, in fewer operations.
+
+    Parameters
+    ----------
+    poses : Tensor of shape (..., 4, 4)
+
+    Returns
+    -------
+    Tensor of shape (..., 4)
+    """
+    return _of_outer(poses.flatten(-2) @ _constant("pose", poses.dtype, poses.device))
+
+
+def _of_outer(flat: Tensor) -> Tensor:
+    """The quaternion q with real part non-negative, from the 16 entries of ``4 q q^T``."""
+    outer = flat.unflatten(-1, (4, 4))
+    # the column of the symmetric matrix that belongs to the largest entry of q
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True).unsqueeze(-1)
+    q = outer.gather(-1, largest.expand(*outer.shape[:-1], 1)).squeeze(-1)
+    norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)
+    return q / torch.copysign(norm, q.narrow(-1, 0, 1))

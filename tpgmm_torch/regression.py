@@ -3,13 +3,14 @@
 Every component of every operator is first conditioned on time, which commutes with the affine
 map (1) and with the product (2) and does not depend on the robot; what is left to do at each
 tick is to linearise the operators at q_{t-1}, to project the conditionals, to fuse them, and to
-mix the components (DESIGN 4.2, 4.3).
+mix the components.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -17,10 +18,13 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.local_mixtures import LocalMixture
 from tpgmm_torch.operators import Linearization, Operator
+from tpgmm_torch.task_update import Tables, TaskUpdate
 from tpgmm_torch.trajectories import Candidate
+from tpgmm_torch.windows import Windows
 
-__all__ = ["Estimate", "LocalMixture", "Regression"]
+__all__ = ["Estimate", "Regression"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,41 +49,6 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class LocalMixture:
-    """The K local Gaussians of one operator, conditioned on time.
-
-    Parameters
-    ----------
-    mean, gain : Tensor of shape (K, D)
-        ``E[x | t] = mean + gain (t - time_mean)``.
-    covariance : Tensor of shape (K, D, D)
-        Of the local coordinates given time.
-    time_mean, time_variance : Tensor of shape (K,)
-        The components' time marginal [s], [s^2].
-    """
-
-    mean: Tensor
-    gain: Tensor
-    covariance: Tensor
-    time_mean: Tensor
-    time_variance: Tensor
-
-    @classmethod
-    def of(cls, means: Tensor, covariances: Tensor) -> LocalMixture:
-        """Condition on the first coordinate: shapes (K, 1 + D) and (K, 1 + D, 1 + D)."""
-        gain, covariance = gaussians.condition(means, covariances, 1)
-        return cls(means[:, 1:], gain[..., 0], covariance, means[:, 0], covariances[:, 0, 0])
-
-    def select(self, components: Tensor) -> LocalMixture:
-        """Only some of the components."""
-        return LocalMixture(*(getattr(self, name)[components] for name in self.__annotations__))
-
-    def at(self, time: Tensor) -> Tensor:
-        """Conditional means at times of shape (...): a tensor of shape (..., K, D)."""
-        return self.mean + self.gain * (time[..., None] - self.time_mean)[..., None]
-
-
-@dataclass(frozen=True, eq=False)
 class Regression:
     """A fitted mixture, ready to be asked for joint references.
 
@@ -99,7 +68,9 @@ class Regression:
         Standard deviation of the prior N(q_{t-1}, .) that closes the information form where
         no operator determines every joint [rad].
     negligible : float
-        Components with a smaller weight are left out; 0 keeps all.
+        Components with less than that share of the largest weight are left out: the mean moves
+        by at most the weight left out times how far apart the components' means are. 0 keeps
+        all.
     """
 
     kinematics: Kinematics
@@ -124,34 +95,15 @@ class Regression:
 
         ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
         """
-        n_components = len(self.log_weights)
-        active = torch.arange(n_components, device=time.device)
-        log_h = self._time_activation(time) if self.activation == "time" else None
-        if log_h is not None and time.ndim == 0 and self.negligible > 0:
-            h = log_h.exp()
-            active = torch.nonzero(h >= h.max().clamp(max=self.negligible))[:, 0]
-            log_h = torch.log_softmax(log_h[active], dim=-1)
-        projections = [
-            self._project(operator, mixture.select(active), time, state, frames)
-            for operator, mixture in zip(self.operators, self.mixtures, strict=True)
-        ]
-        closed = projections
-        if self.fusion == "covariance":
-            closed = [p.in_joint_space(self.epsilon) for p in projections]
-        precision, vector, square = self._sum(closed, state)
-        if log_h is None:
-            log_h = self._product_activation(time, active, precision, vector, square)
-        step, covariances = gaussians.from_information(precision, vector[..., 0])
-        weights = log_h.exp()
-        mean, covariance = gaussians.moment_match(weights, step, covariances)
-        activation = weights
-        if len(active) < n_components:
-            activation = weights.new_zeros(*weights.shape[:-1], n_components)
-            activation[..., active] = weights
+        if self._update is None:
+            joints, covariance, activation = self._fused(time, state, frames)
+        else:
+            joints, covariance, activation = self._update(self._tables, time, state, frames)
         alone: tuple[Candidate, ...] = ()
         if candidates:
-            alone = _candidates(projections, weights, state.joints)
-        joints = state.joints + mean
+            active = self._active(time)
+            projections = self._projections(active, time, state, frames)
+            alone = _candidates(projections, activation[..., active], state.joints)
         if bounds is not None:
             joints = _within(joints, covariance, *bounds)
         return Estimate(joints, covariance, activation, alone)
@@ -168,8 +120,84 @@ class Regression:
         log_h = self.log_weights - 0.5 * (apart + mixture.time_variance.log())
         return torch.log_softmax(log_h, dim=-1)
 
+    @cached_property
+    def _update(self) -> TaskUpdate | None:
+        """The update of a prior over the joints, where that is what is asked for."""
+        usual = self.fusion == "information" and self.activation == "time"
+        if not usual or not TaskUpdate.serves(self.operators, self.kinematics):
+            return None
+        # what is made while inference mode is on could not serve where gradients are wanted
+        with torch.inference_mode(False):
+            return TaskUpdate(self.kinematics, self.operators, self.mixtures, self.log_weights)
+
+    @cached_property
+    def _windows(self) -> Windows:
+        time = self.mixtures[0]
+        return Windows(self.log_weights, time.time_mean, time.time_variance, self.negligible)
+
+    @cached_property
+    def _selected(self) -> dict[tuple[int, ...], Tables]:
+        return {}
+
+    def _active(self, time: Tensor) -> tuple[int, ...]:
+        """Components that count at one instant, or from the first to the last of several."""
+        every = tuple(range(len(self.log_weights)))
+        if self.activation != "time" or self.negligible == 0 or len(every) == 1:
+            return every
+        if time.ndim == 0:
+            return self._windows.at(time.detach().item())
+        learning = self.log_weights.requires_grad or self.mixtures[0].mean.requires_grad
+        if learning or time.numel() == 0:  # windows would cost more than they save
+            return every
+        return self._windows.between(*(float(bound) for bound in time.detach().aminmax()))
+
+    def _tables(self, time: Tensor) -> Tables:
+        """Of the components that count."""
+        assert self._update is not None
+        active = self._active(time)
+        if active not in self._selected:
+            with torch.inference_mode(False):
+                self._selected[active] = self._update.tables.select(active)
+        return self._selected[active]
+
+    def _fused(
+        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Eq. (2) for operators of any kind, in the form and with the weights asked for."""
+        active = self._active(time)
+        projections = self._projections(active, time, state, frames)
+        if self.fusion == "covariance":
+            projections = [p.in_joint_space(self.epsilon) for p in projections]
+        precision, vector, square = self._sum(projections, state)
+        if self.activation == "time":
+            log_h = torch.log_softmax(self._time_activation(time)[..., active], dim=-1)
+        else:
+            log_h = self._product_activation(time, precision, vector, square)
+        step, covariances = gaussians.from_information(precision, vector[..., 0])
+        weights = log_h.exp()
+        mean, covariance = gaussians.moment_match(weights, step, covariances)
+        activation = weights.new_zeros(*weights.shape[:-1], len(self.log_weights))
+        activation[..., active] = weights
+        return state.joints + mean, covariance, activation
+
+    def _projections(
+        self,
+        active: tuple[int, ...],
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+    ) -> list[_Projection]:
+        mixtures = self.mixtures
+        if len(active) < len(self.log_weights):
+            index = torch.tensor(active, device=time.device)
+            mixtures = [mixture.select(index) for mixture in mixtures]
+        return [
+            self._project(operator, mixture, time, state, frames)
+            for operator, mixture in zip(self.operators, mixtures, strict=True)
+        ]
+
     def _product_activation(
-        self, time: Tensor, active: Tensor, precision: Tensor, vector: Tensor, square: Tensor
+        self, time: Tensor, precision: Tensor, vector: Tensor, square: Tensor
     ) -> Tensor:
         """``log h_i(t)`` from the time marginal of the product, eq. (2)'s own.
 
@@ -181,10 +209,10 @@ class Regression:
         disagreement = square - white.mT @ white
         slope, curvature = disagreement[..., 0, 1], disagreement[..., 1, 1]
         for mixture in self.mixtures:
-            apart = time[..., None] - mixture.time_mean[active]
-            slope = slope + apart / mixture.time_variance[active]
-            curvature = curvature + 1 / mixture.time_variance[active]
-        log_h = self.log_weights[active] + 0.5 * (curvature.log() - slope.square() / curvature)
+            apart = time[..., None] - mixture.time_mean
+            slope = slope + apart / mixture.time_variance
+            curvature = curvature + 1 / mixture.time_variance
+        log_h = self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
         return torch.log_softmax(log_h, dim=-1)
 
     def _project(
@@ -239,19 +267,29 @@ def _within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> T
     from where they are wanted. A joint that is driven over a bound by that joins the ones that
     stand, until none is left.
     """
-    joints, standing = mean, torch.zeros_like(mean, dtype=torch.bool)
+    kept = torch.clamp(mean, lower, upper)
+    if torch.equal(kept, mean):
+        return mean
+    lower, upper = lower.expand_as(mean), upper.expand_as(mean)
+    some = (kept != mean).any(-1)  # of a batch, only these robots
+    means, lowers, uppers = mean[some], lower[some], upper[some]
+    precision = torch.cholesky_inverse(
+        gaussians.cholesky(covariance.expand(*mean.shape, -1)[some], "the product")
+    )
+    joints, standing = means, torch.zeros_like(means, dtype=torch.bool)
     # bounds that contradict each other, of a robot that stands outside, end the loop too
-    while bool((beyond := ~standing & ((joints < lower) | (joints > upper))).any()):
+    while bool((beyond := ~standing & ((joints < lowers) | (joints > uppers))).any()):
         standing = standing | beyond
-        limit = torch.minimum(torch.maximum(joints, lower), upper)
-        precision = torch.cholesky_inverse(gaussians.cholesky(covariance, "the product"))
+        limit = torch.clamp(joints, lowers, uppers)
         # a joint that stands is known this many times better than the product knows it
         weight = torch.where(standing, 1e10 * precision.diagonal(dim1=-2, dim2=-1), 0.0)
-        pull = (weight * (limit - mean))[..., None]
+        pull = (weight * (limit - means))[..., None]
         factor = gaussians.cholesky(precision + torch.diag_embed(weight), "the product")
-        free = mean + torch.cholesky_solve(pull, factor)[..., 0]
+        free = means + torch.cholesky_solve(pull, factor)[..., 0]
         joints = torch.where(standing, limit, free)
-    return joints
+    whole = mean.clone()
+    whole[some] = joints
+    return whole
 
 
 def _hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:

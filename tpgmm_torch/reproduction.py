@@ -16,8 +16,9 @@ from tpgmm_torch.demonstrations import Demonstration, Situation
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.frames import Frame, as_tensor
 from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.local_mixtures import LocalMixture
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.regression import Estimate, LocalMixture, Regression
+from tpgmm_torch.regression import Estimate, Regression
 from tpgmm_torch.rollout import Synthesis, rollout
 from tpgmm_torch.trajectories import Trajectory
 

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.forward_kinematics import TreeKinematics
 from tpgmm_torch.frames import Frame, as_tensor
 from tpgmm_torch.kinematics import Kinematics, RobotState, dtype_name, dtype_named
-from tpgmm_torch.trees import MovingTree, reduce
+from tpgmm_torch.trees import reduce
 from tpgmm_torch.urdf import UrdfModel, read_urdf
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
@@ -27,7 +28,7 @@ __all__ = ["Kinematics", "Robot", "RobotState"]
 class Robot(Kinematics):
     """A robot described by a URDF; made by :meth:`from_urdf`.
 
-    All links come from one pass through the tree (pytorch-kinematics), so that arms which
+    All links come from one pass through the tree, so that arms which
     share a waist share its columns in the stacked Jacobian. Two robots are equal if their
     descriptions and settings are; the device does not count.
     """
@@ -130,34 +131,7 @@ class Robot(Kinematics):
         with torch.inference_mode(False), torch.device("cpu"):
             limits = _limits(model, self.joint_names).to(**options)
             self.lower, self.upper, self.velocity = limits
-            self._build(tree, options)
-
-    def _build(self, tree: MovingTree, options: dict[str, Any]) -> None:
-        """Constants of :meth:`state`; their rows are in the chain's order of joints."""
-        self._chain = _chain(tree).to(**options)
-        order = [int(name) for name in self._chain.get_joint_parameter_names()]
-        frames = [tree.frames[index] for index in order]
-        place = {int(name): index for name, index in self._chain.frame_to_idx.items()}
-        follow = np.zeros((len(frames), self.n_joints))
-        twist = np.zeros((len(frames), 3, 2))
-        moved = np.zeros((len(self.links), len(frames), 1))
-        for row, frame in enumerate(frames):
-            follow[row, frame.joint] = frame.multiplier
-            twist[row, :, 0 if frame.prismatic else 1] = frame.axis
-            for link, attachment in enumerate(tree.links):
-                moved[link, row] = order[row] in tree.moved_by(attachment.frame)
-        shift = np.array([frame.shift for frame in frames])
-        poses = np.array([link.pose for link in tree.links]).reshape(-1, 1, 4, 4)
-        # chain joints = follow q + shift: the order, mimicry, and coordinates left out
-        self._follow = torch.from_numpy(follow.T).to(**options)  # (n, m)
-        self._shift = torch.from_numpy(shift).to(**options)  # (m,)
-        # from twists of the chain's joints to columns of the joint vector, link by link
-        self._columns = torch.from_numpy(moved * follow).to(**options)  # (L, m, n)
-        self._twist = torch.from_numpy(twist).to(**options)  # (m, 3, 2): slide, turn
-        self._tool = torch.from_numpy(poses).to(**options)  # (L, 1, 4, 4)
-        index: dict[str, Any] = {"dtype": torch.long, "device": options["device"]}
-        self._joint_frames = torch.tensor([place[i] for i in order], **index)
-        self._link_frames = torch.tensor([place[link.frame] for link in tree.links], **index)
+            self._kinematics = TreeKinematics(tree, self.n_joints, **options)
 
     def state(self, joints: Any) -> RobotState:
         """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
@@ -169,25 +143,11 @@ class Robot(Kinematics):
         """
         joints = self.joint_tensor(joints)
         batch = joints.shape[:-1]
+        if len(batch) == 1:
+            return RobotState(joints, self.links, *self._kinematics(joints))
         rows = joints.reshape(batch.numel(), self.n_joints)
-        chain_joints = torch.addmm(self._shift, rows, self._follow)
-        # the analytical gradient of the library is silently wrong at second order
-        frames = self._chain.forward_kinematics_tensor(chain_joints, analytical_grad=False)
-        poses = (frames[self._link_frames] @ self._tool).transpose(0, 1)  # (B, L, 4, 4)
-        moving = frames[self._joint_frames].transpose(0, 1)  # (B, m, 4, 4)
-        slide, turn = (moving[..., :3, :3] @ self._twist)[:, None].unbind(-1)  # (B, 1, m, 3)
-        lever = poses[:, :, None, :3, 3] - moving[:, None, :, :3, 3]  # (B, L, m, 3)
-        linear = slide + torch.linalg.cross(turn, lever)
-        twists = torch.cat((linear, turn.expand_as(linear)), dim=-1)
-        jacobians = twists.mT @ self._columns  # (B, L, 6, n)
-        shape = (*batch, len(self.links))
-        return RobotState(
-            joints,
-            self.links,
-            poses[..., :3, 3].reshape(*shape, 3),
-            quaternions.from_matrix(poses[..., :3, :3]).reshape(*shape, 4),
-            jacobians.reshape(*shape, 6, self.n_joints),
-        )
+        poses = (part.reshape(batch + part.shape[1:]) for part in self._kinematics(rows))
+        return RobotState(joints, self.links, *poses)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
@@ -321,29 +281,3 @@ def _limits(model: UrdfModel, names: Sequence[str]) -> Tensor:
     joints = [model.joint.get(name) for name in names]
     rows = [free if j is None else (j.lower, j.upper, j.velocity) for j in joints]
     return torch.tensor(rows, dtype=torch.float64, device="cpu").reshape(-1, 3).T
-
-
-def _chain(tree: MovingTree) -> Any:
-    """The tree for pytorch-kinematics; its names are indices of moving frames, -1 the base."""
-    try:
-        import pytorch_kinematics as pk
-        from pytorch_kinematics.frame import Frame as ChainFrame
-        from pytorch_kinematics.frame import Joint
-    except ImportError as error:
-        raise DependencyError(
-            "Robot needs pytorch-kinematics: pip install 'tpgmm-torch[robots]'"
-        ) from error
-    exact = {"dtype": torch.float64, "device": "cpu"}
-    chain = [ChainFrame("-1")]
-    for index, frame in enumerate(tree.frames):
-        offset = torch.from_numpy(frame.offset)
-        joint = Joint(
-            str(index),
-            offset=pk.Transform3d(matrix=offset[None], **exact),
-            joint_type="prismatic" if frame.prismatic else "revolute",
-            axis=torch.from_numpy(frame.axis),
-            **exact,
-        )
-        chain.append(ChainFrame(str(index), joint=joint))
-        chain[frame.parent + 1].children.append(chain[-1])
-    return pk.Chain(chain[0], **exact)

@@ -3,10 +3,10 @@
 Both hold, for every component and block, ``sum_n gamma (y; 1) (y; 1)^T`` in the whitened
 coordinates of the present mixture: mass, mean and scatter together, summed in float64.
 
-:class:`WhitenedStatistics` whitens the points for each component. It loses no digits however
-narrow a component is. :class:`PackedStatistics` expands each point once, for all components,
-into the products of its coordinates, whereupon densities and moments are one matrix product
-each; its densities lose as many digits as the squared precision of a component has.
+:class:`WhitenedStatistics` whitens the points for each component, and loses as many digits
+as the components are narrower than the data. :class:`PackedStatistics` expands each point
+once, for all components, into the products of its coordinates, whereupon densities and
+moments are one matrix product each; it loses twice as many.
 """
 
 from collections.abc import Sequence
@@ -15,19 +15,27 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from tpgmm_torch.block_gaussians import Chunk, Parameters, Whitener
+from tpgmm_torch.block_gaussians import Chunk, Whitener
 
-__all__ = ["PackedStatistics", "Statistics", "WhitenedStatistics", "statistics"]
+__all__ = ["PackedStatistics", "Statistics", "WhitenedStatistics", "packs"]
 
 #: The packed form is taken below this trace of the precision of a component, in standardised
-#: units: its log-densities are then off by about 1e-8 at most ...
-SHARPEST = 1e8
+#: units: its log-densities are then off by about 1e-9 at most ...
+SHARPEST = 1e7
 
 #: ... and from this number of points on: fewer gain nothing worth a digit.
 MANY_POINTS = 4096
 
 #: By how much a mean log-density may be off, relative to 1 and to itself.
 ROUNDING = {torch.float64: 2e-13, torch.float32: 1e-5}
+
+
+#: Up to so many numbers, products of coordinates are kept from pass to pass.
+MOST_KEPT = 2**23
+
+#: So many rows at a time are multiplied with those after them: more is fewer calls, but more
+#: products that repeat others.
+STRIDE = 4
 
 
 class Statistics(Protocol):
@@ -37,22 +45,35 @@ class Statistics(Protocol):
     ----------
     rounding : float
         By how much a mean log-density may be off, relative to 1 and to itself.
+    sums : tuple of Tensor
+        What was gathered, in float64; to be added to those of other processes.
     """
 
     rounding: float
+    sums: tuple[Tensor, ...]
 
-    def joint(self, chunk: Chunk) -> Tensor:
-        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (K, n)."""
+    def load(self, index: int, chunk: Chunk) -> None:
+        """Turn to the chunk with this number."""
 
-    def gather(self, responsibilities: Tensor) -> None:
-        """Add the chunk given last, with responsibilities (K, n) that may be overwritten."""
+    def joint(self, components: Tensor | None) -> Tensor:
+        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (A, n).
 
-    def moments(self) -> tuple[Tensor, ...]:
-        """The sums per block, shape (K, D_j + 1, D_j + 1)."""
+        Of the given components (A,), or of all where they are None.
+        """
+
+    def gather(self, responsibilities: Tensor, components: Tensor | None) -> None:
+        """Add the chunk, with the responsibilities (A, n) of the components given last."""
+
+    def moments(self, *sums: Tensor) -> tuple[Tensor, ...]:
+        """The moments per block, shape (K, D_j + 1, D_j + 1), from (combined) sums."""
 
 
 class WhitenedStatistics:
     """Moments taken in whitened coordinates; see the module.
+
+    What is summed is ``gamma (y; 1) (x; 1)^T``: the factors on the right are common to all
+    components, so that one matrix product serves them all, and the second factor is whitened
+    when all points have been summed.
 
     Parameters
     ----------
@@ -64,101 +85,205 @@ class WhitenedStatistics:
     def __init__(self, whitener: Whitener, dtype: torch.dtype) -> None:
         self.rounding = ROUNDING[dtype]
         self._whitener = whitener
-        self._sums = tuple(torch.zeros_like(whitener) for whitener in whitener.maps)
-        self._whitened: Chunk = ()
+        self._maps = [whitening.to(dtype) for whitening in whitener.maps]
+        self._constant = whitener.constant.to(dtype)[:, None]
+        self.sums: tuple[Tensor, ...] = tuple(
+            torch.zeros_like(whitening) for whitening in whitener.maps
+        )
+        self._chunk: Chunk = ()
+        self._whitened: list[Tensor] = []
 
-    def joint(self, chunk: Chunk) -> Tensor:
-        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (K, n)."""
-        joint, self._whitened = self._whitener(chunk)
+    def load(self, index: int, chunk: Chunk) -> None:
+        """Turn to the chunk with this number."""
+        self._chunk = chunk
+
+    def joint(self, components: Tensor | None) -> Tensor:
+        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (A, n)."""
+        joint = _chosen(self._constant, components)
+        self._whitened = []
+        for maps, x in zip(self._maps, self._chunk, strict=True):
+            chosen = _chosen(maps, components)
+            y = (chosen.view(-1, len(x)) @ x).view(len(chosen), len(x), -1)
+            joint = torch.sub(joint, y.square().sum(1), alpha=0.5)
+            self._whitened.append(y)
         return joint
 
-    def gather(self, responsibilities: Tensor) -> None:
-        """Add the chunk given last, with responsibilities (K, n), which are overwritten."""
-        roots = responsibilities.sqrt_()[:, None]
-        for total, y in zip(self._sums, self._whitened, strict=True):
-            y.mul_(roots)
-            total += torch.bmm(y, y.mT)
+    def gather(self, responsibilities: Tensor, components: Tensor | None) -> None:
+        """Add the chunk, with the responsibilities (A, n) of the components given last."""
+        for total, y, x in zip(self.sums, self._whitened, self._chunk, strict=True):
+            y.mul_(responsibilities[:, None])
+            part = y.view(-1, y.shape[2]) @ x.T
+            _add(total, part.view(len(y), len(x), len(x)).double(), components, dim=0)
 
-    def moments(self) -> tuple[Tensor, ...]:
-        """The sums per block, shape (K, D_j + 1, D_j + 1)."""
-        return self._sums
+    def moments(self, *sums: Tensor) -> tuple[Tensor, ...]:
+        """The moments per block, shape (K, D_j + 1, D_j + 1), from (combined) sums."""
+        moments = []
+        for total, exact, used in zip(sums, self._whitener.maps, self._maps, strict=True):
+            if used.dtype != exact.dtype:  # points were whitened by maps that were rounded
+                total = exact @ torch.linalg.solve(used.double(), total)
+            moment = total @ exact.mT
+            moments.append((moment + moment.mT) / 2)
+        return tuple(moments)
+
+
+class Features:
+    """Products ``x_a x_b`` of the coordinates of (x; 1), block by block: phi(x).
+
+    They are kept from pass to pass where the points are few enough.
+
+    Parameters
+    ----------
+    widths : sequence of int
+        D_j of each block.
+    n_points : int
+        Number of points of this process.
+    """
+
+    def __init__(self, widths: Sequence[int], n_points: int) -> None:
+        self.pairs = [_pairs(width + 1) for width in widths]
+        self.count = sum(pairs.shape[1] for pairs in self.pairs)
+        self._keeps = self.count * n_points <= MOST_KEPT
+        self._kept: dict[int, Tensor] = {}
+        self._phi = torch.empty(0)
+        self._points: list[Tensor] = []
+        self._products: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def of(self, index: int, chunk: Chunk) -> Tensor:
+        """Features of the chunk with this number, shape (F, n), valid until the next call."""
+        if index in self._kept:
+            return self._kept[index]
+        n_points = chunk[0].shape[1]
+        if self._keeps or self._phi.shape[-1] != n_points:
+            self._prepare(chunk, n_points)
+        for own, x in zip(self._points, chunk, strict=True):
+            own.copy_(x)
+        for few, many, product in self._products:
+            torch.mul(few, many, out=product)
+        if self._keeps:
+            self._kept[index] = self._phi
+        return self._phi
+
+    def _prepare(self, chunk: Chunk, n_points: int) -> None:
+        """Make room, and the views that need not be made again for each chunk."""
+        self._phi = chunk[0].new_empty(self.count, n_points)
+        self._points = [torch.empty_like(x) for x in chunk]
+        self._products, start = [], 0
+        for x in self._points:
+            for first in range(0, len(x), STRIDE):
+                few, many = x[first : first + STRIDE, None], x[None, first:]
+                end = start + few.shape[0] * many.shape[1]
+                product = self._phi[start:end].view(len(few), -1, n_points)
+                self._products.append((few, many, product))
+                start = end
+
+
+def _pairs(width: int) -> Tensor:
+    """The rows a and b of the products of one block, shape (2, F_j).
+
+    ``STRIDE`` rows at a time are multiplied with all from the first of them on.
+    """
+    return torch.tensor(
+        [
+            (row, column)
+            for first in range(0, width, STRIDE)
+            for row in range(first, min(first + STRIDE, width))
+            for column in range(first, width)
+        ]
+    ).T
 
 
 class PackedStatistics:
     """Moments taken in products of coordinates; see the module.
 
-    ``log(pi_k N_k(x)) = theta_k . phi(x)``, where ``phi`` holds the products ``x_a x_b``,
-    a <= b, of the coordinates of (x; 1), block by block: F numbers.
+    ``log(pi_k N_k(x)) = theta_k . phi(x)``.
 
     Parameters
     ----------
     whitener : Whitener
+    features : Features
     """
 
-    def __init__(self, whitener: Whitener) -> None:
-        self._maps = whitener.maps
-        self._pairs = [
-            torch.triu_indices(m.shape[-1], m.shape[-1], device=m.device) for m in self._maps
-        ]
+    def __init__(self, whitener: Whitener, features: Features) -> None:
+        self._maps, self._features = whitener.maps, features
         coefficients = []
-        for whitening, (row, column) in zip(self._maps, self._pairs, strict=True):
+        for whitening, (row, column) in zip(self._maps, features.pairs, strict=True):
             precision = whitening.mT @ whitening
-            coefficients.append(-precision[:, row, column] * (1 - (row == column) / 2))
+            # half of it on the diagonal; what is below repeats what is above
+            times = (row <= column).to(precision) * (1 - (row == column) / 2)
+            coefficients.append(-precision[:, row, column] * times)
         # the product of the last block's appended 1 with itself is the constant's
         coefficients[-1][:, -1] += whitener.constant
         self._theta = torch.cat(coefficients, 1)  # (K, F)
-        self._sums = torch.zeros_like(self._theta)
         self._phi = self._theta.new_empty(0)
-        self.rounding = max(ROUNDING[torch.float64], 1e-16 * sharpness(whitener))
+        # features first: with components first the product below would copy the features
+        self.sums: tuple[Tensor, ...] = (
+            torch.zeros_like(self._theta.T, memory_format=torch.contiguous_format),
+        )
+        self.rounding = max(ROUNDING[torch.float64], 1e-16 * float(sharpness(whitener).max()))
 
-    def joint(self, chunk: Chunk) -> Tensor:
-        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (K, n)."""
-        n_points = chunk[0].shape[1]
-        if self._phi.shape[-1] != n_points:
-            self._phi = self._theta.new_empty(self._theta.shape[1], n_points)
-        start = 0
-        for x in chunk:
-            for first in range(len(x)):
-                end = start + len(x) - first
-                torch.mul(x[first:], x[first], out=self._phi[start:end])
-                start = end
-        return self._theta @ self._phi
+    def load(self, index: int, chunk: Chunk) -> None:
+        """Turn to a chunk of points: expand them."""
+        self._phi = self._features.of(index, chunk)
 
-    def gather(self, responsibilities: Tensor) -> None:
-        """Add the chunk given last, with responsibilities (K, n)."""
-        self._sums.addmm_(responsibilities, self._phi.T)
+    def joint(self, components: Tensor | None) -> Tensor:
+        """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (A, n)."""
+        return _chosen(self._theta, components) @ self._phi
 
-    def moments(self) -> tuple[Tensor, ...]:
-        """The sums per block, shape (K, D_j + 1, D_j + 1)."""
-        widths = [pairs.shape[1] for pairs in self._pairs]
+    def gather(self, responsibilities: Tensor, components: Tensor | None) -> None:
+        """Add the chunk, with the responsibilities (A, n) of the components given last."""
+        if components is None:
+            self.sums[0].addmm_(self._phi, responsibilities.T)
+        else:
+            _add(self.sums[0], self._phi @ responsibilities.T, components, dim=1)
+
+    def moments(self, *sums: Tensor) -> tuple[Tensor, ...]:
+        """The moments per block, shape (K, D_j + 1, D_j + 1), from (combined) sums."""
+        (packed,) = sums
+        pairs = self._features.pairs
         moments = []
-        for whitening, (row, column), packed in zip(
-            self._maps, self._pairs, torch.split(self._sums, widths, dim=1), strict=True
+        for whitening, (row, column), products in zip(
+            self._maps, pairs, packed.T.split([p.shape[1] for p in pairs], dim=1), strict=True
         ):
             plain = torch.zeros_like(whitening)
-            plain[:, row, column] = packed
-            plain[:, column, row] = packed
+            plain[:, row, column] = products
+            plain[:, column, row] = products
             moments.append(whitening @ plain @ whitening.mT)
         return tuple(moments)
 
 
-def sharpness(whitener: Whitener) -> float:
-    """The largest trace of a precision matrix among the components."""
-    traces = sum(m[:, :-1, :-1].square().sum((1, 2)) for m in whitener.maps)
-    return float(torch.as_tensor(traces).max())
+def _chosen(rows: Tensor, components: Tensor | None) -> Tensor:
+    return rows if components is None else rows.index_select(0, components)
 
 
-def statistics(parameters: Parameters, chunks: Sequence[Chunk]) -> Statistics:
-    """The faster formulation where it is accurate enough, else the accurate one.
+def _add(total: Tensor, part: Tensor, components: Tensor | None, dim: int) -> None:
+    if components is None:
+        total.add_(part)
+    else:
+        total.index_add_(dim, components, part)
+
+
+def sharpness(whitener: Whitener) -> Tensor:
+    """The trace of each component's precision matrix, shape (K,)."""
+    traces = [m[:, :-1, :-1].square().sum((1, 2)) for m in whitener.maps]
+    return torch.stack(traces).sum(0)
+
+
+def packs(whitener: Whitener, n_mixtures: int, n_points: int, dtype: torch.dtype) -> list[bool]:
+    """For which mixtures the packed form is accurate enough, and worth it.
 
     Parameters
     ----------
-    parameters : Parameters
-    chunks : sequence of tuple of Tensor of shape (D_j + 1, n)
+    whitener : Whitener
+        Of several mixtures of equal size, one after the other.
+    n_mixtures : int
+        How many they are.
+    n_points : int
+        Of all processes.
+    dtype : torch.dtype
+        Precision of the points.
     """
-    dtype = chunks[0][0].dtype
-    whitener = Whitener(parameters, dtype)
-    many = sum(chunk[0].shape[1] for chunk in chunks) >= MANY_POINTS
-    if many and dtype == torch.float64 and sharpness(whitener) < SHARPEST:
-        return PackedStatistics(whitener)
-    return WhitenedStatistics(whitener, dtype)
+    if n_points < MANY_POINTS or dtype != torch.float64:
+        return [False] * n_mixtures
+    fits = sharpness(whitener).view(n_mixtures, -1).amax(1) < SHARPEST
+    found: list[bool] = fits.tolist()
+    return found

@@ -3,6 +3,17 @@
 Needs the extra ``data`` (pandas, pyarrow); LeRobot itself is never imported.
 """
 
+from tpgmm_torch.exceptions import DependencyError
+
+try:
+    import pandas  # noqa: F401
+    import pyarrow  # noqa: F401
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        f"data sets need {error.name}: pip install 'tpgmm-torch[data]'"
+    ) from None
+
+from tpgmm_datasets.batches import EpisodeBatches
 from tpgmm_datasets.description import DatasetInfo, describe_lerobot
 from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
 from tpgmm_datasets.poses import FramePose, LinkPose
@@ -17,6 +28,7 @@ __all__ = [
     "DatasetError",
     "DatasetInfo",
     "DatasetWarning",
+    "EpisodeBatches",
     "FramePose",
     "LinkPose",
     "Scale",

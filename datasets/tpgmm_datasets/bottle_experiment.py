@@ -200,7 +200,7 @@ class BottleExperiment:
         return TaskParameterizedGMM(n_components, operators, self.skill.robot)
 
     def _settings(self) -> dict[str, Any]:
-        packages = ("tpgmm-torch", "torch", "numpy", "scikit-learn", "pytorch-kinematics")
+        packages = ("tpgmm-torch", "torch", "numpy", "scikit-learn")
         return {
             "n_components": self.n_components,
             "n_demonstrations": self.n_demonstrations,

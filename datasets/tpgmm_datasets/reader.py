@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tpgmm_datasets.assembly import Assembly, EventSource, FrameSource, frame_sources
-from tpgmm_datasets.episodes import read_episodes, strict_policy
+from tpgmm_datasets.episodes import Policy, read_episodes, strict_policy
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.hub import local_folder
 from tpgmm_datasets.joints import JointColumns, joint_feature
@@ -15,7 +16,7 @@ from tpgmm_datasets.layout import Episode, Layout, open_layout
 from tpgmm_datasets.units import Units
 from tpgmm_torch.demonstrations import Demonstration
 
-__all__ = ["iter_lerobot", "load_lerobot"]
+__all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 
 
 def load_lerobot(
@@ -142,6 +143,73 @@ def iter_lerobot(
     DatasetError
         As :func:`load_lerobot`.
     """
+    recording = open_recording(
+        path,
+        robot=robot,
+        joints=joints,
+        joint_names=joint_names,
+        units=units,
+        frames=frames,
+        events=events,
+        episodes=episodes,
+        rate=rate,
+        trim=trim,
+        relax=relax,
+    )
+    return recording.demonstrations()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A data set that was opened: its metadata are checked, its rows are not yet read.
+
+    Parameters
+    ----------
+    episodes : tuple of Episode
+        Which are wanted, in order.
+    assembly : Assembly
+        What a demonstration is made of.
+    policy : callable
+        What is done with a problem.
+    """
+
+    episodes: tuple[Episode, ...]
+    assembly: Assembly
+    policy: Policy
+
+    def demonstrations(self) -> Iterator[Demonstration]:
+        """Read the wanted episodes, one when it is asked for."""
+        layout, features = self.assembly.layout, self.assembly.features
+        rows = read_episodes(layout, self.episodes, features, self.policy)
+        return map(self.assembly.demonstration, rows)
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    robot: Any = None,
+    joints: str | None = None,
+    joint_names: Mapping[str, str] | Sequence[str] | None = None,
+    units: Units = "auto",
+    frames: Mapping[str, FrameSource] | None = None,
+    events: Mapping[str, EventSource] | None = None,
+    episodes: slice | Sequence[int] | str | None = None,
+    rate: float | None = None,
+    trim: float | None = None,
+    relax: Collection[str] = (),
+) -> Recording:
+    """Check the metadata of a data set, and find out how to read it.
+
+    Parameters
+    ----------
+    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
+        As for :func:`load_lerobot`.
+
+    Raises
+    ------
+    DatasetError
+        As :func:`load_lerobot`.
+    """
     policy = strict_policy(relax)
     layout = open_layout(local_folder(path))
     for problem in layout.problems:
@@ -156,9 +224,7 @@ def iter_lerobot(
         rate,
         trim,
     )
-    wanted = select_episodes(layout, episodes)
-    rows = read_episodes(layout, wanted, assembly.features, policy)
-    return map(assembly.demonstration, rows)
+    return Recording(tuple(select_episodes(layout, episodes)), assembly, policy)
 
 
 def select_episodes(

@@ -11,11 +11,11 @@ from sphinx.util.docutils import SphinxDirective
 
 __all__ = ["Report", "setup"]
 
-INCLUDE = "```{{include}} {0}\n:relative-images:\n:relative-docs: {1}\n```"
+INCLUDE = "```{{include}} {0}\n:heading-offset: 1\n:relative-images:\n:relative-docs: {1}\n```"
 
 
 class Report(SphinxDirective):
-    """The contents of the file, with its pictures and links."""
+    """The contents of the file, with its pictures and links, one heading deeper."""
 
     required_arguments = 1
 

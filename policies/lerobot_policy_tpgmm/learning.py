@@ -27,7 +27,7 @@ from lerobot_policy_tpgmm.losses import (
 )
 from lerobot_policy_tpgmm.recorder import EpochRecorder, episode_ranges, located
 from tpgmm_torch import Demonstration, Kinematics
-from tpgmm_torch.block_gaussians import Standardization
+from tpgmm_torch.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.local_data import local_data
 from tpgmm_torch.retiming import Alignment
@@ -157,8 +157,9 @@ class Learner:
         model = policy.config.estimator(kinematics, policy.operators)
         widths = [mean.shape[1] for mean in policy.mixture.means]
         isotropic = model.covariance_type == "spherical"
-        units = Standardization.of_data(points, widths, isotropic=isotropic)
-        shares = model._regularization(points, policy.operators, kinematics)
+        moments = ColumnMoments.of(points)
+        units = moments.standardization(widths, isotropic=isotropic)
+        shares = model._regularization(moments, policy.operators, kinematics)
         added = torch.from_numpy(shares) * torch.cat(units.scales).square()
         return list(added.to(policy.mixture.time).split(widths))
 

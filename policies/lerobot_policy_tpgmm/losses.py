@@ -12,7 +12,8 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.parameters import MixtureParameters
 from tpgmm_torch import Frame, Kinematics, Operator, RobotState
-from tpgmm_torch.regression import LocalMixture, Regression
+from tpgmm_torch.local_mixtures import LocalMixture
+from tpgmm_torch.regression import Regression
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
 

@@ -11,14 +11,14 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 __all__ = ["explain"]
 
 #: Each entry point is a typer app or a function, added under its name.
 ENTRY_POINTS = "tpgmm.commands"
 #: Packages that come with the extra ``cli``.
-OPTIONAL = ("dtaidistance", "matplotlib", "pandas", "pyarrow", "pytorch_kinematics")
+OPTIONAL = ("dtaidistance", "matplotlib", "pandas", "pyarrow")
 
 
 class Commands(TyperGroup):
@@ -63,18 +63,20 @@ class Commands(TyperGroup):
         return [*own, *sorted(set(_plugins()) - set(own))]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """A command by name; a plugin is imported only now."""
+        """A command by name; of a plugin's, which may take long to import, only the name."""
         own = super().get_command(ctx, cmd_name)
         if own is not None or cmd_name not in _plugins():
             return own
-        try:
-            return _command(cmd_name, _plugins()[cmd_name].load())
-        except Exception as error:  # whatever is wrong with it, the others must work
-            _say(
-                f"warning: the command {cmd_name!r} of a plugin cannot be loaded: "
-                f"{type(error).__name__}: {error}"
-            )
-            return None
+        plugin = _plugins()[cmd_name]
+        origin = plugin.dist.name if plugin.dist else plugin.module
+        return TyperCommand(cmd_name, help=f"A command of {origin}: tpgmm {cmd_name} --help")
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is about to run; now a plugin is imported."""
+        name = args[0]
+        if name in set(_plugins()) - set(super().list_commands(ctx)):
+            self.add_command(_loaded(_plugins()[name]))
+        return super().resolve_command(ctx, args)
 
 
 def explain(error: Exception) -> str | None:
@@ -121,12 +123,21 @@ def _plugins() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
 
 
-def _command(name: str, found: Any) -> Any:
-    if not isinstance(found, typer.Typer):
-        if not callable(found):
-            raise TypeError(f"it is {found!r}, not a typer app or a function")
-        function, found = found, typer.Typer(add_completion=False)
-        found.command(name)(function)
-    command = typer.main.get_command(found)
-    command.name = name
+def _loaded(plugin: EntryPoint) -> Any:
+    from tpgmm_torch.exceptions import DependencyError
+
+    try:
+        found = plugin.load()
+        if not isinstance(found, typer.Typer):
+            if not callable(found):
+                raise TypeError(f"it is {found!r}, not a typer app or a function")
+            function, found = found, typer.Typer(add_completion=False)
+            found.command(plugin.name)(function)
+        command = typer.main.get_command(found)
+    except Exception as error:  # whatever is wrong with it
+        raise DependencyError(
+            f"the command {plugin.name!r} of a plugin cannot be loaded: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    command.name = plugin.name
     return command

@@ -58,6 +58,16 @@ def fit(
     joints: options.Joints = None,
     rate: options.Rate = None,
     alignment: options.AlignmentMethod = "dtw",
+    batch_episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            rich_help_panel=options.DATA,
+            help="For sets larger than memory: read so many episodes at a time. The first N "
+            "decide on the common clock. Default: all at once.",
+        ),
+    ] = None,
     operator: Annotated[
         list[str] | None,
         typer.Option(
@@ -113,6 +123,21 @@ def fit(
     random_state: Annotated[
         int, typer.Option(rich_help_panel=LEARNING, help="Seed of what is random.")
     ] = 0,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            rich_help_panel=LEARNING,
+            help="Keep the state of EM there, and go on from it if it is of the same data and "
+            "settings.",
+        ),
+    ] = None,
+    checkpoint_every: Annotated[
+        int,
+        typer.Option(
+            min=1, rich_help_panel=LEARNING, help="Iterations from one state kept to the next."
+        ),
+    ] = 10,
     fusion: Annotated[
         Literal["information", "covariance"],
         typer.Option(
@@ -145,37 +170,45 @@ def fit(
 
     Episodes are aligned in time, described by operators (links seen from frames, and joints),
     and learned as one Gaussian mixture over all of them. The model is a folder of JSON and
-    safetensors that 'tpgmm reproduce' and 'tpgmm plot' take.
+    safetensors that 'tpgmm reproduce' and 'tpgmm plot' take. Several processes learn together
+    under torchrun.
     """
     from tpgmm_datasets.signals import Signals
+    from tpgmm_torch.checkpoints import Checkpoint
+    from tpgmm_torch.cli.training_data import read_training_data
+    from tpgmm_torch.distributed import joined_processes
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = writer(output_format)
     operators = [parse_operator(text) for text in operator or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
-    read = options.read_demonstrations(
-        dataset, kinematics, frame, episodes, units, joints, rate
-    )
-    demonstrations = options.align(read, alignment, kinematics)
+    reading = options.reading_options(kinematics, frame, episodes, units, joints, rate)
     links = kinematics.links if kinematics is not None else ()
-    model = TaskParameterizedGMM(
-        n_components,
-        operators or default_operators(links, list(read[0].frames)),
-        kinematics,
-        covariance_type=covariance_type,
-        reg_covar=reg_covar,
-        tol=tol,
-        max_iter=max_iter,
-        n_init=n_init,
-        init_params=init_params,
-        responsibilities=responsibilities,
-        random_state=random_state,
-        fusion=fusion,
-        activation=activation,
-        epsilon=epsilon,
-        blend=blend,
-    ).fit(demonstrations)
+    state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)
+    kept = 0 if state is None else state.n_iter()
+    with joined_processes() as processes:
+        data = read_training_data(dataset, reading, alignment, batch_episodes, processes)
+        model = TaskParameterizedGMM(
+            n_components,
+            operators or default_operators(links, list(data.frames)),
+            kinematics,
+            covariance_type=covariance_type,
+            reg_covar=reg_covar,
+            tol=tol,
+            max_iter=max_iter,
+            n_init=n_init,
+            init_params=init_params,
+            responsibilities=responsibilities,
+            random_state=random_state,
+            fusion=fusion,
+            activation=activation,
+            epsilon=epsilon,
+            blend=blend,
+        ).fit(data.source, checkpoint=state, processes=processes)
+        durations, steps = data.summary(processes)
+        if processes.rank > 0:
+            return
     if write is None:
         model.save(out)
     else:
@@ -183,29 +216,32 @@ def fit(
             dataset,
             kinematics,
             joints=joints,
-            units=options.parse_units(units or ()),
-            frames=options.parse_frames(frame or ()),
+            units=reading["units"],
+            frames=reading["frames"],
             rate=rate,
         )
         write(model, out, signals)
-    _report(model, read, demonstrations)
+    _report(model, durations, steps, data.aligned)
+    if kept:
+        typer.echo(f"resumed          {checkpoint}, after {kept} iterations")
+    if processes.count > 1:
+        typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
 
 
 def _report(
     model: TaskParameterizedGMM,
-    read: Sequence[Demonstration],
+    durations: Sequence[float],
+    steps: int,
     aligned: Sequence[Demonstration],
 ) -> None:
     from tpgmm_torch.operators.text import format_operator
 
-    durations = [demonstration.duration for demonstration in read]
-    steps = sum(map(len, aligned))
     kinematics = model.kinematics_
     converged = "converged" if model.converged_ else "not converged: raise --max-iter or --tol"
     lines = {
-        "demonstrations": f"{len(read)} of {min(durations):.2f} to {max(durations):.2f} s, "
-        f"{steps} steps after alignment",
+        "demonstrations": f"{len(durations)} of {min(durations):.2f} to "
+        f"{max(durations):.2f} s, {steps} steps after alignment",
         "joints": f"{kinematics.n_joints}",
         "links": ", ".join(kinematics.links) or "none",
         "frames": ", ".join(model.frame_names_) or "none",
@@ -216,8 +252,11 @@ def _report(
     lines |= {
         "components": f"{model.n_components} ({model.covariance_type})",
         "iterations": f"{model.n_iter_}, {converged}",
-        "log-likelihood": f"{model.score(aligned):.3f} per step",
-        "BIC": f"{model.bic(aligned):.0f}",
     }
+    if aligned:
+        lines["log-likelihood"] = f"{model.score(aligned):.3f} per step"
+        lines["BIC"] = f"{model.bic(aligned):.0f}"
+    else:  # they are on disk, and would have to be read once more
+        lines["bound of EM"] = f"{model.lower_bound_:.3f} per step"
     for name, value in lines.items():
         typer.echo(f"{name:<16} {value}")

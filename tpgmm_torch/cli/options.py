@@ -13,14 +13,17 @@ import typer
 if TYPE_CHECKING:
     from tpgmm_torch.demonstrations import Demonstration
     from tpgmm_torch.kinematics import Kinematics
+    from tpgmm_torch.retiming import Alignment
 
 __all__ = [
     "align",
+    "aligner",
     "parse_episodes",
     "parse_frames",
     "parse_units",
     "read_demonstrations",
     "read_robot",
+    "reading_options",
 ]
 
 DATA, ROBOT = "Data set", "Robot"
@@ -135,14 +138,33 @@ def read_demonstrations(
     from tpgmm_datasets import load_lerobot
 
     return load_lerobot(
-        dataset,
-        robot=robot,
-        frames=parse_frames(frames or ()),
-        episodes=parse_episodes(episodes),
-        units=parse_units(units or ()),
-        joints=joints,
-        rate=rate,
+        dataset, **reading_options(robot, frames, episodes, units, joints, rate)
     )
+
+
+def reading_options(
+    robot: Kinematics | None,
+    frames: Sequence[str] | None,
+    episodes: str | None,
+    units: Sequence[str] | None,
+    joints: str | None,
+    rate: float | None,
+) -> dict[str, Any]:
+    """Arguments of ``load_lerobot`` that say what the options do.
+
+    Parameters
+    ----------
+    robot, frames, episodes, units, joints, rate
+        As for :func:`read_demonstrations`.
+    """
+    return {
+        "robot": robot,
+        "frames": parse_frames(frames or ()),
+        "episodes": parse_episodes(episodes),
+        "units": parse_units(units or ()),
+        "joints": joints,
+        "rate": rate,
+    }
 
 
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
@@ -289,11 +311,22 @@ def align(
     method : {"dtw", "barycenter", "linear", "none"}
     robot : Kinematics or None
     """
+    chosen = aligner(method, robot)
+    return list(demonstrations) if chosen is None else chosen.fit_transform(demonstrations)
+
+
+def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
+    """The transformer that brings demonstrations onto one clock, None for none.
+
+    Parameters
+    ----------
+    method : {"dtw", "barycenter", "linear", "none"}
+    robot : Kinematics or None
+    """
     from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 
     if method == "none":
-        return list(demonstrations)
+        return None
     if method == "linear":
-        return LinearTimeNormalization(robot=robot).fit_transform(demonstrations)
-    reference = "medoid" if method == "dtw" else method
-    return DynamicTimeWarping(reference, robot=robot).fit_transform(demonstrations)
+        return LinearTimeNormalization(robot=robot)
+    return DynamicTimeWarping("medoid" if method == "dtw" else method, robot=robot)

@@ -1,4 +1,4 @@
-"""What every operator is: one linear map in task space (DESIGN 4.1)."""
+"""What every operator is: one linear map in task space."""
 
 from __future__ import annotations
 
@@ -30,11 +30,15 @@ class Linearization:
         ``M``; None stands for the identity.
     displacement : Tensor of shape (..., m)
         ``c``.
+    present : Tensor of shape (..., D), optional
+        The present quaternions where the local coordinates hold some, zero elsewhere; None
+        leaves it to :meth:`Operator.coordinates`.
     """
 
     jacobian: Tensor | None
     matrix: Tensor | None
     displacement: Tensor
+    present: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)

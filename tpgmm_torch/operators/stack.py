@@ -13,6 +13,7 @@ from tpgmm_torch.frames import Frame
 from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator
+from tpgmm_torch.operators.pose_terms import pose_terms
 
 __all__ = ["Stack"]
 
@@ -53,14 +54,28 @@ class Stack(Operator):
                 raise DataError(f"Stack takes operators, got {type(operator).__name__}")
         object.__setattr__(self, "operators", operators)
 
+    @property
+    def leaves(self) -> tuple[Operator, ...]:
+        """The members, and those of members that are stacks themselves, in their order."""
+        return tuple(
+            leaf
+            for operator in self.operators
+            for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
+        )
+
     def dimension(self, kinematics: Kinematics | None) -> int:
         """The sum of the dimensions."""
         return sum(operator.dimension(kinematics) for operator in self.operators)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """Jacobians and displacements stacked, matrices on the diagonal."""
-        parts = [operator.linearize(state, frames) for operator in self.operators]
         like = state.joints
+        # where a state maps orientations in its own way, so must each operator
+        if type(state).orientation_map is RobotState.orientation_map:
+            terms = pose_terms(self.leaves, state.links, like.dtype, like.device)
+            if terms is not None:
+                return terms.linearize(state, frames)
+        parts = [operator.linearize(state, frames) for operator in self.operators]
         identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
         jacobians, matrices, displacements = [], [], []
         for part in parts:

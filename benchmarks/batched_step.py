@@ -1,0 +1,56 @@
+"""One control tick of thousands of robots at a time, kinematics included."""
+
+from collections.abc import Iterator
+
+import torch
+
+from benchmarks.rows import Row
+from benchmarks.settings import Settings
+from benchmarks.skill import learned, skill
+from benchmarks.timing import Work, in_turns, medians, per_call
+from tpgmm_torch import Frame, TaskParameterizedGMM
+
+__all__ = ["measure", "tick"]
+
+
+def measure(settings: Settings) -> Iterator[Row]:
+    """Every robot has its own bottle and posture; with one clock for all, or one each."""
+    n_robots = settings.size(4096, 8)
+    rounds = settings.rounds(9)
+    model = learned(settings, dtype="float32")
+    clocks = {"one clock": False, "own clocks": True}
+    measurements = {
+        name: per_call(tick(model, settings, n_robots, own), 1) for name, own in clocks.items()
+    }
+    taken = medians(in_turns(measurements, rounds, warm_up=True))
+    for name in clocks:
+        yield Row(
+            f"model.step, {n_robots} robots, {name}, float32, mean and covariance, eager: "
+            "per robot",
+            "us",
+            1e6 * taken[name] / n_robots,
+            asked=settings.asked("most", 25),
+            rounds=rounds,
+        )
+
+
+def tick(
+    model: TaskParameterizedGMM, settings: Settings, n_robots: int, own_clocks: bool = True
+) -> Work:
+    """A tick of so many robots, 3 s after they began, or each a second sooner or later."""
+    situations = skill(settings).situations(n_robots, settings.seed + 2000)
+    like = model.time_
+    joints = torch.stack([situation.joints for situation in situations]).to(like)
+    bottles = [situation.frames["bottle"] for situation in situations]
+    positions = torch.stack([bottle.position for bottle in bottles]).to(like)
+    orientations = torch.stack([bottle.orientation for bottle in bottles]).to(like)
+    frames = {"bottle": Frame(positions, orientations)}
+    time = torch.full((), 3.0).to(like)
+    if own_clocks:
+        time = time + torch.linspace(-1, 1, n_robots).to(like)
+
+    def work() -> object:
+        with torch.inference_mode():
+            return model.step(time, joints, frames)
+
+    return work

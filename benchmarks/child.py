@@ -1,0 +1,65 @@
+"""Measurements in a process of their own, for memory and for the time of imports."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+__all__ = ["answer", "ask", "peak_memory", "reset_peak"]
+
+ROOT = Path(__file__).parents[1]
+
+
+def ask(module: str, *arguments: object, launcher: tuple[str, ...] = ()) -> Any:
+    """Run a module of this folder as a program; what it gave to :func:`answer`.
+
+    Parameters
+    ----------
+    module : str
+    *arguments
+        Of its command line.
+    launcher : sequence of str
+        What stands between the interpreter and the module.
+
+    Raises
+    ------
+    RuntimeError
+        If it fails; with what it printed.
+    """
+    command = [sys.executable, *launcher, "-m", f"benchmarks.{module}"]
+    done = subprocess.run(
+        [*command, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def answer(value: object) -> None:
+    """Say the result to the process that asked."""
+    print(json.dumps(value), flush=True)
+
+
+def reset_peak() -> None:
+    """Let the peak of this process's memory begin at what it holds now (Linux).
+
+    Raises
+    ------
+    OSError
+        Where the system does not let it.
+    """
+    Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def peak_memory() -> float:
+    """Most memory that this process has held since :func:`reset_peak` [bytes] (Linux)."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    [line] = [line for line in status.splitlines() if line.startswith("VmHWM:")]
+    return 1024.0 * int(line.split()[1])

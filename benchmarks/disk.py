@@ -1,0 +1,121 @@
+"""EM on points that stay on disk, beside reading them; as a program, both in turns."""
+
+import shutil
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.child import answer, ask, peak_memory, reset_peak
+from benchmarks.points import BLOCKS, Problem, motions
+from benchmarks.rows import Omitted, Row
+from benchmarks.settings import Settings
+from benchmarks.timing import in_turns, medians, per_iteration, seconds
+from tpgmm_torch import BlockGaussianMixture
+
+__all__ = ["measure"]
+
+FILES, BATCH = 10, 65_536
+
+
+class Batches:
+    """The columns of parquet files, again and again, as arrays of shape (n, columns).
+
+    Parameters
+    ----------
+    folder : Path
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.paths = sorted(folder.glob("*.parquet"))
+
+    def __iter__(self) -> Iterator[NDArray[np.float32]]:
+        """One pass."""
+        for batch in self.records():
+            # a column is contiguous on disk, and stays so
+            columns = np.empty((batch.num_columns, batch.num_rows), dtype=np.float32)
+            for row, column in zip(columns, batch.columns, strict=True):
+                row[:] = column.to_numpy()
+            yield columns.T
+
+    def records(self) -> Iterator[object]:
+        """One pass as pyarrow has them, in one thread."""
+        from pyarrow import parquet
+
+        for path in self.paths:
+            yield from parquet.ParquetFile(path).iter_batches(BATCH, use_threads=False)
+
+
+def measure(settings: Settings) -> Iterator[Row | Omitted]:
+    """One pass of EM over all files, and the peak memory of the whole process."""
+    n_points, n_components = settings.size(10_000_000, 2_600), settings.size(10, 3)
+    rounds = settings.rounds(1)
+    work = f"EM on disk, N = {n_points} x {sum(BLOCKS)} float32, K = {n_components}"
+    folder = Path(tempfile.mkdtemp(prefix="points-", dir=settings.out))
+    try:
+        _write(folder, n_points // FILES, settings.seed)
+        found = ask("disk", folder.resolve(), n_components, rounds, settings.seed)
+    finally:
+        shutil.rmtree(folder)
+    yield Row(
+        f"{work}: one pass",
+        "s",
+        found["ours"],
+        "pyarrow reads the same columns",
+        found["pyarrow"],
+        settings.asked("times", 4),
+        rounds=rounds,
+        note="read by a thread of its own, computed by another; files in the system's cache",
+    )
+    if found["peak"] is None:
+        yield Omitted(f"{work}: peak memory", "it cannot be read on this system")
+    else:
+        asked = settings.asked("most", 1.2)
+        yield Row(f"{work}: peak memory, imports included", "GB", found["peak"], asked=asked)
+
+
+def _write(folder: Path, n_rows: int, seed: int) -> None:
+    """The same points in every file: what they are does not matter here."""
+    import pyarrow
+    from pyarrow import parquet
+
+    points = motions(n_rows, seed=seed).astype(np.float32)
+    names = [f"column_{index}" for index in range(points.shape[1])]
+    first = folder / "0.parquet"
+    parquet.write_table(pyarrow.table(list(points.T), names=names), first)
+    for index in range(1, FILES):
+        shutil.copyfile(first, folder / f"{index}.parquet")
+
+
+def _in_turns(folder: Path, n_components: int, rounds: int, seed: int) -> dict[str, object]:
+    peak = None
+    try:
+        reset_peak()
+        peak_is_known = True
+    except OSError:
+        peak_is_known = False
+    batches = Batches(folder)
+    start = Problem.of(motions(13_000, seed=seed), n_components).start
+    settings = {"blocks": BLOCKS, "tol": 0.0, "dtype": "float32", **start}
+
+    def fit(n: int) -> object:
+        with warnings.catch_warnings(action="ignore"):
+            return BlockGaussianMixture(n_components, max_iter=n, **settings).fit(batches)
+
+    def read() -> None:
+        for _ in batches.records():
+            pass
+
+    measurements = {"pyarrow": lambda: seconds(read), "ours": per_iteration(fit, 1, 4)}
+    taken = medians(in_turns(measurements, rounds))
+    if peak_is_known:
+        peak = peak_memory() / 1e9
+    return {**taken, "peak": peak}
+
+
+if __name__ == "__main__":
+    answer(_in_turns(Path(sys.argv[1]), *map(int, sys.argv[2:])))

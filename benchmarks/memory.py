@@ -1,0 +1,51 @@
+"""Memory of EM above that of the points; as a program, from imports on."""
+
+import multiprocessing
+import sys
+from collections.abc import Iterator
+
+from benchmarks import mixtures
+from benchmarks.child import answer, ask, peak_memory, reset_peak
+from benchmarks.points import Problem, motions
+from benchmarks.rows import Omitted, Row
+from benchmarks.settings import Settings
+
+__all__ = ["measure"]
+
+LIBRARIES = {"ours": mixtures.ours, "scikit-learn": mixtures.scikit_learn}
+
+
+def measure(settings: Settings) -> Iterator[Row | Omitted]:
+    """Two iterations, each library in a process of its own."""
+    n_points, n_components = settings.size(1_000_000, 1_300), settings.size(50, 5)
+    work = f"EM, N = {n_points}, K = {n_components}, float64: memory above the points"
+    try:
+        reset_peak()
+    except OSError as error:
+        yield Omitted(work, f"the peak of the memory cannot be read on this system: {error}")
+        return
+    used = ask("memory", n_points, n_components, settings.seed)
+    asked = settings.asked("most", 0.3)
+    yield Row(work, "GB", used["ours"], "scikit-learn, full", used["scikit-learn"], asked)
+
+
+def _above(library: str, n_points: int, n_components: int, seed: int) -> float:
+    """How much memory a fit takes beyond what is held before [GB]."""
+    few = Problem.of(motions(1_300, seed=seed), n_components)
+    LIBRARIES[library](few)(1)  # what is loaded and kept once, whatever the points
+    fit = LIBRARIES[library](Problem.of(motions(n_points, seed=seed), n_components))
+    reset_peak()
+    before = peak_memory()
+    fit(2)
+    return (peak_memory() - before) / 1e9
+
+
+def _each(*sizes: int) -> dict[str, float]:
+    """Each library in a process that has done nothing but the imports."""
+    forked = multiprocessing.get_context("fork")
+    with forked.Pool(1, maxtasksperchild=1) as pool:
+        return {name: pool.apply(_above, (name, *sizes)) for name in LIBRARIES}
+
+
+if __name__ == "__main__":
+    answer(_each(*map(int, sys.argv[1:])))

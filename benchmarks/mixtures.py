@@ -1,0 +1,102 @@
+"""EM by this library and by others, from one start, for a given number of iterations.
+
+Each function returns ``fit(n)``, which makes n iterations. All take one thread, and points in
+the dtype that is measured, in the layout that they like best.
+"""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.mixture import GaussianMixture
+
+from benchmarks.points import Problem
+from tpgmm_torch import BlockGaussianMixture
+
+__all__ = ["gmr", "ours", "pomegranate", "restarts", "scikit_learn"]
+
+Fit = Callable[[int], object]
+
+
+def ours(problem: Problem, dtype: str = "float64") -> Fit:
+    """Our own: blocks as they are."""
+    points = problem.points.astype(dtype, copy=False)
+
+    def fit(n: int) -> object:
+        settings = {"blocks": problem.blocks, "tol": 0.0, "max_iter": n, "dtype": dtype}
+        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
+            mixture = BlockGaussianMixture(len(problem.weights), **settings, **problem.start)
+            return mixture.fit(points)
+
+    return fit
+
+
+def restarts(problem: Problem, n_init: int, dtype: str = "float64") -> Fit:
+    """Our own with so many starts, each of n iterations."""
+    points = problem.points.astype(dtype, copy=False)
+
+    def fit(n: int) -> object:
+        settings = {"blocks": problem.blocks, "tol": 0.0, "max_iter": n, "dtype": dtype}
+        with warnings.catch_warnings(action="ignore"):
+            return BlockGaussianMixture(
+                len(problem.weights), n_init=n_init, random_state=0, **settings
+            ).fit(points)
+
+    return fit
+
+
+def scikit_learn(problem: Problem, dtype: str = "float64") -> Fit:
+    """scikit-learn, full covariance of all columns in one block.
+
+    The nearest of its covariance types: it has no blocks. Given precisions spare it k-means,
+    rows are contiguous, and float32 points are computed with in float32.
+    """
+    points, means, covariances = problem.joined(dtype)
+    start = {
+        "weights_init": problem.weights.astype(dtype),
+        "means_init": means,
+        "precisions_init": np.linalg.inv(covariances),
+    }
+
+    def fit(n: int) -> object:
+        mixture = GaussianMixture(len(means), tol=0.0, max_iter=n, **start)
+        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
+            return mixture.fit(points)
+
+    return fit
+
+
+def pomegranate(problem: Problem) -> Fit:
+    """The package pomegranate, full covariance: tensors, the start given, no early end."""
+    from pomegranate.distributions import Normal
+    from pomegranate.gmm import GeneralMixtureModel
+
+    points, means, covariances = map(torch.from_numpy, problem.joined())
+    weights = torch.from_numpy(problem.weights)
+
+    def fit(n: int) -> object:
+        components = [  # fitting changes them
+            Normal(means=mean.clone(), covs=covariance.clone())
+            for mean, covariance in zip(means, covariances, strict=True)
+        ]
+        mixture = GeneralMixtureModel(
+            components, priors=weights.clone(), max_iter=n, tol=float("-inf")
+        )
+        return mixture.fit(points)
+
+    return fit
+
+
+def gmr(problem: Problem) -> Fit:
+    """gmr, which has full covariances only; the start given, no early end (R_diff = 0)."""
+    from gmr import GMM
+
+    points, means, covariances = problem.joined()
+
+    def fit(n: int) -> object:
+        mixture = GMM(len(means), problem.weights.copy(), means.copy(), covariances.copy())
+        return mixture.from_samples(points, R_diff=0.0, n_iter=n)
+
+    return fit

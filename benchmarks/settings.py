@@ -1,0 +1,61 @@
+"""Which cases there are, and how they are to be measured."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.rows import Asked, Kind
+
+__all__ = ["CASES", "Settings"]
+
+#: Name on the command line -> module beside this file, whose ``measure(settings)`` yields rows.
+CASES = {
+    "import": "start_up",
+    "em-13k": "em_small",
+    "em-1m": "em_large",
+    "memory": "memory",
+    "disk": "disk",
+    "processes": "processes",
+    "kinematics": "kinematics",
+    "step": "control_step",
+    "batch": "batched_step",
+    "predict": "prediction",
+    "curves": "curves",
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to measure.
+
+    Parameters
+    ----------
+    full : bool
+        The sizes that the figures are about; False only shows that everything runs.
+    out : Path
+        Folder for results, and for large files while they are needed.
+    repeat : int, optional
+        Rounds of every measurement; None leaves it to the case.
+    seed : int, default=0
+        Of all random numbers.
+    """
+
+    full: bool
+    out: Path
+    repeat: int | None = None
+    seed: int = 0
+
+    def size(self, full: int, tiny: int) -> int:
+        """One of two sizes."""
+        return full if self.full else tiny
+
+    def rounds(self, full: int) -> int:
+        """How often to measure: as asked, or ``full`` times at full sizes, or once."""
+        return self.repeat or self.size(full, 1)
+
+    def iterations(self, few: int, many: int) -> tuple[int, int]:
+        """How many iterations the two fits make whose difference is measured."""
+        return (few, many) if self.full else (1, 2)
+
+    def asked(self, kind: Kind, figure: float) -> Asked | None:
+        """What is to be reached; at tiny sizes, nothing."""
+        return Asked(kind, figure) if self.full else None

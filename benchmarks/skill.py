@@ -1,0 +1,36 @@
+"""The paper's experiment as what is to be reproduced: two hands, 17 joints, K = 10, P = 2."""
+
+from functools import cache
+
+from benchmarks.settings import Settings
+from tpgmm_datasets.bottle_experiment import bottle_operators
+from tpgmm_datasets.bottle_shaking import BottleShaking
+from tpgmm_torch import Demonstration, TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
+
+__all__ = ["COMPONENTS", "learned", "skill"]
+
+COMPONENTS = 10
+
+
+@cache
+def skill(settings: Settings) -> BottleShaking:
+    """The generator, at 100 Hz in full size."""
+    return BottleShaking(rate=settings.size(100, 10))
+
+
+@cache
+def _aligned(settings: Settings) -> list[Demonstration]:
+    demonstrations = skill(settings).demonstrations(settings.size(10, 3), settings.seed)
+    return DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
+
+
+@cache
+def learned(
+    settings: Settings, n_components: int = COMPONENTS, dtype: str = "float64"
+) -> TaskParameterizedGMM:
+    """The model; not to be changed."""
+    operators, robot = bottle_operators(), skill(settings).robot
+    return TaskParameterizedGMM(n_components, operators, robot, dtype=dtype).fit(
+        _aligned(settings)
+    )

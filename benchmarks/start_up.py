@@ -1,0 +1,53 @@
+"""How long imports take, in new interpreters; as a program, in this one."""
+
+import importlib
+import sys
+from collections.abc import Iterator
+from statistics import median
+from time import perf_counter
+
+from benchmarks.child import answer, ask
+from benchmarks.rows import Row
+from benchmarks.settings import Settings
+
+__all__ = ["measure"]
+
+#: What a model needs, in this order: each one's time is without those before it.
+MODULES = ("torch", "sklearn.base", "tpgmm_torch.estimator")
+
+
+def measure(settings: Settings) -> Iterator[Row]:
+    """The package alone, which loads the rest when it is asked for, and all of it."""
+    rounds = settings.rounds(5)
+    if settings.full:  # from now on, the files are in the system's cache
+        ask("start_up", *MODULES)
+    package, parts = [], []
+    for _ in range(rounds):
+        package += ask("start_up", "tpgmm_torch")
+        parts.append(ask("start_up", *MODULES))
+    torch = median(part[0] for part in parts)
+    yield Row(
+        "import tpgmm_torch",
+        "s",
+        median(package),
+        "import torch",
+        torch,
+        settings.asked("times", 1.5),
+        rounds=rounds,
+        note="PyTorch and scikit-learn are loaded when first needed: the next rows",
+    )
+    whole = median(map(sum, parts))
+    work = "from tpgmm_torch import TaskParameterizedGMM"
+    yield Row(work, "s", whole, "import torch", torch, rounds=rounds)
+    both = median(part[0] + part[1] for part in parts)
+    yield Row(work, "s", whole, "import torch, sklearn.base", both, rounds=rounds)
+
+
+def _seconds(module: str) -> float:
+    began = perf_counter()
+    importlib.import_module(module)
+    return perf_counter() - began
+
+
+if __name__ == "__main__":
+    answer([_seconds(name) for name in sys.argv[1:]])

@@ -1,0 +1,121 @@
+"""What ``tpgmm fit`` learns from: all episodes at once, or batches; alone, or with others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from tpgmm_torch.cli import options
+
+if TYPE_CHECKING:
+    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_torch.distributed import Processes
+    from tpgmm_torch.retiming import Alignment
+
+__all__ = ["AlignedBatches", "TrainingData", "read_training_data"]
+
+
+@dataclass
+class AlignedBatches:
+    """Batches of episodes brought onto one clock as they come.
+
+    Parameters
+    ----------
+    batches : iterable of sequence of Demonstration
+        This process's.
+    alignment : Alignment or None
+        Fitted already.
+    durations : list of float
+        Of the episodes of the last pass, before they were aligned [s].
+    steps : int
+        Number of their time steps, after.
+    """
+
+    batches: Iterable[Sequence[Demonstration]]
+    alignment: Alignment | None
+    durations: list[float] = field(default_factory=list)
+    steps: int = 0
+
+    def __iter__(self) -> Iterator[Sequence[Demonstration]]:
+        """Read and align, and note how long the episodes are."""
+        self.durations, self.steps = [], 0
+        for batch in self.batches:
+            self.durations += [demonstration.duration for demonstration in batch]
+            aligned = batch if self.alignment is None else self.alignment.transform(batch)
+            self.steps += sum(map(len, aligned))
+            yield aligned
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Demonstrations of this process, and what is told of all.
+
+    Parameters
+    ----------
+    source : sequence of Demonstration, or AlignedBatches
+        For ``fit``.
+    frames : tuple of str
+        Names of the frames.
+    read : sequence of Demonstration
+        All as they were read; none where they come in batches.
+    aligned : sequence of Demonstration
+        The same aligned.
+    """
+
+    source: Sequence[Demonstration] | AlignedBatches
+    frames: tuple[str, ...]
+    read: Sequence[Demonstration]
+    aligned: Sequence[Demonstration]
+
+    def summary(self, processes: Processes) -> tuple[list[float], int]:
+        """Durations of all episodes, and their steps after alignment; after ``fit``.
+
+        Parameters
+        ----------
+        processes : Processes
+            All of which have to ask.
+        """
+        if not isinstance(self.source, AlignedBatches):
+            return [d.duration for d in self.read], sum(map(len, self.aligned))
+        own = torch.tensor(self.source.durations, dtype=torch.float64)
+        (steps,) = processes.sum(torch.tensor(float(self.source.steps), dtype=torch.float64))
+        return processes.concatenate(own).tolist(), int(steps)
+
+
+def read_training_data(
+    dataset: str,
+    reading: dict[str, Any],
+    alignment: str,
+    batch_episodes: int | None,
+    processes: Processes,
+) -> TrainingData:
+    """Read what this process learns from.
+
+    Without batches each process reads and aligns all episodes, then learns from its share.
+    With batches it reads its share alone, and the alignment is that of the first batch of all.
+
+    Parameters
+    ----------
+    dataset : str
+    reading : dict
+        Arguments of ``load_lerobot``.
+    alignment : {"dtw", "barycenter", "linear", "none"}
+    batch_episodes : int or None
+        Episodes in a batch.
+    processes : Processes
+    """
+    from tpgmm_datasets import EpisodeBatches, load_lerobot
+
+    robot = reading["robot"]
+    if batch_episodes is None:
+        read = load_lerobot(dataset, **reading)
+        aligned = options.align(read, alignment, robot)
+        return TrainingData(processes.share(aligned), tuple(read[0].frames), read, aligned)
+    first = next(iter(EpisodeBatches(dataset, batch_episodes, **reading)))
+    chosen = options.aligner(alignment, robot)
+    fitted = None if chosen is None else chosen.fit(first)
+    batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **reading)
+    return TrainingData(AlignedBatches(batches, fitted), tuple(first[0].frames), (), ())

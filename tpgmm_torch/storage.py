@@ -1,0 +1,184 @@
+"""Folders of two files: JSON for words and settings, safetensors for numbers.
+
+A folder is written beside its destination and moved there in one step, so an interrupted save
+leaves the old one or none. Reading takes numbers and names, never code, and refuses whatever
+was cut off or changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from tpgmm_torch.exceptions import ModelFileError
+
+__all__ = ["Folder"]
+
+CONFIG = "config.json"
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _canonical(config: Mapping[str, Any]) -> bytes:
+    body = {key: value for key, value in config.items() if key != "digest"}
+    return json.dumps(body, sort_keys=True, allow_nan=False).encode()
+
+
+@dataclass(frozen=True)
+class Folder:
+    """One kind of folder: ``config.json`` and ``KIND.safetensors``.
+
+    Parameters
+    ----------
+    kind : str
+        What is in it, "model" for example.
+    version : int
+        Of its format; others are refused.
+    """
+
+    kind: str
+    version: int
+
+    @property
+    def _format(self) -> str:
+        return f"tpgmm-torch {self.kind}"
+
+    @property
+    def tensors(self) -> str:
+        """Name of the file of numbers."""
+        return f"{self.kind}.safetensors"
+
+    def write(
+        self, path: str | Path, config: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    ) -> None:
+        """Write a folder atomically, replacing one of its kind that is there.
+
+        Parameters
+        ----------
+        path : str or Path
+            The directory.
+        config : mapping
+            JSON values.
+        tensors : mapping of str to Tensor
+
+        Raises
+        ------
+        ModelFileError
+            If ``path`` exists and is no folder of this kind, or holds other files too: it is
+            left alone. If the configuration is not of JSON's values.
+        """
+        path = Path(path)
+        if path.exists() and not self._replaceable(path):
+            raise ModelFileError(
+                f"{path} exists and is not a saved {self.kind} alone; choose another directory"
+            )
+        blob = safetensors.torch.save(
+            {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+        )
+        shapes = {
+            k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()
+        }
+        full = {"format": self._format, "version": self.version, **config}
+        full |= {"tensors": shapes, "tensors_sha256": _digest(blob)}
+        try:
+            full["digest"] = _digest(_canonical(full))
+        except (TypeError, ValueError) as error:
+            raise ModelFileError(
+                f"the {self.kind} cannot be described in JSON: {error}"
+            ) from error
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
+        try:
+            (staging / "new").mkdir()
+            (staging / "new" / CONFIG).write_text(json.dumps(full, indent=1, allow_nan=False))
+            (staging / "new" / self.tensors).write_bytes(blob)
+            if path.exists():
+                path.rename(staging / "old")
+            (staging / "new").rename(path)
+        except BaseException:
+            if (staging / "old").exists() and not path.exists():
+                (staging / "old").rename(path)
+            raise
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+
+    def _replaceable(self, path: Path) -> bool:
+        """Whether nothing but one of this kind, or nothing at all, is lost by replacing it."""
+        own = {CONFIG, self.tensors}
+        if not path.is_dir() or {item.name for item in path.iterdir()} - own:
+            return False
+        try:
+            return json.loads((path / CONFIG).read_text())["format"] == self._format
+        except FileNotFoundError:
+            return not any(path.iterdir())
+        except (ValueError, TypeError, KeyError):
+            return False
+
+    def read(self, path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """Read a folder, checking version, digests, names, shapes and dtypes.
+
+        Parameters
+        ----------
+        path : str or Path
+            The directory.
+
+        Returns
+        -------
+        config : dict
+        tensors : dict of str to Tensor
+
+        Raises
+        ------
+        ModelFileError
+            If a file is missing, truncated, changed, or of another version.
+        """
+        path = Path(path)
+        try:
+            config = json.loads((path / CONFIG).read_text())
+            blob = (path / self.tensors).read_bytes()
+        except FileNotFoundError as error:
+            raise ModelFileError(
+                f"{path} is not a saved {self.kind}: {error.filename} is missing"
+            ) from None
+        except (ValueError, OSError) as error:
+            raise ModelFileError(f"{path / CONFIG} cannot be read: {error}") from error
+        if not isinstance(config, dict) or config.get("format") != self._format:
+            raise ModelFileError(f"{path / CONFIG} does not describe a {self._format}")
+        if config.get("version") != self.version:
+            raise ModelFileError(
+                f"{path} is a {self.kind} of format version {config.get('version')!r}, this "
+                f"release reads version {self.version}: load it with the release that wrote "
+                "it, or fit again"
+            )
+        try:
+            digest = _digest(_canonical(config))
+        except ValueError:  # it holds NaN or infinity, which no model has
+            digest = ""
+        if config.get("digest") != digest:
+            raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
+        if config.get("tensors_sha256") != _digest(blob):
+            raise ModelFileError(
+                f"{path / self.tensors} is truncated or was changed after it was saved"
+            )
+        try:
+            tensors = safetensors.torch.load(blob)
+        except SafetensorError as error:
+            raise ModelFileError(f"{path / self.tensors} cannot be read: {error}") from error
+        found = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
+        if found != config.get("tensors"):
+            raise ModelFileError(
+                f"{path / self.tensors} holds {found}, expected {config.get('tensors')}"
+            )
+        return config, tensors

@@ -1,0 +1,382 @@
+"""The control tick in few operations: joints known by a Gaussian, corrected by tasks.
+
+Where the joints have an operator of their own (:class:`Canonical`), its conditional
+``N(m, C)`` given time is a prior over the joints that does not depend on the robot, and each
+task ``J (q - q_{t-1}) ~ N(y, S)`` is a measurement of it. The product (2) of the projected
+Gaussians is then the Kalman update
+
+    H = S + J C J^T,   q = m + C J^T H^-1 (y - J (m - q_{t-1})),   C - C J^T H^-1 J C,
+
+the information form by the matrix inversion lemma: as many dimensions as the
+tasks have (12 for two hands) in place of as many as there are joints, no pseudo-inverse and no
+epsilon. Inside, the A components stand in the first dimension and B robots in the second, so
+that what all robots share enters one matrix product per component.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+from tpgmm_torch.frames import Frame
+from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.local_mixtures import LocalMixture
+from tpgmm_torch.operators import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Linearization,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+
+__all__ = ["Tables", "TaskUpdate"]
+
+#: Operators whose M has full row rank at every state, so that S is as definite as what was
+#: learned. An operator of another kind may claim to know a direction exactly by mistake, which
+#: the sum of precisions refuses and this form would not notice.
+TASKS = (AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation)
+
+#: Robots at a time on a processor, whose cache then holds what is between the operations.
+PART = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """What a control tick needs of A components, prepared once.
+
+    Parameters
+    ----------
+    places : Tensor of shape (A, K)
+        One-hot rows: which components of the mixture they are.
+    time_mean, time_precision : Tensor of shape (A,)
+        The time marginals [s], [1/s^2].
+    log_weights : Tensor of shape (A,)
+        Of the components, with what of the time marginal's density does not change.
+    mean, gain : Tensor of shape (A, D + n, 1)
+        Local coordinates of the D task dimensions, and the *negative* n joints:
+        ``E[x | t] = mean + gain (t - time_mean)``.
+    covariance : Tensor of shape (A, D + n, D + n)
+        Of these given time: a block for each task, and the prior's C.
+    prior : Tensor of shape (A, n * n)
+        C once more.
+    """
+
+    places: Tensor
+    time_mean: Tensor
+    time_precision: Tensor
+    log_weights: Tensor
+    mean: Tensor
+    gain: Tensor
+    covariance: Tensor
+    prior: Tensor
+
+    def select(self, components: Sequence[int]) -> Tables:
+        """Only some of the components."""
+        index = torch.tensor(components, device=self.time_mean.device)
+        return Tables(*(getattr(self, field.name)[index] for field in fields(self)))
+
+
+class TaskUpdate:
+    """The update of the joints' operator by all others.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    operators : sequence of Operator
+        At least one of them is :class:`Canonical`.
+    mixtures : sequence of LocalMixture
+        One per operator.
+    log_weights : Tensor of shape (K,)
+
+    Attributes
+    ----------
+    tables : Tables
+        Of all components.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        operators: Sequence[Operator],
+        mixtures: Sequence[LocalMixture],
+        log_weights: Tensor,
+    ) -> None:
+        tasks, local, priors = [], [], []
+        for operator, mixture in zip(operators, mixtures, strict=True):
+            if type(operator) is Canonical:
+                priors.append(mixture)
+            else:
+                tasks.append(operator)
+                local.append(mixture)
+        self._task = Stack(*tasks) if tasks else None
+        self.tables = _tables(mixtures[0], local, priors, log_weights)
+        like = self.tables.mean
+        self._width = 0 if self._task is None else self._task.dimension(kinematics)
+        starts = () if self._task is None else self._task.quaternion_starts(kinematics)
+        self._blocks: Tensor | None = None
+        if starts:
+            self._blocks = like.new_zeros(self._width, like.shape[-2])
+            for start in starts:
+                self._blocks[start : start + 4, start : start + 4] = 1.0
+        self._plus, self._minus = like.new_ones(()), -like.new_ones(())
+        # tasks make the covariance smaller, what keeps the components apart makes it larger
+        height = 3 * len(self._task.leaves) if self._task else 0
+        self._signature = torch.cat((-like.new_ones(height), like.new_ones(1)))
+
+    @staticmethod
+    def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
+        """Whether these operators can be fused in this way.
+
+        Parameters
+        ----------
+        operators : sequence of Operator
+        kinematics : Kinematics
+            Where the joint vector holds quaternions, what the joints' operator says depends on
+            the present state.
+        """
+        if kinematics.quaternion_starts or not any(type(o) is Canonical for o in operators):
+            return False
+        tasks = [operator for operator in operators if type(operator) is not Canonical]
+        leaves = Stack(*tasks).leaves if tasks else ()
+        return all(type(leaf) in TASKS for leaf in leaves)
+
+    def __call__(
+        self,
+        choose: Callable[[Tensor], Tables],
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """References at ``time`` (scalar or of the batch's shape) from the state q_{t-1}.
+
+        Parameters
+        ----------
+        choose : callable
+            Gives the tables of the components that count at some times.
+        time : Tensor
+        state : RobotState
+        frames : mapping of str to Frame
+
+        Returns
+        -------
+        joints : Tensor of shape (..., n)
+        covariance : Tensor of shape (..., n, n)
+        activation : Tensor of shape (..., K)
+        """
+        at = self._linearize(state, frames)
+        jacobian, matrix, shift, joints = at.jacobian, at.matrix, at.displacement, state.joints
+        assert jacobian is not None and matrix is not None
+        instants = time.shape or joints.shape[:-1]
+        batch = gaussians.common_shape(
+            jacobian.shape[:-2], matrix.shape[:-2], shift.shape[:-1], instants
+        )
+        # y - J (m - q) = [M, J] (mu; -m) + c + J q
+        shift = _flat(shift.unsqueeze(-1) + jacobian @ joints.unsqueeze(-1), batch)
+        if jacobian.shape[:-2] != matrix.shape[:-2]:
+            jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
+        row = _flat(torch.cat((matrix, jacobian), -1), batch)  # (B, m, D + n)
+        present = at.present
+        if present is None and self._task is not None:
+            present = self._task.coordinates(state, frames)
+        flat = [row, shift] if present is None else [row, shift, _flat(present, batch, 1)]
+        if time.ndim:
+            time = _flat(time, batch, 0)
+        if time.is_cuda or len(row) <= PART:
+            parts = self._part(choose(time), time, *flat)
+        else:
+            parts = self._in_parts(choose, time, flat)
+        if len(batch) == 1:
+            return parts
+        joints, covariance, activation = parts
+        return (
+            joints.reshape(*batch, -1),
+            covariance.reshape(*batch, *covariance.shape[-2:]),
+            activation.reshape(*batch, -1) if time.ndim else activation,
+        )
+
+    def _in_parts(
+        self, choose: Callable[[Tensor], Tables], time: Tensor, flat: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Part by part, of robots that are at about the same time: few components count."""
+        order = time.argsort() if time.ndim else torch.arange(len(flat[0]))
+        results = []
+        for part in order.split(PART):
+            now = time[part] if time.ndim else time
+            results.append(self._part(choose(now), now, *(x[part] for x in flat)))
+        joints, covariance, activation = zip(*results, strict=True)
+        back = order.argsort()
+        every = torch.cat(activation)[back] if time.ndim else activation[0]
+        return torch.cat(joints)[back], torch.cat(covariance)[back], every
+
+    def _part(
+        self,
+        tables: Tables,
+        time: Tensor,
+        row: Tensor,
+        shift: Tensor,
+        present: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Joints (B, n), covariance (B, n, n) and activation (K,) or (B, K)."""
+        apart = (time.unsqueeze(-1) if time.ndim else time) - tables.time_mean
+        log_h = torch.addcmul(
+            tables.log_weights, tables.time_precision, apart * apart, value=-0.5
+        )
+        weights = torch.softmax(log_h, -1)  # (A,), or (B, A)
+        mean = torch.addcmul(tables.mean, tables.gain, apart.unsqueeze(-1).unsqueeze(-1))
+        # (A, B or 1, D + n, 1)
+        mean = mean.transpose(0, 1) if time.ndim else mean.unsqueeze(1)
+        if present is None or self._blocks is None:
+            row = row.expand(len(mean), *row.shape)
+        else:
+            row = row * self._signs(mean, present)
+        joints, covariance = self._corrected(tables, weights, mean, row, shift)
+        return joints, covariance, weights @ tables.places
+
+    def _corrected(
+        self, tables: Tables, weights: Tensor, mean: Tensor, row: Tensor, shift: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and covariance of the mixture of the updated components.
+
+        Parameters
+        ----------
+        tables : Tables
+        weights : Tensor of shape (A,) or (B, A)
+        mean : Tensor of shape (A, B or 1, D + n, 1)
+            ``(mu; -m)``.
+        row : Tensor of shape (A, B, m, D + n)
+            ``[M, J]``.
+        shift : Tensor of shape (B, m, 1)
+            ``c + J q_{t-1}``.
+
+        Returns
+        -------
+        joints : Tensor of shape (B, n)
+        covariance : Tensor of shape (B, n, n)
+        """
+        a, b, m, size = row.shape
+        n = size - self._width
+        rows = row.reshape(a, b * m, size)
+        cross = torch.bmm(rows, tables.covariance).view(a * b, m, size)
+        row = rows.view(a * b, m, size)
+        h = torch.bmm(cross, row.mT)
+        factor = gaussians.cholesky(h, "the covariance of the tasks")
+        if mean.shape[1] == b:
+            mean = mean.reshape(a * b, size, 1)
+            shift = shift.expand(a, b, m, 1).reshape(a * b, m, 1)
+            innovation = torch.baddbmm(shift, row, mean)
+        else:  # one time for all: one product per component
+            innovation = torch.baddbmm(shift.view(1, b * m, 1), rows, mean.squeeze(1))
+            innovation = innovation.view(a * b, m, 1)
+            mean = mean.expand(a, b, size, 1).reshape(a * b, size, 1)
+        right = torch.cat((cross.narrow(-1, size - n, n), innovation), -1)
+        white = torch.linalg.solve_triangular(factor, right, upper=False)  # (A B, m, n + 1)
+        gain, innovation = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
+        prior = mean.narrow(-2, size - n, n)
+        each = torch.baddbmm(prior, gain.mT, innovation, beta=-1).view(a, b, n)
+        by_component = (weights.T if weights.ndim == 2 else weights.unsqueeze(-1)).unsqueeze(-1)
+        joints = (by_component * each).sum(0)
+        # within the components C - G^T G, and between them: the law of total variance
+        apart = (each - joints).view(a, b, 1, n)
+        spread = torch.cat((gain.view(a, b, m, n), apart), -2)
+        weighted = spread * (by_component * self._signature).unsqueeze(-1)
+        if b == 1:
+            spread, weighted = (x.view(1, a * (m + 1), n) for x in (spread, weighted))
+        else:
+            spread, weighted = (
+                x.transpose(0, 1).reshape(b, a * (m + 1), n) for x in (spread, weighted)
+            )
+        within = (weights @ tables.prior).view(-1, n, n)
+        return joints, torch.baddbmm(within, spread.mT, weighted)
+
+    def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        joints = state.joints
+        if self._task is None:
+            batch, n = joints.shape[:-1], joints.shape[-1]
+            nothing = joints.new_zeros(*batch, 0)
+            return Linearization(
+                joints.new_zeros(*batch, 0, n), joints.new_zeros(*batch, 0, 0), nothing
+            )
+        return self._task.linearize(state, frames)
+
+    def _signs(self, mean: Tensor, present: Tensor) -> Tensor:
+        """Signs (A, B, 1, D + n) that bring each mean quaternion to the present one's side."""
+        assert self._blocks is not None
+        inner = (mean.narrow(-2, 0, self._width).squeeze(-1) * present) @ self._blocks
+        return torch.where(inner < 0, self._minus, self._plus).unsqueeze(-2)
+
+
+def _flat(tensor: Tensor, batch: torch.Size, own: int = 2) -> Tensor:
+    """The batch's dimensions as one, before ``own`` dimensions of the tensor's own."""
+    before = tensor.ndim - own
+    if tensor.shape[:before] != batch:
+        tensor = tensor.expand(*batch, *tensor.shape[before:])
+    return (
+        tensor
+        if len(batch) == 1
+        else tensor.reshape(batch.numel(), *tensor.shape[len(batch) :])
+    )
+
+
+def _tables(
+    first: LocalMixture,
+    tasks: Sequence[LocalMixture],
+    priors: Sequence[LocalMixture],
+    log_weights: Tensor,
+) -> Tables:
+    """Tables of all components, prepared in float64: narrow directions lose digits first."""
+    like = first.mean
+    time_mean, variance = first.time_mean.double(), first.time_variance.double()
+
+    def recentred(mixture: LocalMixture) -> tuple[Tensor, Tensor, Tensor]:
+        gain = mixture.gain.double()
+        apart = time_mean - mixture.time_mean.double()
+        covariance = mixture.covariance.double()
+        gaussians.cholesky(covariance, "the covariance of a projected component")
+        return mixture.mean.double() + gain * apart[:, None], gain, covariance
+
+    parts = [recentred(mixture) for mixture in tasks]
+    parts.append(_product([recentred(mixture) for mixture in priors]))
+    means, gains, covariances = zip(*parts, strict=True)
+    size = sum(mean.shape[-1] for mean in means)
+    blocks, start = [], 0
+    for covariance in covariances:
+        end = start + covariance.shape[-1]
+        blocks.append(torch.nn.functional.pad(covariance, (start, size - end)))
+        start = end
+    count = len(time_mean)
+    return Tables(
+        torch.eye(count, dtype=like.dtype, device=like.device),
+        *(
+            table.to(like)
+            for table in (
+                time_mean,
+                1 / variance,
+                log_weights.double() - 0.5 * variance.log(),
+                torch.cat((*means[:-1], -means[-1]), -1)[..., None],
+                torch.cat((*gains[:-1], -gains[-1]), -1)[..., None],
+                torch.cat(blocks, -2),
+                covariances[-1].flatten(1),
+            )
+        ),
+    )
+
+
+def _product(
+    priors: Sequence[tuple[Tensor, Tensor, Tensor]],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, gain and covariance of the product (2) of Gaussians over the joints."""
+    if len(priors) == 1:
+        return priors[0]
+    covariances = torch.stack([covariance for _, _, covariance in priors])
+    vectors = torch.stack([torch.stack((mean, gain), -1) for mean, gain, _ in priors])
+    inverses = torch.cholesky_inverse(gaussians.cholesky(covariances, "a joints' operator"))
+    factor = gaussians.cholesky(inverses.sum(0), "the product of the joints' operators")
+    mean, gain = torch.cholesky_solve((inverses @ vectors).sum(0), factor).unbind(-1)
+    return mean, gain, torch.cholesky_inverse(factor)
