@@ -73,6 +73,8 @@ class Row:
         """Whether the figure asked for was reached; None where none is asked for."""
         if self.asked is None:
             return None
+        if self.ours <= 0:  # a difference of times that is smaller than their noise
+            return False
         if self.asked.kind == "most":
             return self.ours <= self.asked.figure
         if self.theirs is None:

@@ -44,6 +44,7 @@ def test_one_batch_of_all_is_the_whole(dataset, tmp_path):
     output("fit", dataset, *FIT, "--batch-episodes", 2, "--out", tmp_path / "other")
 
 
+@pytest.mark.filterwarnings("ignore:EM did not converge")
 def test_a_fit_is_prolonged_from_its_checkpoint(dataset, tmp_path):
     state, whole, parts = tmp_path / "em", tmp_path / "whole", tmp_path / "parts"
     fit = ("fit", dataset, *FIT[:-2], "--tol", 0)

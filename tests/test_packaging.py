@@ -172,7 +172,7 @@ def test_constraints_satisfy_every_extra(extra):
 
 
 def test_constraints_name_everything_that_the_tests_install():
-    assert {"robots", "data", "plot", "simulation", "lerobot"} <= EXTRAS.keys()
+    assert {"data", "plot", "simulation", "lerobot"} <= EXTRAS.keys()
     needed = {canonicalize_name(requirement.name) for requirement in requirements("test")}
     assert needed - constraints().keys() == set()
 

@@ -201,30 +201,30 @@ class Standardization:
         size = whole // min(n_components * sum(widths), packed) // group_size + 1
         size *= group_size
         shift, scale = torch.cat(self.shifts)[:, None], torch.cat(self.scales)[:, None]
-        by_column = points.flags.f_contiguous
-        n_points = len(points) if order is None else len(order)
+        # few long operations, which leave Python to other threads
+        columns = _columns(points, order).to(shift.device, torch.float64)
+        standard = columns.contiguous().sub_(shift).div_(scale)
+        n_points = standard.shape[1]
         # one piece of memory for all chunks of a block: many small ones would scatter
         stores = [shift.new_ones(width * n_points, dtype=dtype) for width in widths]
-        columns = np.empty((len(shift), min(size, n_points)))
-        chunks = []
-        for start in range(0, n_points, size):
-            stop = min(start + size, n_points)
-            part = points[start:stop].T
-            if order is not None:
-                own = order[start:stop]
-                part = points.T[:, own] if by_column else points[own].T
-            columns[:, : stop - start] = part
-            standard = torch.from_numpy(columns[:, : stop - start]).to(shift.device)
-            standard.sub_(shift).div_(scale)
-            chunk = [
-                store[width * start : width * stop].view(width, -1)
+        whole_size = n_points // size * size
+        for store, width, inner in zip(
+            stores, widths, standard.split([width - 1 for width in widths]), strict=True
+        ):
+            for start, stop, step in ((0, whole_size, size), (whole_size, n_points, None)):
+                if stop > start:
+                    part = store[width * start : width * stop].view(
+                        -1, width, step or stop - start
+                    )
+                    divided = inner[:, start:stop].unflatten(1, (len(part), -1))
+                    part[:, :-1] = divided.transpose(0, 1)
+        return [
+            tuple(
+                store[width * start : width * min(start + size, n_points)].view(width, -1)
                 for store, width in zip(stores, widths, strict=True)
-            ]
-            inner = standard.split([width - 1 for width in widths])
-            for block, coordinates in zip(chunk, inner, strict=True):
-                block[:-1] = coordinates
-            chunks.append(tuple(chunk))
-        return chunks
+            )
+            for start in range(0, n_points, size)
+        ]
 
     def standardize(self, parameters: Parameters) -> Parameters:
         """A mixture in units of the data, brought to standardised units."""
@@ -235,6 +235,15 @@ class Standardization:
     def restore(self, parameters: Parameters) -> Parameters:
         """A mixture in standardised units, brought to units of the data."""
         return parameters.affine(self.scales, self.shifts)
+
+
+def _columns(points: NDArray[np.floating], order: NDArray[np.intp] | None) -> Tensor:
+    """Rows (n, D), or some of them in another order, as columns (D, n): a copy."""
+    chosen = slice(None) if order is None else torch.from_numpy(order)
+    points = np.require(points, requirements="W")  # torch warns of any other
+    if points.flags.f_contiguous:
+        return torch.from_numpy(points.T)[:, chosen].clone()
+    return torch.from_numpy(points)[chosen].T.clone(memory_format=torch.contiguous_format)
 
 
 @dataclass(frozen=True)

@@ -238,8 +238,9 @@ PLAIN = ("bounds", "n_iter", "converged", "replaced", "n_replaced", "floored")
 def _tensors(run: Run, prefix: str) -> dict[str, Tensor]:
     """Numbers of a run by name; ``prefix`` tells the runs apart."""
     mixture = run.parameters
-    keys = np.asarray(run.rng.get_state(legacy=True)[1], dtype=np.int64)
-    tensors = {"weights": mixture.weights, "keys": torch.from_numpy(keys)}
+    _, keys, *_ = run.rng.get_state(legacy=True)
+    numbers = torch.from_numpy(np.asarray(keys, dtype=np.int64))
+    tensors = {"weights": mixture.weights, "keys": numbers}
     for j, (mean, factor) in enumerate(zip(mixture.means, mixture.factors, strict=True)):
         tensors |= {f"means.{j}": mean, f"factors.{j}": factor}
     return {prefix + name: tensor.clone() for name, tensor in tensors.items()}

@@ -25,7 +25,7 @@ from tpgmm_torch.block_gaussians import (
 from tpgmm_torch.checkpoints import Checkpoint, Purpose
 from tpgmm_torch.column_moments import ColumnMoments
 from tpgmm_torch.distributed import ALONE, Processes, common_random_state
-from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.expectation_maximization import Run, ascend
 from tpgmm_torch.given_start import GivenStart
 from tpgmm_torch.initialization import StartDrawer, check_distinct
@@ -306,6 +306,8 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
             As :meth:`fit`.
         """
         moments = moments or ColumnMoments.of_batches(rows, processes)
+        if moments.count < 2:
+            raise DataError("the data hold 1 sample; a mixture is learned from at least 2")
         widths = check_blocks(self.blocks, len(moments.mean))
         if rows.n_rows % self.group_size:
             raise ShapeError(f"{rows.n_rows} rows are no multiple of {self.group_size=}")

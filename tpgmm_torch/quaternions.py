@@ -52,11 +52,7 @@ CONSTANTS: dict[tuple[str, torch.dtype, torch.device], Tensor] = {}
 
 
 def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Structure constants: every function here is a product with one of these matrices.
-
-    That is a few operations where the formulas written out take dozens, and what is done at
-    each control tick costs per operation.
-    """
+    """Structure constants: a product with one of them stands for dozens of operations."""
     key = name, dtype, device
     if key not in CONSTANTS:
         CONSTANTS[key] = _structure(name, dtype).to(device)
@@ -64,10 +60,7 @@ def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def _structure(name: str, dtype: torch.dtype) -> Tensor:
-    """Make one of the constants."""
-
-    def linear(table: object, width: int) -> Tensor:
-        """Coefficients (width, entries) of a table of signed places."""
+    def linear(table: object, width: int) -> Tensor:  # of a table of signed places
         entries = [entry for row in table for entry in row]  # type: ignore[attr-defined]
         matrix = torch.zeros(width, len(entries), dtype=dtype)
         for column, entry in enumerate(entries):

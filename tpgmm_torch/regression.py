@@ -9,18 +9,19 @@ mix the components.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.component_tables import Tables
 from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
 from tpgmm_torch.operators import Linearization, Operator
-from tpgmm_torch.task_update import Tables, TaskUpdate
+from tpgmm_torch.task_update import TaskUpdate
 from tpgmm_torch.trajectories import Candidate
 from tpgmm_torch.windows import Windows
 
@@ -99,14 +100,35 @@ class Regression:
             joints, covariance, activation = self._fused(time, state, frames)
         else:
             joints, covariance, activation = self._update(self._tables, time, state, frames)
-        alone: tuple[Candidate, ...] = ()
-        if candidates:
-            active = self._active(time)
-            projections = self._projections(active, time, state, frames)
-            alone = _candidates(projections, activation[..., active], state.joints)
+        estimate = self.bounded(joints, covariance, activation, bounds)
+        if not candidates:
+            return estimate
+        active = self._active(time)
+        projections = self._projections(active, time, state, frames)
+        alone = _candidates(projections, activation[..., active], state.joints)
+        return replace(estimate, candidates=alone)
+
+    def tick(
+        self,
+        time: Tensor,
+        joints: Tensor,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """:meth:`step` from a joint vector: kinematics included, without candidates."""
+        return self.step(time, self.kinematics.state(joints), frames, False, bounds)
+
+    @staticmethod
+    def bounded(
+        joints: Tensor,
+        covariance: Tensor,
+        activation: Tensor,
+        bounds: tuple[Tensor, Tensor] | None,
+    ) -> Estimate:
+        """The estimate, given that joints keep within bounds if there are some."""
         if bounds is not None:
             joints = _within(joints, covariance, *bounds)
-        return Estimate(joints, covariance, activation, alone)
+        return Estimate(joints, covariance, activation)
 
     def expected(self, operator: int, time: Tensor) -> Tensor:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""

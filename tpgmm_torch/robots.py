@@ -83,8 +83,6 @@ class Robot(Kinematics):
             If the description cannot be read, or the settings contradict it or one another.
         UnknownNameError
             If a link or a joint is not in the URDF.
-        DependencyError
-            If pytorch-kinematics is not installed.
 
         Examples
         --------
@@ -131,7 +129,7 @@ class Robot(Kinematics):
         with torch.inference_mode(False), torch.device("cpu"):
             limits = _limits(model, self.joint_names).to(**options)
             self.lower, self.upper, self.velocity = limits
-            self._kinematics = TreeKinematics(tree, self.n_joints, **options)
+            self.forward_kinematics = TreeKinematics(tree, self.n_joints, **options)
 
     def state(self, joints: Any) -> RobotState:
         """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
@@ -144,9 +142,9 @@ class Robot(Kinematics):
         joints = self.joint_tensor(joints)
         batch = joints.shape[:-1]
         if len(batch) == 1:
-            return RobotState(joints, self.links, *self._kinematics(joints))
+            return RobotState(joints, self.links, *self.forward_kinematics(joints))
         rows = joints.reshape(batch.numel(), self.n_joints)
-        poses = (part.reshape(batch + part.shape[1:]) for part in self._kinematics(rows))
+        poses = (part.reshape(batch + part.shape[1:]) for part in self.forward_kinematics(rows))
         return RobotState(joints, self.links, *poses)
 
     def to(

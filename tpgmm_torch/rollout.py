@@ -148,8 +148,12 @@ class Synthesis:
                 high = torch.maximum(torch.minimum(high, last + reach), last - reach)
             # they are those of the estimate, to which the fading gap comes on top
             bounds = (low, high) if gap is None else (low - gap, high - gap)
-        state = kinematics.state(last if measured is None else measured)
-        estimate = self.regression.step(now, state, frames, candidates, bounds)
+        joints = last if measured is None else measured
+        if candidates:
+            state = kinematics.state(joints)
+            estimate = self.regression.step(now, state, frames, candidates, bounds)
+        else:
+            estimate = self.regression.tick(now, joints, frames, bounds)
         if self._last is None:
             self._first, self._gap = now, last - estimate.joints
             gap = self._fading(now)

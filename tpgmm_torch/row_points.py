@@ -17,7 +17,7 @@ from tpgmm_torch.rows import Rows
 __all__ = ["RowPoints"]
 
 #: Rows that are put in order of time and standardised at a time.
-PIECE = 2**16
+PIECE = 2**14
 
 
 class RowPoints(Points):

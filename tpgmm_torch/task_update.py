@@ -16,12 +16,12 @@ that what all robots share enters one matrix product per component.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.component_tables import Tables
 from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
@@ -36,7 +36,7 @@ from tpgmm_torch.operators import (
     Stack,
 )
 
-__all__ = ["Tables", "TaskUpdate"]
+__all__ = ["TaskUpdate"]
 
 #: Operators whose M has full row rank at every state, so that S is as definite as what was
 #: learned. An operator of another kind may claim to know a direction exactly by mistake, which
@@ -45,42 +45,6 @@ TASKS = (AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrient
 
 #: Robots at a time on a processor, whose cache then holds what is between the operations.
 PART = 128
-
-
-@dataclass(frozen=True, eq=False)
-class Tables:
-    """What a control tick needs of A components, prepared once.
-
-    Parameters
-    ----------
-    places : Tensor of shape (A, K)
-        One-hot rows: which components of the mixture they are.
-    time_mean, time_precision : Tensor of shape (A,)
-        The time marginals [s], [1/s^2].
-    log_weights : Tensor of shape (A,)
-        Of the components, with what of the time marginal's density does not change.
-    mean, gain : Tensor of shape (A, D + n, 1)
-        Local coordinates of the D task dimensions, and the *negative* n joints:
-        ``E[x | t] = mean + gain (t - time_mean)``.
-    covariance : Tensor of shape (A, D + n, D + n)
-        Of these given time: a block for each task, and the prior's C.
-    prior : Tensor of shape (A, n * n)
-        C once more.
-    """
-
-    places: Tensor
-    time_mean: Tensor
-    time_precision: Tensor
-    log_weights: Tensor
-    mean: Tensor
-    gain: Tensor
-    covariance: Tensor
-    prior: Tensor
-
-    def select(self, components: Sequence[int]) -> Tables:
-        """Only some of the components."""
-        index = torch.tensor(components, device=self.time_mean.device)
-        return Tables(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 class TaskUpdate:
@@ -97,6 +61,8 @@ class TaskUpdate:
 
     Attributes
     ----------
+    task : Stack or None
+        All operators but those of the joints.
     tables : Tables
         Of all components.
     """
@@ -115,11 +81,11 @@ class TaskUpdate:
             else:
                 tasks.append(operator)
                 local.append(mixture)
-        self._task = Stack(*tasks) if tasks else None
-        self.tables = _tables(mixtures[0], local, priors, log_weights)
+        self.task = Stack(*tasks) if tasks else None
+        self.tables = Tables.prepared(mixtures[0], local, priors, log_weights)
         like = self.tables.mean
-        self._width = 0 if self._task is None else self._task.dimension(kinematics)
-        starts = () if self._task is None else self._task.quaternion_starts(kinematics)
+        self._width = 0 if self.task is None else self.task.dimension(kinematics)
+        starts = () if self.task is None else self.task.quaternion_starts(kinematics)
         self._blocks: Tensor | None = None
         if starts:
             self._blocks = like.new_zeros(self._width, like.shape[-2])
@@ -127,7 +93,7 @@ class TaskUpdate:
                 self._blocks[start : start + 4, start : start + 4] = 1.0
         self._plus, self._minus = like.new_ones(()), -like.new_ones(())
         # tasks make the covariance smaller, what keeps the components apart makes it larger
-        height = 3 * len(self._task.leaves) if self._task else 0
+        height = 3 * len(self.task.leaves) if self.task else 0
         self._signature = torch.cat((-like.new_ones(height), like.new_ones(1)))
 
     @staticmethod
@@ -183,13 +149,13 @@ class TaskUpdate:
             jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
         row = _flat(torch.cat((matrix, jacobian), -1), batch)  # (B, m, D + n)
         present = at.present
-        if present is None and self._task is not None:
-            present = self._task.coordinates(state, frames)
+        if present is None and self.task is not None:
+            present = self.task.coordinates(state, frames)
         flat = [row, shift] if present is None else [row, shift, _flat(present, batch, 1)]
         if time.ndim:
             time = _flat(time, batch, 0)
         if time.is_cuda or len(row) <= PART:
-            parts = self._part(choose(time), time, *flat)
+            parts = self.part(choose(time), time, *flat)
         else:
             parts = self._in_parts(choose, time, flat)
         if len(batch) == 1:
@@ -209,13 +175,13 @@ class TaskUpdate:
         results = []
         for part in order.split(PART):
             now = time[part] if time.ndim else time
-            results.append(self._part(choose(now), now, *(x[part] for x in flat)))
+            results.append(self.part(choose(now), now, *(x[part] for x in flat)))
         joints, covariance, activation = zip(*results, strict=True)
         back = order.argsort()
         every = torch.cat(activation)[back] if time.ndim else activation[0]
         return torch.cat(joints)[back], torch.cat(covariance)[back], every
 
-    def _part(
+    def part(
         self,
         tables: Tables,
         time: Tensor,
@@ -223,7 +189,25 @@ class TaskUpdate:
         shift: Tensor,
         present: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Joints (B, n), covariance (B, n, n) and activation (K,) or (B, K)."""
+        """The same for B robots that have been linearised.
+
+        Parameters
+        ----------
+        tables : Tables
+        time : Tensor of shape () or (B,)
+        row : Tensor of shape (B, m, D + n)
+            ``[M, J]``.
+        shift : Tensor of shape (B, m, 1)
+            ``c + J q_{t-1}``.
+        present : Tensor of shape (B, D), optional
+            The present quaternions.
+
+        Returns
+        -------
+        joints : Tensor of shape (B, n)
+        covariance : Tensor of shape (B, n, n)
+        activation : Tensor of shape (K,) or (B, K)
+        """
         apart = (time.unsqueeze(-1) if time.ndim else time) - tables.time_mean
         log_h = torch.addcmul(
             tables.log_weights, tables.time_precision, apart * apart, value=-0.5
@@ -297,13 +281,13 @@ class TaskUpdate:
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         joints = state.joints
-        if self._task is None:
+        if self.task is None:
             batch, n = joints.shape[:-1], joints.shape[-1]
             nothing = joints.new_zeros(*batch, 0)
             return Linearization(
                 joints.new_zeros(*batch, 0, n), joints.new_zeros(*batch, 0, 0), nothing
             )
-        return self._task.linearize(state, frames)
+        return self.task.linearize(state, frames)
 
     def _signs(self, mean: Tensor, present: Tensor) -> Tensor:
         """Signs (A, B, 1, D + n) that bring each mean quaternion to the present one's side."""
@@ -322,61 +306,3 @@ def _flat(tensor: Tensor, batch: torch.Size, own: int = 2) -> Tensor:
         if len(batch) == 1
         else tensor.reshape(batch.numel(), *tensor.shape[len(batch) :])
     )
-
-
-def _tables(
-    first: LocalMixture,
-    tasks: Sequence[LocalMixture],
-    priors: Sequence[LocalMixture],
-    log_weights: Tensor,
-) -> Tables:
-    """Tables of all components, prepared in float64: narrow directions lose digits first."""
-    like = first.mean
-    time_mean, variance = first.time_mean.double(), first.time_variance.double()
-
-    def recentred(mixture: LocalMixture) -> tuple[Tensor, Tensor, Tensor]:
-        gain = mixture.gain.double()
-        apart = time_mean - mixture.time_mean.double()
-        covariance = mixture.covariance.double()
-        gaussians.cholesky(covariance, "the covariance of a projected component")
-        return mixture.mean.double() + gain * apart[:, None], gain, covariance
-
-    parts = [recentred(mixture) for mixture in tasks]
-    parts.append(_product([recentred(mixture) for mixture in priors]))
-    means, gains, covariances = zip(*parts, strict=True)
-    size = sum(mean.shape[-1] for mean in means)
-    blocks, start = [], 0
-    for covariance in covariances:
-        end = start + covariance.shape[-1]
-        blocks.append(torch.nn.functional.pad(covariance, (start, size - end)))
-        start = end
-    count = len(time_mean)
-    return Tables(
-        torch.eye(count, dtype=like.dtype, device=like.device),
-        *(
-            table.to(like)
-            for table in (
-                time_mean,
-                1 / variance,
-                log_weights.double() - 0.5 * variance.log(),
-                torch.cat((*means[:-1], -means[-1]), -1)[..., None],
-                torch.cat((*gains[:-1], -gains[-1]), -1)[..., None],
-                torch.cat(blocks, -2),
-                covariances[-1].flatten(1),
-            )
-        ),
-    )
-
-
-def _product(
-    priors: Sequence[tuple[Tensor, Tensor, Tensor]],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean, gain and covariance of the product (2) of Gaussians over the joints."""
-    if len(priors) == 1:
-        return priors[0]
-    covariances = torch.stack([covariance for _, _, covariance in priors])
-    vectors = torch.stack([torch.stack((mean, gain), -1) for mean, gain, _ in priors])
-    inverses = torch.cholesky_inverse(gaussians.cholesky(covariances, "a joints' operator"))
-    factor = gaussians.cholesky(inverses.sum(0), "the product of the joints' operators")
-    mean, gain = torch.cholesky_solve((inverses @ vectors).sum(0), factor).unbind(-1)
-    return mean, gain, torch.cholesky_inverse(factor)
