@@ -41,7 +41,10 @@ def measure(settings: Settings) -> Iterator[Row]:
 def tick(
     model: TaskParameterizedGMM, settings: Settings, n_robots: int, own_clocks: bool = True
 ) -> Work:
-    """A tick of so many robots, 3 s after they began, or each a second sooner or later."""
+    """A tick of so many robots, 3 s after they began, or each a second sooner or later.
+
+    They have caught up with the skill by some ticks, as robots on their way have.
+    """
     situations = skill(settings).situations(n_robots, settings.seed + 2000)
     like = model.time_
     joints = torch.stack([situation.joints for situation in situations]).to(like)
@@ -52,6 +55,8 @@ def tick(
     time = torch.full((), 3.0).to(like)
     if own_clocks:
         time = time + torch.linspace(-1, 1, n_robots).to(like)
+    for _ in range(5):
+        joints = model.step(time, joints, frames).joints
 
     def work() -> object:
         with torch.inference_mode():

@@ -140,6 +140,17 @@ CASES = {
     "the paper's": Case(
         OnRobot(), [BOTH_HANDS, Canonical()], lambda at: [both_hands(at), oracles.canonical(at)]
     ),
+    "positions": Case(
+        OnRobot(),
+        [Stack(RelativePosition(LEFT, OBJECT), AbsolutePosition(RIGHT)), Canonical()],
+        lambda at: [
+            oracles.stack(
+                oracles.relative_position(at, LEFT, OBJECT),
+                oracles.absolute_position(at, RIGHT),
+            ),
+            oracles.canonical(at),
+        ],
+    ),
     "three": Case(
         OnRobot(),
         [RelativePosition(LEFT, OBJECT), pose_of(LEFT, RIGHT), Canonical()],

@@ -24,7 +24,7 @@ def assert_same(first, second, atol=1e-9):
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-@pytest.mark.parametrize("name", ["the paper's", "canonical", "three"])
+@pytest.mark.parametrize("name", ["the paper's", "canonical", "positions", "three"])
 def test_the_update_is_the_sum_of_precisions(name, batch):
     problem = Problem.of(CASES[name], 4, *batch)
     regression = problem.regression()

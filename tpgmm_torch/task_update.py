@@ -247,8 +247,8 @@ class TaskUpdate:
         a, b, m, size = row.shape
         n = size - self._width
         rows = row.reshape(a, b * m, size)
-        cross = torch.bmm(rows, tables.covariance).view(a * b, m, size)
-        row = rows.view(a * b, m, size)
+        cross = torch.bmm(rows, tables.covariance).reshape(a * b, m, size)
+        row = rows.reshape(a * b, m, size)
         h = torch.bmm(cross, row.mT)
         factor = gaussians.cholesky(h, "the covariance of the tasks")
         if mean.shape[1] == b:
@@ -256,27 +256,27 @@ class TaskUpdate:
             shift = shift.expand(a, b, m, 1).reshape(a * b, m, 1)
             innovation = torch.baddbmm(shift, row, mean)
         else:  # one time for all: one product per component
-            innovation = torch.baddbmm(shift.view(1, b * m, 1), rows, mean.squeeze(1))
-            innovation = innovation.view(a * b, m, 1)
+            innovation = torch.baddbmm(shift.reshape(1, b * m, 1), rows, mean.squeeze(1))
+            innovation = innovation.reshape(a * b, m, 1)
             mean = mean.expand(a, b, size, 1).reshape(a * b, size, 1)
         right = torch.cat((cross.narrow(-1, size - n, n), innovation), -1)
         white = torch.linalg.solve_triangular(factor, right, upper=False)  # (A B, m, n + 1)
         gain, innovation = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
         prior = mean.narrow(-2, size - n, n)
-        each = torch.baddbmm(prior, gain.mT, innovation, beta=-1).view(a, b, n)
+        each = torch.baddbmm(prior, gain.mT, innovation, beta=-1).reshape(a, b, n)
         by_component = (weights.T if weights.ndim == 2 else weights.unsqueeze(-1)).unsqueeze(-1)
         joints = (by_component * each).sum(0)
         # within the components C - G^T G, and between them: the law of total variance
-        apart = (each - joints).view(a, b, 1, n)
-        spread = torch.cat((gain.view(a, b, m, n), apart), -2)
+        apart = (each - joints).reshape(a, b, 1, n)
+        spread = torch.cat((gain.reshape(a, b, m, n), apart), -2)
         weighted = spread * (by_component * self._signature).unsqueeze(-1)
         if b == 1:
-            spread, weighted = (x.view(1, a * (m + 1), n) for x in (spread, weighted))
+            spread, weighted = (x.reshape(1, a * (m + 1), n) for x in (spread, weighted))
         else:
             spread, weighted = (
                 x.transpose(0, 1).reshape(b, a * (m + 1), n) for x in (spread, weighted)
             )
-        within = (weights @ tables.prior).view(-1, n, n)
+        within = (weights @ tables.prior).reshape(-1, n, n)
         return joints, torch.baddbmm(within, spread.mT, weighted)
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
