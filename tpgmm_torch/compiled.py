@@ -83,20 +83,30 @@ class CompiledRegression(Regression):
         rows += [frame.position.reshape(-1, 3) for frame in frames.values()]
         rows += [frame.orientation.reshape(-1, 4) for frame in frames.values()]
         tables = self._padded(time)
-        if len(rows[0]) <= PART or joints.is_cuda:
-            mean, covariance, activation = self._graph(time, rows, tables)
-        else:  # what is between the operations shall stay in the cache
-            parts = zip(*(row.split(PART) for row in rows), strict=True)
-            results = [self._graph(time, list(part), tables) for part in parts]
-            means, covariances, activations = zip(*results, strict=True)
-            mean, covariance = torch.cat(means), torch.cat(covariances)
-            activation = activations[0]
+        try:
+            mean, covariance, activation = self._parts(time, rows, tables)
+        except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+            raise DataError(
+                "the covariance of the tasks is not positive definite: a direction has no "
+                "variance; a larger reg_covar gives it some"
+            ) from error
         mean, covariance = mean.reshape(*batch, n), covariance.reshape(*batch, n, n)
         return self.bounded(mean, covariance, activation, bounds)
 
     def __getstate__(self) -> dict[str, Any]:
         """What can be stored: the graph is made anew."""
         return {name: value for name, value in vars(self).items() if name != "_graph"}
+
+    def _parts(
+        self, time: Tensor, rows: list[Tensor], tables: Tables
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        if len(rows[0]) <= PART or time.is_cuda:
+            return self._graph(time, rows, tables)
+        # what is between the operations shall stay in the cache
+        parts = zip(*(row.split(PART) for row in rows), strict=True)
+        results = [self._graph(time, list(part), tables) for part in parts]
+        joints, covariances, activations = zip(*results, strict=True)
+        return torch.cat(joints), torch.cat(covariances), activations[0]
 
     @cached_property
     def _terms(self) -> PoseTerms:

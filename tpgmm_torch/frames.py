@@ -45,7 +45,7 @@ def as_tensor(values: Any, name: str) -> Tensor:
         If it is not numeric, or holds NaN or infinity (the message says where).
     """
     if isinstance(values, float) and math.isfinite(values):
-        return torch.tensor(values, dtype=torch.float64)
+        return torch.scalar_tensor(values, dtype=torch.float64)
     if isinstance(values, Tensor) and not values.is_complex():
         tensor = (values if values.is_floating_point() else values.double()).clone()
     else:

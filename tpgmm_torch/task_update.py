@@ -91,7 +91,7 @@ class TaskUpdate:
             self._blocks = like.new_zeros(self._width, like.shape[-2])
             for start in starts:
                 self._blocks[start : start + 4, start : start + 4] = 1.0
-        self._plus, self._minus = like.new_ones(()), -like.new_ones(())
+        self._one = like.new_ones(())
         # tasks make the covariance smaller, what keeps the components apart makes it larger
         height = 3 * len(self.task.leaves) if self.task else 0
         self._signature = torch.cat((-like.new_ones(height), like.new_ones(1)))
@@ -293,7 +293,8 @@ class TaskUpdate:
         """Signs (A, B, 1, D + n) that bring each mean quaternion to the present one's side."""
         assert self._blocks is not None
         inner = (mean.narrow(-2, 0, self._width).squeeze(-1) * present) @ self._blocks
-        return torch.where(inner < 0, self._minus, self._plus).unsqueeze(-2)
+        # where no quaternion stands, inner is zero of either sign
+        return torch.copysign(self._one, inner + 1e-30).unsqueeze(-2)
 
 
 def _flat(tensor: Tensor, batch: torch.Size, own: int = 2) -> Tensor:
