@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -47,7 +47,10 @@ class Tables:
     def select(self, components: Sequence[int]) -> Tables:
         """Only some of the components."""
         index = torch.tensor(components, device=self.time_mean.device)
-        return Tables(*(getattr(self, field.name)[index] for field in fields(self)))
+        chosen = Tables(*(getattr(self, field.name)[index] for field in fields(self)))
+        # stored row by row of all components, which are multiplied with at once
+        rows = chosen.covariance.transpose(0, 1).contiguous()
+        return replace(chosen, covariance=rows.transpose(0, 1))
 
     def padded(self, components: Sequence[int], count: int) -> Tables:
         """Some of the components, and others without weight up to ``count``."""

@@ -90,7 +90,7 @@ class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
         Standard deviation of the prior around q_{t-1} where no operator determines every
         joint [rad].
     negligible : float, default=1e-9
-        With ``activation="time"``, components of a smaller weight are left out of a step.
+        With ``activation="time"``, shares of the largest weight below this do not count.
     blend : float, default=1.0
         Seconds over which ``predict`` fades out the difference between the start posture and
         the model's first reference (minimum jerk); 0 follows the model at once.

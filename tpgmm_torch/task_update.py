@@ -216,54 +216,89 @@ class TaskUpdate:
         mean = torch.addcmul(tables.mean, tables.gain, apart.unsqueeze(-1).unsqueeze(-1))
         # (A, B or 1, D + n, 1)
         mean = mean.transpose(0, 1) if time.ndim else mean.unsqueeze(1)
-        if present is None or self._blocks is None:
-            row = row.expand(len(mean), *row.shape)
-        else:
-            row = row * self._signs(mean, present)
-        joints, covariance = self._corrected(tables, weights, mean, row, shift)
+        if present is not None and self._blocks is not None:
+            signs = self._signs(mean, present)
+            # nearly always all components are on one side; a graph cannot depend on that
+            alike = not torch.compiler.is_compiling() and torch.equal(
+                signs, signs[:1].expand_as(signs)
+            )
+            row = row * (signs[0] if alike else signs)
+        measured = self._shared if row.ndim == 3 else self._own
+        h, right = measured(tables.covariance, mean, row, shift)
+        joints, covariance = self._corrected(tables.prior, weights, mean, h, right)
         return joints, covariance, weights @ tables.places
 
-    def _corrected(
-        self, tables: Tables, weights: Tensor, mean: Tensor, row: Tensor, shift: Tensor
+    def _shared(
+        self, covariance: Tensor, mean: Tensor, row: Tensor, shift: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Mean and covariance of the mixture of the updated components.
+        """H, and beside each other J C and the innovation: rows that all components share.
 
         Parameters
         ----------
-        tables : Tables
-        weights : Tensor of shape (A,) or (B, A)
+        covariance : Tensor of shape (A, D + n, D + n)
         mean : Tensor of shape (A, B or 1, D + n, 1)
             ``(mu; -m)``.
-        row : Tensor of shape (A, B, m, D + n)
+        row : Tensor of shape (B, m, D + n)
             ``[M, J]``.
         shift : Tensor of shape (B, m, 1)
             ``c + J q_{t-1}``.
 
         Returns
         -------
-        joints : Tensor of shape (B, n)
-        covariance : Tensor of shape (B, n, n)
+        h : Tensor of shape (A B, m, m)
+        right : Tensor of shape (A B, m, n + 1)
         """
-        a, b, m, size = row.shape
+        a, (b, m, size) = len(covariance), row.shape
+        wide = covariance.transpose(0, 1).reshape(size, a * size)
+        cross = (row.reshape(b * m, size) @ wide).reshape(b, m * a, size)
+        h = torch.bmm(cross, row.mT).reshape(b, m, a, m).permute(2, 0, 1, 3)
+        cross = cross.reshape(b, m, a, size).permute(2, 0, 1, 3)
+        means = mean.squeeze(-1).permute(1, 2, 0)  # (B or 1, D + n, A)
+        innovation = row @ (means[0] if len(means) == 1 else means) + shift  # (B, m, A)
+        innovation = innovation.permute(2, 0, 1).unsqueeze(-1)
         n = size - self._width
+        right = torch.cat((cross.narrow(-1, self._width, n), innovation), -1)
+        return h.reshape(a * b, m, m), right.reshape(a * b, m, n + 1)
+
+    def _own(
+        self, covariance: Tensor, mean: Tensor, row: Tensor, shift: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The same where each component has its own rows (A, B, m, D + n)."""
+        a, b, m, size = row.shape
         rows = row.reshape(a, b * m, size)
-        cross = torch.bmm(rows, tables.covariance).reshape(a * b, m, size)
+        cross = torch.bmm(rows, covariance).reshape(a * b, m, size)
         row = rows.reshape(a * b, m, size)
         h = torch.bmm(cross, row.mT)
-        factor = gaussians.cholesky(h, "the covariance of the tasks")
         if mean.shape[1] == b:
-            mean = mean.reshape(a * b, size, 1)
             shift = shift.expand(a, b, m, 1).reshape(a * b, m, 1)
-            innovation = torch.baddbmm(shift, row, mean)
+            innovation = torch.baddbmm(shift, row, mean.reshape(a * b, size, 1))
         else:  # one time for all: one product per component
             innovation = torch.baddbmm(shift.reshape(1, b * m, 1), rows, mean.squeeze(1))
             innovation = innovation.reshape(a * b, m, 1)
-            mean = mean.expand(a, b, size, 1).reshape(a * b, size, 1)
-        right = torch.cat((cross.narrow(-1, size - n, n), innovation), -1)
+        joints = cross.narrow(-1, self._width, size - self._width)
+        return h, torch.cat((joints, innovation), -1)
+
+    def _corrected(
+        self, prior: Tensor, weights: Tensor, mean: Tensor, h: Tensor, right: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Mean (B, n) and covariance (B, n, n) of the mixture of the updated components.
+
+        Parameters
+        ----------
+        prior : Tensor of shape (A, n * n)
+            C of each component.
+        weights : Tensor of shape (A,) or (B, A)
+        mean : Tensor of shape (A, B or 1, D + n, 1)
+        h, right : Tensor
+            See :meth:`_shared`.
+        """
+        m, n, a = h.shape[-1], right.shape[-1] - 1, len(mean)
+        b = len(h) // a
+        factor = gaussians.cholesky(h, "the covariance of the tasks")
         white = torch.linalg.solve_triangular(factor, right, upper=False)  # (A B, m, n + 1)
         gain, innovation = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
-        prior = mean.narrow(-2, size - n, n)
-        each = torch.baddbmm(prior, gain.mT, innovation, beta=-1).reshape(a, b, n)
+        negative = mean.narrow(-2, self._width, n).expand(a, b, n, 1).reshape(a * b, n, 1)
+        each = torch.baddbmm(negative, gain.mT, innovation, beta=-1).reshape(a, b, n)
         by_component = (weights.T if weights.ndim == 2 else weights.unsqueeze(-1)).unsqueeze(-1)
         joints = (by_component * each).sum(0)
         # within the components C - G^T G, and between them: the law of total variance
@@ -276,7 +311,7 @@ class TaskUpdate:
             spread, weighted = (
                 x.transpose(0, 1).reshape(b, a * (m + 1), n) for x in (spread, weighted)
             )
-        within = (weights @ tables.prior).reshape(-1, n, n)
+        within = (weights @ prior).reshape(-1, n, n)
         return joints, torch.baddbmm(within, spread.mT, weighted)
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
