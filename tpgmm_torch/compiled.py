@@ -52,7 +52,7 @@ class CompiledRegression(Regression):
     Parameters
     ----------
     backend : str
-        Of :func:`torch.compile`.
+        Of ``torch.compile``.
 
     Raises
     ------

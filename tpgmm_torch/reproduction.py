@@ -126,7 +126,7 @@ class Reproduction:
     def compile(self, backend: str = "inductor", n_robots: int = 1) -> Self:
         """Make :meth:`step`, :meth:`synthesis` and :meth:`predict` one compiled graph.
 
-        Kinematics, operators and fusion of a tick run as one graph of :func:`torch.compile`;
+        Kinematics, operators and fusion of a tick run as one graph of ``torch.compile``;
         what they give is the same. The graph of one robot is compiled at once, which takes a
         minute or so: not while a robot waits. Ticks with candidates, with several times or
         that are differentiated run as before.
@@ -134,7 +134,7 @@ class Reproduction:
         Parameters
         ----------
         backend : str, default="inductor"
-            Of :func:`torch.compile`; the default needs a C++ compiler.
+            Of ``torch.compile``; the default needs a C++ compiler.
         n_robots : int, default=1
             Batch size to compile for; any other is compiled when it first comes.
 
