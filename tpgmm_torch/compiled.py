@@ -19,7 +19,7 @@ from tpgmm_torch.kinematics import RobotState
 from tpgmm_torch.operators.pose_terms import PoseTerms, pose_terms
 from tpgmm_torch.regression import Estimate, Regression
 from tpgmm_torch.robots import Robot
-from tpgmm_torch.task_update import PART
+from tpgmm_torch.task_update import PART, TaskUpdate
 
 __all__ = ["CompiledRegression", "check_compiler"]
 
@@ -82,7 +82,7 @@ class CompiledRegression(Regression):
         rows = [joints.expand(*batch, n).reshape(-1, n)]
         rows += [frame.position.reshape(-1, 3) for frame in frames.values()]
         rows += [frame.orientation.reshape(-1, 4) for frame in frames.values()]
-        tables = self._padded(time)
+        tables = self._tables(time)
         try:
             mean, covariance, activation = self._parts(time, rows, tables)
         except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
@@ -141,10 +141,7 @@ class CompiledRegression(Regression):
                 for index, name in enumerate(terms.names)
             }
             at = terms.linearize(state, frames)
-            assert at.matrix is not None
-            assert at.jacobian is not None
-            row = torch.cat((at.matrix, at.jacobian), -1)
-            shift = at.displacement.unsqueeze(-1) + at.jacobian @ joints.unsqueeze(-1)
+            row, shift = update.measurement(at, joints, joints.shape[:-1])
             return update.part(tables, time, row, shift, at.present)
 
         # every batch size is a graph of its own, with nothing left open
@@ -153,17 +150,6 @@ class CompiledRegression(Regression):
             how["options"] = {"cpp_wrapper": True}
         return torch.compile(graph, **how)
 
-    def _padded(self, time: Tensor) -> Tables:
-        """Tables of one size at all times: what is added has no weight."""
-        active = self._active(time)
-        known = self._padded_tables
-        if active not in known:
-            assert self._update is not None
-            with torch.inference_mode(False):
-                size = max(self._windows.largest, len(active))
-                known[active] = self._update.tables.padded(active, size)
-        return known[active]
-
-    @cached_property
-    def _padded_tables(self) -> dict[tuple[int, ...], Tables]:
-        return {}
+    def _select(self, update: TaskUpdate, active: tuple[int, ...]) -> Tables:
+        """Tables of one size at all instants: what is added has no weight."""
+        return update.tables.padded(active, max(self._windows.largest, len(active)))

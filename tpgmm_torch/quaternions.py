@@ -48,18 +48,18 @@ OUTER = (
 
 
 #: What :func:`_constant` has made.
-CONSTANTS: dict[tuple[str, torch.dtype, torch.device], Tensor] = {}
+CONSTANTS: dict[tuple[torch.dtype, torch.device], dict[str, Tensor]] = {}
 
 
 def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Structure constants: a product with one of them stands for dozens of operations."""
-    key = name, dtype, device
+    key = dtype, device
     if key not in CONSTANTS:
-        CONSTANTS[key] = _structure(name, dtype).to(device)
-    return CONSTANTS[key]
+        CONSTANTS[key] = {n: matrix.to(device) for n, matrix in _structure(dtype).items()}
+    return CONSTANTS[key][name]
 
 
-def _structure(name: str, dtype: torch.dtype) -> Tensor:
+def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
     def linear(table: object, width: int) -> Tensor:  # of a table of signed places
         entries = [entry for row in table for entry in row]  # type: ignore[attr-defined]
         matrix = torch.zeros(width, len(entries), dtype=dtype)
@@ -78,7 +78,7 @@ def _structure(name: str, dtype: torch.dtype) -> Tensor:
         outer, eye = linear(OUTER, 9), torch.eye(4, dtype=dtype).flatten()
         pose = torch.zeros(4, 4, 16, dtype=dtype)
         pose[:3, :3], pose[3, 3] = outer.unflatten(0, (3, 3)), eye
-        constants = {
+        return {
             "conjugate": conjugate,
             "left": left,
             "right": right,
@@ -88,7 +88,6 @@ def _structure(name: str, dtype: torch.dtype) -> Tensor:
             "eye": eye,
             "pose": pose.flatten(0, 1),
         }
-        return constants[name]
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:

@@ -179,8 +179,11 @@ class Regression:
         active = self._active(time)
         if active not in self._selected:
             with torch.inference_mode(False):
-                self._selected[active] = self._update.tables.select(active)
+                self._selected[active] = self._select(self._update, active)
         return self._selected[active]
+
+    def _select(self, update: TaskUpdate, active: tuple[int, ...]) -> Tables:
+        return update.tables.select(active)
 
     def _fused(
         self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]

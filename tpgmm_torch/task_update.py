@@ -137,17 +137,15 @@ class TaskUpdate:
         activation : Tensor of shape (..., K)
         """
         at = self._linearize(state, frames)
-        jacobian, matrix, shift, joints = at.jacobian, at.matrix, at.displacement, state.joints
-        assert jacobian is not None and matrix is not None
-        instants = time.shape or joints.shape[:-1]
+        assert at.jacobian is not None and at.matrix is not None
+        joints = state.joints
         batch = gaussians.common_shape(
-            jacobian.shape[:-2], matrix.shape[:-2], shift.shape[:-1], instants
+            at.jacobian.shape[:-2],
+            at.matrix.shape[:-2],
+            at.displacement.shape[:-1],
+            time.shape or joints.shape[:-1],
         )
-        # y - J (m - q) = [M, J] (mu; -m) + c + J q
-        shift = _flat(shift.unsqueeze(-1) + jacobian @ joints.unsqueeze(-1), batch)
-        if jacobian.shape[:-2] != matrix.shape[:-2]:
-            jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
-        row = _flat(torch.cat((matrix, jacobian), -1), batch)  # (B, m, D + n)
+        row, shift = self.measurement(at, joints, batch)
         present = at.present
         if present is None and self.task is not None:
             present = self.task.coordinates(state, frames)
@@ -166,6 +164,33 @@ class TaskUpdate:
             covariance.reshape(*batch, *covariance.shape[-2:]),
             activation.reshape(*batch, -1) if time.ndim else activation,
         )
+
+    @staticmethod
+    def measurement(
+        at: Linearization, joints: Tensor, batch: torch.Size
+    ) -> tuple[Tensor, Tensor]:
+        """``y - J (m - q_{t-1}) = [M, J] (mu; -m) + c + J q_{t-1}``, for :meth:`part`.
+
+        Parameters
+        ----------
+        at : Linearization
+            With Jacobian and matrix.
+        joints : Tensor of shape (..., n)
+            The joints q_{t-1}.
+        batch : torch.Size
+            Of B robots.
+
+        Returns
+        -------
+        row : Tensor of shape (B, m, D + n)
+        shift : Tensor of shape (B, m, 1)
+        """
+        jacobian, matrix = at.jacobian, at.matrix
+        assert jacobian is not None and matrix is not None
+        shift = at.displacement.unsqueeze(-1) + jacobian @ joints.unsqueeze(-1)
+        if jacobian.shape[:-2] != matrix.shape[:-2]:
+            jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
+        return _flat(torch.cat((matrix, jacobian), -1), batch), _flat(shift, batch)
 
     def _in_parts(
         self, choose: Callable[[Tensor], Tables], time: Tensor, flat: Sequence[Tensor]

@@ -56,7 +56,7 @@ class PoseTerms:
         # the last row holds the present quaternions, by which hemispheres are chosen
         matrix = torch.zeros(len(operators), 16, height + 1, width, dtype=torch.float64)
         shift = torch.zeros(n_poses, 3, height, dtype=torch.float64)
-        turn, product = _rotation_products(), _quaternion_products()
+        product = _quaternion_products()
         rows: list[int] = []
         first: list[int] = []
         second: list[int] = []
@@ -71,7 +71,7 @@ class PoseTerms:
             if isinstance(operator, POSITIONS):
                 first.append(reference)
                 rows += range(6 * link, 6 * link + 3)
-                matrix[index, :, row : row + 3, column : column + 3] = turn
+                matrix[index, :, row : row + 3, column : column + 3] = product[:, 1:, 1:]
                 shift[link, axes, row + axes] = -1.0
                 if operator.references():
                     shift[reference, axes, row + axes] = 1.0
@@ -153,14 +153,10 @@ def pose_terms(
 
 
 def _quaternion_products() -> Tensor:
-    """``Hbar(conj a) H+(b)`` as coefficients (16, 4, 4) of the products ``a_i b_j``."""
+    """``Hbar(conj a) H+(b)`` as coefficients (16, 4, 4) of the products ``a_i b_j``.
+
+    Where a = b, the lower right 3 x 3 is the rotation matrix.
+    """
     basis = torch.eye(4, dtype=torch.float64)
     right = quaternions.right_matrix(quaternions.conjugate(basis))
     return (right[:, None] @ quaternions.left_matrix(basis)).flatten(0, 1)
-
-
-def _rotation_products() -> Tensor:
-    """The rotation matrix of ``a`` as coefficients (16, 3, 3) of the products ``a_i a_j``."""
-    basis = torch.eye(4, dtype=torch.float64)
-    right = quaternions.right_matrix(quaternions.conjugate(basis))
-    return (quaternions.left_matrix(basis)[:, None] @ right).flatten(0, 1)[:, 1:, 1:]
