@@ -8,7 +8,8 @@ import torch
 
 from tests.mixtures import CASES, Problem, local_mixture, random_local, times
 from tpgmm_torch import Canonical, Frame, Stack
-from tpgmm_torch.task_update import PART, TaskUpdate
+from tpgmm_torch.regression import PART
+from tpgmm_torch.task_update import TaskUpdate
 from tpgmm_torch.windows import Windows
 
 
@@ -64,7 +65,7 @@ def test_thousands_of_robots_are_parts_of_a_few(alike):
     problem = Problem.of(CASES["the paper's"], 5, count)
     regression = problem.regression()
     now = times() if alike else times(count)
-    whole = regression.step(now, problem.state, problem.frames)
+    whole = regression.tick(now, problem.state.joints, problem.frames)
     for index in (0, PART - 1, PART, count - 1):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
         one = regression.step(now if alike else now[index], problem.state[index], frames)

@@ -1,10 +1,18 @@
-"""The control tick as one compiled graph: kinematics, operators, update (torch.compile)."""
+"""The control tick as one compiled graph: kinematics, operators, update.
+
+The default is AOTInductor: what calls the kernels is compiled too, constants are part of it,
+and nothing is asked before a call, which counts where a tick takes a tenth of a millisecond.
+Other backends are those of torch.compile.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
-from collections.abc import Callable, Mapping
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,6 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tpgmm_torch import gaussians
+from tpgmm_torch.compiled_update import CompiledUpdate
 from tpgmm_torch.component_tables import Tables
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.frames import Frame
@@ -19,9 +29,12 @@ from tpgmm_torch.kinematics import RobotState
 from tpgmm_torch.operators.pose_terms import PoseTerms, pose_terms
 from tpgmm_torch.regression import Estimate, Regression
 from tpgmm_torch.robots import Robot
-from tpgmm_torch.task_update import PART, TaskUpdate
+from tpgmm_torch.task_update import TaskUpdate
 
 __all__ = ["CompiledRegression", "check_compiler"]
+
+#: Robots of a graph that serves many.
+PART = 64
 
 
 def check_compiler(backend: str) -> None:
@@ -71,42 +84,91 @@ class CompiledRegression(Regression):
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """One tick from the joints q_{t-1}; see :meth:`Regression.tick`."""
-        joints = self.kinematics.joint_tensor(joints)
-        poses = [frames[name] for name in self._terms.names if name in frames]
-        learning = torch.is_grad_enabled() and joints.requires_grad
-        if time.ndim or learning or len(poses) < len(self._terms.names):
+        names = self._terms.names
+        poses = [frames[name] for name in names if name in frames]
+        learning = torch.is_grad_enabled() and getattr(joints, "requires_grad", False)
+        if time.ndim or learning or len(poses) < len(names):
             return super().tick(time, joints, frames, bounds)
-        batch = torch.broadcast_shapes(joints.shape[:-1], *(f.batch_shape for f in poses))
-        n = joints.shape[-1]
-        frames = {name: frames[name].expand(batch) for name in self._terms.names}
-        rows = [joints.expand(*batch, n).reshape(-1, n)]
-        rows += [frame.position.reshape(-1, 3) for frame in frames.values()]
-        rows += [frame.orientation.reshape(-1, 4) for frame in frames.values()]
-        tables = self._tables(time)
-        try:
-            mean, covariance, activation = self._parts(time, rows, tables)
-        except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+        like = self.kinematics.lower
+        if not isinstance(joints, Tensor) or joints.dtype != like.dtype:
+            joints = self.kinematics.joint_tensor(joints)
+        batch = gaussians.common_shape(joints.shape[:-1], *(pose.batch_shape for pose in poses))
+        rows = [joints, *(p.position for p in poses), *(p.orientation for p in poses)]
+        run = self._one if batch.numel() == 1 else self._many
+        mean, covariance, activation = run(
+            rows, batch, [time, *vars(self._tables(time)).values()]
+        )
+        if not math.isfinite(mean.sum().item()):
+            self.kinematics.joint_tensor(joints)  # were they finite?
             raise DataError(
                 "the covariance of the tasks is not positive definite: a direction has no "
                 "variance; a larger reg_covar gives it some"
-            ) from error
-        mean, covariance = mean.reshape(*batch, n), covariance.reshape(*batch, n, n)
+            )
         return self.bounded(mean, covariance, activation, bounds)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What can be stored: the graph is made anew."""
-        return {name: value for name, value in vars(self).items() if name != "_graph"}
+        """What can be stored: graphs are made anew."""
+        return {name: value for name, value in vars(self).items() if name != "_graphs"}
 
-    def _parts(
-        self, time: Tensor, rows: list[Tensor], tables: Tables
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        if len(rows[0]) <= PART or time.is_cuda:
-            return self._graph(time, rows, tables)
-        # what is between the operations shall stay in the cache
-        parts = zip(*(row.split(PART) for row in rows), strict=True)
-        results = [self._graph(time, list(part), tables) for part in parts]
-        joints, covariances, activations = zip(*results, strict=True)
-        return torch.cat(joints), torch.cat(covariances), activations[0]
+    def _one(
+        self, rows: Sequence[Tensor], batch: torch.Size, shared: Sequence[Tensor]
+    ) -> Sequence[Tensor]:
+        """Joints, covariance and activation of one robot."""
+        flat = [row.reshape(row.shape[-1]).contiguous() for row in rows]
+        joints, covariance, activation = self._run([*flat, *shared])
+        if batch:
+            joints, covariance = (
+                joints.view(*batch, -1),
+                covariance.view(*batch, *covariance.shape),
+            )
+        return joints, covariance, activation
+
+    def _many(
+        self, rows: Sequence[Tensor], batch: torch.Size, shared: Sequence[Tensor]
+    ) -> Sequence[Tensor]:
+        """The same of robots of any number, each time of so many that the cache holds them."""
+        count, n = batch.numel(), rows[0].shape[-1]
+        flat = [row.expand(*batch, row.shape[-1]).reshape(count, row.shape[-1]) for row in rows]
+        if spare := -count % PART:
+            flat = [torch.cat((row, row[:1].expand(spare, -1))) for row in flat]
+        parts = zip(*(row.contiguous().split(PART) for row in flat), strict=True)
+        joints, covariance, activation = zip(
+            *(self._run([*part, *shared]) for part in parts), strict=True
+        )
+        # the graph's robots stand in the last dimension
+        whole = torch.cat(joints, -1)[:, :count].T.reshape(*batch, n)
+        covariances = torch.cat(covariance, -1)[..., :count].permute(2, 0, 1)
+        return whole, covariances.reshape(*batch, n, n), activation[0]
+
+    def _run(self, inputs: list[Tensor]) -> Sequence[Tensor]:
+        dimensions = inputs[0].ndim
+        if dimensions not in self._graphs:
+            self._graphs[dimensions] = self._compile(inputs)
+        return self._graphs[dimensions](inputs)
+
+    @cached_property
+    def _graphs(self) -> dict[int, Callable[[list[Tensor]], Sequence[Tensor]]]:
+        return {}
+
+    def _compile(self, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], Sequence[Tensor]]:
+        """The graph for inputs of such shapes."""
+        terms, update, robot = self._terms, self._update, self.kinematics
+        assert update is not None
+        assert isinstance(robot, Robot)
+        graph = _Tick(terms, update, robot)
+        if self.backend != "inductor":
+            compiled = torch.compile(graph, backend=self.backend, dynamic=False, fullgraph=True)
+            return lambda inputs: compiled(*inputs)
+        # a graph of tensors that are made here serves whoever has gradients on or off
+        with torch.inference_mode(False), torch.no_grad(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of what torch asks of itself
+            examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
+            program = torch.export.export(graph, examples)
+            with tempfile.TemporaryDirectory() as folder:
+                path = torch._inductor.aoti_compile_and_package(
+                    program, package_path=f"{folder}/tick.pt2"
+                )
+                return torch._inductor.aoti_load_package(path).loader.run
 
     @cached_property
     def _terms(self) -> PoseTerms:
@@ -124,32 +186,33 @@ class CompiledRegression(Regression):
             )
         return terms
 
-    @cached_property
-    def _graph(self) -> Callable[..., tuple[Tensor, Tensor, Tensor]]:
-        terms, update, robot = self._terms, self._update, self.kinematics
-        assert update is not None
-        assert isinstance(robot, Robot)
-        kinematics, links = robot.forward_kinematics, robot.links
-
-        def graph(
-            time: Tensor, rows: list[Tensor], tables: Tables
-        ) -> tuple[Tensor, Tensor, Tensor]:
-            joints, poses, count = rows[0], rows[1:], len(terms.names)
-            state = RobotState(joints, links, *kinematics(joints))
-            frames = {
-                name: Frame._from(poses[index], poses[count + index])
-                for index, name in enumerate(terms.names)
-            }
-            at = terms.linearize(state, frames)
-            row, shift = update.measurement(at, joints, joints.shape[:-1])
-            return update.part(tables, time, row, shift, at.present)
-
-        # every batch size is a graph of its own, with nothing left open
-        how: dict[str, Any] = {"backend": self.backend, "dynamic": False, "fullgraph": True}
-        if self.backend == "inductor":  # what calls the kernels is compiled too: half the time
-            how["options"] = {"cpp_wrapper": True}
-        return torch.compile(graph, **how)
-
     def _select(self, update: TaskUpdate, active: tuple[int, ...]) -> Tables:
         """Tables of one size at all instants: what is added has no weight."""
         return update.tables.padded(active, max(self._windows.largest, len(active)))
+
+
+class _Tick(torch.nn.Module):
+    """From joints, poses of objects, time and tables to what :class:`CompiledUpdate` gives."""
+
+    def __init__(self, terms: PoseTerms, update: TaskUpdate, robot: Robot) -> None:
+        super().__init__()
+        assert update.task is not None
+        self._terms, self._robot = terms, robot
+        self._update = CompiledUpdate(update.task, robot, robot.lower)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        names = self._terms.names
+        count = 1 + 2 * len(names)
+        (joints, *poses), (time, *tables) = inputs[:count], inputs[count:]
+        alone = joints.ndim == 1
+        if alone:
+            joints, *poses = (row.unsqueeze(0) for row in (joints, *poses))
+        pairs = zip(poses[: len(names)], poses[len(names) :], strict=True)
+        frames = {name: Frame._from(*pair) for name, pair in zip(names, pairs, strict=True)}
+        links, kinematics = self._robot.links, self._robot.forward_kinematics
+        state = RobotState(joints, links, *kinematics(joints))
+        at = self._terms.linearize(state, frames)
+        mean, covariance, activation = self._update(Tables(*tables), time, at, joints)
+        if alone:
+            return mean.squeeze(-1), covariance.squeeze(-1), activation
+        return mean, covariance, activation

@@ -2,11 +2,12 @@
 
 Each joint turns or slides along the z axis of its own frame, so that its axis is a column of
 the frame's pose, and the pose of a frame in its parent is linear in the sine and the cosine of
-the joint (or in the joint itself, where it slides). The poses in the base frame are the
-products along the tree. One batch of matrix products multiplies all frames by their parents;
-every further one doubles the number of joints that are behind: ten joints in a row need four.
-That costs more arithmetic and fewer operations than going from joint to joint, which is what
-a controller wants; many robots at once go level by level.
+the joint (or in the joint itself, where it slides). So is H+ of its unit quaternion in those of
+half the joint; both are 4 x 4 matrices, and multiply along the tree in the same operations.
+One batch of matrix products multiplies all of them by their parents; every further one doubles
+the number of joints that are behind: ten joints in a row need four. That costs more arithmetic
+and fewer operations than going from joint to joint, which is what a controller wants; many
+robots at once go level by level. Inside, the B robots stand in the last dimension.
 """
 
 from collections.abc import Sequence
@@ -25,6 +26,8 @@ __all__ = ["TreeKinematics"]
 #: Joint vectors at once from which arithmetic costs more than the number of operations.
 MANY = 16
 
+Array = NDArray[np.float64]
+
 
 class TreeKinematics:
     """Forward kinematics and geometric Jacobians of a :class:`MovingTree`.
@@ -41,76 +44,66 @@ class TreeKinematics:
     def __init__(
         self, tree: MovingTree, n_joints: int, dtype: torch.dtype, device: torch.device | str
     ) -> None:
-        depth = [len(tree.moved_by(index)) for index in range(len(tree.frames))]
-        order = sorted(range(len(tree.frames)), key=depth.__getitem__)
-        frames = [tree.frames[frame] for frame in order]
-        # the base is row 0, moving frames follow by their depth
-        row = {-1: 0} | {frame: place for place, frame in enumerate(order, start=1)}
-        parents = [0, *(row[frame.parent] for frame in frames)]
-        count = len(parents)
-
-        turned = {-1: np.eye(4)} | {f: _z_to(tree.frames[f].axis) for f in order}
-        parts = np.zeros((4, count, 4, 4))  # constant, sine, cosine, joint
-        parts[0, 0] = np.eye(4)
-        follow, shift = np.zeros((count, n_joints)), np.zeros((count, 1))
-        for place, (name, frame) in enumerate(zip(order, frames, strict=True), start=1):
-            offset = turned[frame.parent].T @ frame.offset @ turned[name]
-            motions = SLIDE if frame.prismatic else TURN
-            parts[:, place] = offset @ motions
-            follow[place, frame.joint], shift[place] = frame.multiplier, frame.shift
-        slides = np.array([False] + [frame.prismatic for frame in frames])
-
         def constant(values: Any) -> Tensor:
             return torch.from_numpy(np.ascontiguousarray(values)).to(device, dtype)
 
         def index(values: Any) -> Tensor:
             return torch.tensor(values, dtype=torch.long, device=device)
 
-        self._constant, self._sine, self._cosine, sliding = constant(parts)[:, :, None]
-        self._sliding = sliding if slides.any() else None  # (M, 1, 4, 4)
-        self._follow, self._shift = constant(follow), constant(shift)  # (M, n), (M, 1)
+        # bodies are the moving frames and, fixed to them, the links; each has two matrices
+        frames, links = tree.frames, tree.links
+        carriers = [frame.parent for frame in frames] + [link.frame for link in links]
+        depths = [1 + len(tree.moved_by(carrier)) for carrier in carriers]
+        order = np.argsort(depths, kind="stable").tolist()
+        row = {-1: 0} | {body: 1 + 2 * place for place, body in enumerate(order)}
+        count = 1 + 2 * len(order)
+        factors = np.zeros((4, count, 4, 4))  # of 1, sine, cosine, joint
+        factors[0, 0] = np.eye(4)
+        follow, shift = np.zeros((count, n_joints)), np.zeros((count, 1))
+        parents = [0] * count
+        turned = {-1: np.eye(4)} | {f: _z_to(frame.axis) for f, frame in enumerate(frames)}
+        for body, carrier in enumerate(carriers):
+            pose, turn = row[body], row[body] + 1
+            parents[pose], parents[turn] = row[carrier], row[carrier] + (carrier >= 0)
+            if body >= len(frames):
+                offset = turned[carrier].T @ links[body - len(frames)].pose
+                factors[0, pose], factors[0, turn] = offset, _left_matrix(offset)
+                continue
+            frame = frames[body]
+            offset = turned[carrier].T @ frame.offset @ turned[body]
+            factors[:, pose] = offset @ (SLIDE if frame.prismatic else TURN)
+            factors[:, turn] = _left_matrix(offset) @ (STAY if frame.prismatic else HALF_TURN)
+            follow[pose, frame.joint], shift[pose] = frame.multiplier, frame.shift
+            follow[turn], shift[turn] = follow[pose] / 2, shift[pose] / 2
+
+        # (N, 4, 4) each, for one robot, and with a dimension for many
+        one, many = constant(factors), constant(factors[..., None])
+        self._factors = {3: one.unbind(0), 4: many.unbind(0)}
+        self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
         self._hops = [index(hop) for hop in _hops(parents)]
-        ends = np.cumsum(np.bincount([0, *(depth[frame] for frame in order)])).tolist()
+        ends = np.cumsum([1, *(2 * np.bincount(depths)[1:])]).tolist()
         self._levels = [
-            (index([p - first for p in parents[start:end]]), start, end)
+            (index([parent - first for parent in parents[start:end]]), start, end)
             for first, start, end in zip([0, *ends], ends, ends[1:], strict=False)
         ]
-        self._links = index([row[link.frame] for link in tree.links])
-        tools = [turned[link.frame].T @ link.pose for link in tree.links]
-        self._tools = constant(np.reshape(tools, (-1, 1, 4, 4)))  # (L, 1, 4, 4)
 
-        moved = np.zeros((len(tree.links), count))
-        for link, attachment in enumerate(tree.links):
-            moved[link, [row[frame] for frame in tree.moved_by(attachment.frame)]] = 1
-        self._build_columns(moved, follow, slides, constant, index)
-
-    def _build_columns(
-        self,
-        moved: NDArray[np.float64],
-        follow: NDArray[np.float64],
-        slides: NDArray[np.bool_],
-        constant: Any,
-        index: Any,
-    ) -> None:
-        """Which frame moves each column of the Jacobians; the base stands for none."""
-        alone = ((follow != 0).sum(0) <= 1).all() and (follow[follow != 0] == 1).all()
-        columns = follow.argmax(0) * (follow != 0).any(0) if alone else np.arange(len(follow))
-        self._columns = index(columns.tolist())  # (C,)
-        mask = moved[:, columns]
-        still, slide = mask * ~slides[columns], mask * slides[columns]
-        # how an axis that turns and one that slides enter the six rows
-        self._turns = constant(np.repeat(still[:, :, None, None], 6, axis=-1))  # (L, C, 1, 6)
-        self._slides = constant(slide[:, :, None, None]) if slides.any() else None
-        twist = np.zeros((4, 3, 6))
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            twist[j, i, k], twist[i, j, k] = 1.0, -1.0
-            twist[3, i, 3 + i] = 1.0
-        self._twist, self._plain = (
-            constant(twist.reshape(12, 6)),
-            constant([1.0, 1.0, 1.0, 0.0]),
-        )
-        # where joints mimic others, several frames add up to one column
-        self._mimic = None if alone else constant(follow)  # (M, n)
+        # each column of the Jacobians is moved by a frame, or by none
+        column = {frame.joint: f for f, frame in enumerate(frames)}
+        columns = [column.get(joint, -1) for joint in range(n_joints)]
+        self._mimic = None
+        if len(column) < len(frames) or any(frame.multiplier != 1 for frame in frames):
+            # where joints mimic others, several frames add up to one column
+            columns = list(range(len(frames)))
+            self._mimic = constant(follow[[row[c] for c in columns]])  # (C, n)
+        bodies = [row[len(frames) + link] for link in range(len(links))]
+        wanted = [*bodies, *(row[c] for c in columns), *(body + 1 for body in bodies)]
+        self._wanted, self._n_links = index(wanted), len(links)
+        moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
+        mask = np.reshape(moved, (len(columns), len(links), 1, 1))
+        slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1, 1)
+        self._turns = constant(mask * ~slide)  # (C, L, 1, 1)
+        self._slides = constant(mask * slide) if slide.any() else None
+        self._one = constant(1.0)
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Poses and Jacobians in the base frame.
@@ -127,59 +120,70 @@ class TreeKinematics:
         jacobians : Tensor of shape (B, L, 6, n_joints)
             Linear rows above angular rows.
         """
-        frames = self._frames(joints)  # (M, B, 4, 4)
-        links = frames.index_select(0, self._links) @ self._tools  # (L, B, 4, 4)
-        moving = frames.index_select(0, self._columns)  # (C, B, 4, 4)
-        axis = moving.select(-1, 2).narrow(-1, 0, 3)
-        position = links.select(-1, 3)  # (x, 1)
-        # z x (x - p) and z are linear in the products of z with (x - p, 1)
-        lever = position.unsqueeze(1) - moving.select(-1, 3) * self._plain  # (L, C, B, 4)
-        products = lever.unsqueeze(-1) * axis.unsqueeze(-2)
-        twists = (products.flatten(-2) @ self._twist) * self._turns
+        batch, n_links, compiling = len(joints), self._n_links, torch.compiler.is_compiling()
+        if compiling:  # a sum is a loop that others can join
+            moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
+        else:
+            moved = torch.addmm(self._shift, self._follow, joints.T)  # (N, B)
+        if batch == 1 and not compiling:
+            # matrices in the last dimensions, where libraries want them
+            matrices = self._products(self._local(moved.view(-1, 1, 1)), batch)
+            chosen = matrices.index_select(0, self._wanted).unsqueeze(-1)
+        else:
+            matrices = self._products(self._local(moved.view(len(moved), 1, 1, batch)), batch)
+            chosen = matrices.index_select(0, self._wanted)
+        # of the links and of what moves columns the poses, of the links H+
+        poses, turns = chosen.split((len(chosen) - n_links, n_links))
+        quaternion = turns.select(2, 0)  # the first column, (L, 4, B)
+        quaternion = quaternion * torch.copysign(self._one, quaternion.narrow(1, 0, 1))
+        origins = poses[:, :3, 3]
+        position, origin = origins[:n_links], origins[n_links:]
+        axis = poses[n_links:, None, :3, 2]
+        turning = axis * self._turns  # (C, L, 3, B)
+        linear = _cross(turning, position - origin.unsqueeze(1))
         if self._slides is not None:
-            twists = twists + torch.nn.functional.pad(axis * self._slides, (0, 3))
-        jacobians = twists.permute(2, 0, 3, 1)  # (B, L, 6, C)
+            linear = linear + axis * self._slides
+        jacobians = torch.cat((linear, turning), 2).permute(3, 1, 2, 0)  # (B, L, 6, C)
         if self._mimic is not None:
             jacobians = jacobians @ self._mimic
-        orientations = quaternions.of_poses(links)
-        position = position.narrow(-1, 0, 3).transpose(0, 1)
-        return position, orientations.transpose(0, 1), jacobians
+        return position.permute(2, 0, 1), quaternion.permute(2, 0, 1), jacobians
 
-    def _frames(self, joints: Tensor) -> Tensor:
-        """Poses of the moving frames, the base first, shape (M, B, 4, 4)."""
-        moved = torch.addmm(self._shift, self._follow, joints.T)
-        moved = moved.view(*moved.shape, 1, 1)
-        local = torch.addcmul(self._constant, self._sine, moved.sin())
-        local = torch.addcmul(local, self._cosine, moved.cos())
-        if self._sliding is not None:
-            local = torch.addcmul(local, self._sliding, moved)
-        if len(joints) == 1:  # the fewer dimensions, the less each operation costs
-            local = local.squeeze(1)
+    def _local(self, moved: Tensor) -> Tensor:
+        """The matrices of all bodies in their carriers, the base first, (N, 4, 4[, B])."""
+        constant, sine, cosine, sliding = self._factors[moved.ndim]
+        local = torch.addcmul(constant, sine, moved.sin())
+        local = torch.addcmul(local, cosine, moved.cos())
+        return torch.addcmul(local, sliding, moved) if self._slides is not None else local
+
+    def _products(self, local: Tensor, batch: int) -> Tensor:
+        """Those in the base: the products along the tree, of the same shape."""
+        if batch < MANY and not torch.compiler.is_compiling():
             for hop in self._hops:
-                local = torch.bmm(local.index_select(0, hop), local)
-            return local.unsqueeze(1)
-        if len(joints) < MANY:
-            for hop in self._hops:
-                local = local.index_select(0, hop) @ local
+                local = _product(local.index_select(0, hop), local)
             return local
         levels = [local[:1]]
         for parents, start, end in self._levels:
-            levels.append(levels[-1].index_select(0, parents) @ local[start:end])
+            levels.append(_product(levels[-1].index_select(0, parents), local[start:end]))
         return torch.cat(levels)
 
 
-#: A frame's pose after its joint's motion, as the factors of 1, of the joint's sine and cosine,
-#: and of the joint itself: a turn about the z axis, and a way along it.
-TURN = np.zeros((4, 4, 4))
-TURN[0, [2, 3], [2, 3]] = 1.0
-TURN[1, [1, 0], [0, 1]] = 1.0, -1.0
-TURN[2, [0, 1], [0, 1]] = 1.0
-SLIDE = np.zeros((4, 4, 4))
-SLIDE[0] = np.eye(4)
-SLIDE[3, 2, 3] = 1.0
+def _product(first: Tensor, second: Tensor) -> Tensor:
+    """Products of matrices (N, 4, 4), or (N, 4, 4, B) with robots in the last dimension."""
+    if first.ndim == 3:
+        return torch.bmm(first, second)
+    return (first.unsqueeze(-2) * second.unsqueeze(-4)).sum(-3)
 
 
-def _z_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    """Cross products along the third dimension of (C, L, 3, B)."""
+    if first.shape[-1] < MANY and not torch.compiler.is_compiling():
+        return torch.linalg.cross(first, second, dim=2)
+    x, y, z = first.unbind(2)
+    u, v, w = second.unbind(2)
+    return torch.stack((y * w - z * v, z * u - x * w, x * v - y * u), 2)
+
+
+def _z_to(axis: Array) -> Array:
     """A rotation, as a matrix (4, 4), whose z axis is the given unit vector."""
     helper = np.eye(3)[np.abs(axis).argmin()]
     first = np.cross(helper, axis)
@@ -189,10 +193,33 @@ def _z_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     return matrix
 
 
+def _left_matrix(pose: Array) -> Array:
+    """``H+`` of a pose's unit quaternion."""
+    rotation = torch.from_numpy(np.ascontiguousarray(pose[:3, :3]))
+    return quaternions.left_matrix(quaternions.from_matrix(rotation)).numpy()
+
+
 def _hops(parents: Sequence[int]) -> list[list[int]]:
-    """Whom each frame is multiplied by: its parent, its ancestor of degree 2, 4, ..."""
+    """Whom each matrix is multiplied by: its parent, its ancestor of degree 2, 4, ..."""
     hops, ahead = [], list(parents)
     while any(ahead):
         hops.append(ahead)
-        ahead = [ahead[frame] for frame in ahead]
+        ahead = [ahead[node] for node in ahead]
     return hops
+
+
+#: A frame's pose after its joint's motion, as the factors of 1, of the joint's sine and cosine,
+#: and of the joint itself: a turn about the z axis, and a way along it. Then H+ of the same, in
+#: the sine and the cosine of half the joint.
+TURN = np.zeros((4, 4, 4))
+TURN[0, [2, 3], [2, 3]] = 1.0
+TURN[1, [1, 0], [0, 1]] = 1.0, -1.0
+TURN[2, [0, 1], [0, 1]] = 1.0
+SLIDE = np.zeros((4, 4, 4))
+SLIDE[0] = np.eye(4)
+SLIDE[3, 2, 3] = 1.0
+HALF_TURN = np.zeros((4, 4, 4))
+HALF_TURN[1, [3, 2, 1, 0], [0, 1, 2, 3]] = 1.0, 1.0, -1.0, -1.0
+HALF_TURN[2] = np.eye(4)
+STAY = np.zeros((4, 4, 4))
+STAY[0] = np.eye(4)

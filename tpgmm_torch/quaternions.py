@@ -25,7 +25,6 @@ __all__ = [
     "log",
     "match_hemisphere",
     "normalize",
-    "of_poses",
     "product",
     "right_matrix",
     "rotate",
@@ -75,18 +74,14 @@ def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
         # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
         turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
         pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
-        outer, eye = linear(OUTER, 9), torch.eye(4, dtype=dtype).flatten()
-        pose = torch.zeros(4, 4, 16, dtype=dtype)
-        pose[:3, :3], pose[3, 3] = outer.unflatten(0, (3, 3)), eye
         return {
             "conjugate": conjugate,
             "left": left,
             "right": right,
             "vector": right[:, 4:],
             "rotation": pairs[..., 1:, 1:].reshape(16, 9),
-            "outer": outer,
-            "eye": eye,
-            "pose": pose.flatten(0, 1),
+            "outer": linear(OUTER, 9),
+            "eye": torch.eye(4, dtype=dtype).flatten(),
         }
 
 
@@ -372,27 +367,8 @@ def from_matrix(matrix: Tensor) -> Tensor:
     if matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
     flat = matrix.flatten(-2) @ _constant("outer", matrix.dtype, matrix.device)
-    return _of_outer(flat + _constant("eye", matrix.dtype, matrix.device))
-
-
-def of_poses(poses: Tensor) -> Tensor:
-    """:func:`from_matrix` of homogeneous matrices, in fewer operations.
-
-    Parameters
-    ----------
-    poses : Tensor of shape (..., 4, 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
-    """
-    return _of_outer(poses.flatten(-2) @ _constant("pose", poses.dtype, poses.device))
-
-
-def _of_outer(flat: Tensor) -> Tensor:
-    """The quaternion q with real part non-negative, from the 16 entries of ``4 q q^T``."""
-    outer = flat.unflatten(-1, (4, 4))
-    # the column of the symmetric matrix that belongs to the largest entry of q
+    outer = (flat + _constant("eye", matrix.dtype, matrix.device)).unflatten(-1, (4, 4))
+    # the column of the symmetric 4 q q^T that belongs to the largest entry of q
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True).unsqueeze(-1)
     q = outer.gather(-1, largest.expand(*outer.shape[:-1], 1)).squeeze(-1)
     norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)

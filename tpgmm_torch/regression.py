@@ -18,6 +18,7 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.component_tables import Tables
 from tpgmm_torch.frames import Frame
+from tpgmm_torch.joint_limits import within
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
 from tpgmm_torch.operators import Linearization, Operator
@@ -26,6 +27,9 @@ from tpgmm_torch.trajectories import Candidate
 from tpgmm_torch.windows import Windows
 
 __all__ = ["Estimate", "Regression"]
+
+#: Robots at a time on a processor, whose cache then holds what is between the operations.
+PART = 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +119,50 @@ class Regression:
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
-        """:meth:`step` from a joint vector: kinematics included, without candidates."""
-        return self.step(time, self.kinematics.state(joints), frames, False, bounds)
+        """:meth:`step` from joint vectors: kinematics included, without candidates."""
+        joints = self.kinematics.joint_tensor(joints)
+        update = self._update
+        names = update.task.references() if update is not None and update.task else ()
+        poses = {name: frames[name] for name in names if name in frames}
+        batch = gaussians.common_shape(
+            joints.shape[:-1],
+            time.shape or joints.shape[:-1],
+            *(pose.batch_shape for pose in poses.values()),
+        )
+        if update is None or batch.numel() <= PART or time.is_cuda:
+            return self.step(time, self.kinematics.state(joints), frames, False, bounds)
+        return self.bounded(*self._in_parts(update, time, joints, poses, batch), bounds)
+
+    def _in_parts(
+        self,
+        update: TaskUpdate,
+        time: Tensor,
+        joints: Tensor,
+        poses: Mapping[str, Frame],
+        batch: torch.Size,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Part by part, of robots that are at about the same time: few components count."""
+        rows = [joints, *(p.position for p in poses.values())]
+        rows += [p.orientation for p in poses.values()]
+        if time.ndim:
+            rows.append(time.unsqueeze(-1))
+        rows = [row.expand(*batch, row.shape[-1]).flatten(0, -2) for row in rows]
+        if time.ndim:
+            order = rows[-1].squeeze(-1).argsort()
+            rows = [row[order] for row in rows]
+        results = []
+        for start, *given in zip(*(row.split(PART) for row in rows), strict=True):
+            now = given.pop().squeeze(-1) if time.ndim else time
+            pairs = zip(given[: len(poses)], given[len(poses) :], strict=True)
+            here = {name: Frame._from(*p) for name, p in zip(poses, pairs, strict=True)}
+            results.append(update(self._tables, now, self.kinematics.state(start), here))
+        means, covariances, activations = zip(*results, strict=True)
+        back = order.argsort() if time.ndim else slice(None)
+        mean = torch.cat(means)[back].unflatten(0, batch)
+        covariance = torch.cat(covariances)[back].unflatten(0, batch)
+        if time.ndim == 0:
+            return mean, covariance, activations[0]
+        return mean, covariance, torch.cat(activations)[back].unflatten(0, batch)
 
     @staticmethod
     def bounded(
@@ -127,7 +173,7 @@ class Regression:
     ) -> Estimate:
         """The estimate, given that joints keep within bounds if there are some."""
         if bounds is not None:
-            joints = _within(joints, covariance, *bounds)
+            joints = within(joints, covariance, *bounds)
         return Estimate(joints, covariance, activation)
 
     def expected(self, operator: int, time: Tensor) -> Tensor:
@@ -163,11 +209,11 @@ class Regression:
 
     def _active(self, time: Tensor) -> tuple[int, ...]:
         """Components that count at one instant, or from the first to the last of several."""
+        if self.activation == "time" and self.negligible != 0 and time.ndim == 0:
+            return self._windows.at(time.item())
         every = tuple(range(len(self.log_weights)))
         if self.activation != "time" or self.negligible == 0 or len(every) == 1:
             return every
-        if time.ndim == 0:
-            return self._windows.at(time.detach().item())
         learning = self.log_weights.requires_grad or self.mixtures[0].mean.requires_grad
         if learning or time.numel() == 0:  # windows would cost more than they save
             return every
@@ -283,38 +329,6 @@ class Regression:
             identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
             precision = precision + identity / self.prior_std**2
         return precision, vector, square
-
-
-def _within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """The mean, given that joints beyond a bound stand at it.
-
-    The other joints take over as the Gaussian says: clipping alone would move the hands away
-    from where they are wanted. A joint that is driven over a bound by that joins the ones that
-    stand, until none is left.
-    """
-    kept = torch.clamp(mean, lower, upper)
-    if torch.equal(kept, mean):
-        return mean
-    lower, upper = lower.expand_as(mean), upper.expand_as(mean)
-    some = (kept != mean).any(-1)  # of a batch, only these robots
-    means, lowers, uppers = mean[some], lower[some], upper[some]
-    precision = torch.cholesky_inverse(
-        gaussians.cholesky(covariance.expand(*mean.shape, -1)[some], "the product")
-    )
-    joints, standing = means, torch.zeros_like(means, dtype=torch.bool)
-    # bounds that contradict each other, of a robot that stands outside, end the loop too
-    while bool((beyond := ~standing & ((joints < lowers) | (joints > uppers))).any()):
-        standing = standing | beyond
-        limit = torch.clamp(joints, lowers, uppers)
-        # a joint that stands is known this many times better than the product knows it
-        weight = torch.where(standing, 1e10 * precision.diagonal(dim1=-2, dim2=-1), 0.0)
-        pull = (weight * (limit - means))[..., None]
-        factor = gaussians.cholesky(precision + torch.diag_embed(weight), "the product")
-        free = means + torch.cholesky_solve(pull, factor)[..., 0]
-        joints = torch.where(standing, limit, free)
-    whole = mean.clone()
-    whole[some] = joints
-    return whole
 
 
 def _hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:

@@ -43,9 +43,6 @@ __all__ = ["TaskUpdate"]
 #: the sum of precisions refuses and this form would not notice.
 TASKS = (AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation)
 
-#: Robots at a time on a processor, whose cache then holds what is between the operations.
-PART = 128
-
 
 class TaskUpdate:
     """The update of the joints' operator by all others.
@@ -152,13 +149,9 @@ class TaskUpdate:
         flat = [row, shift] if present is None else [row, shift, _flat(present, batch, 1)]
         if time.ndim:
             time = _flat(time, batch, 0)
-        if time.is_cuda or len(row) <= PART:
-            parts = self.part(choose(time), time, *flat)
-        else:
-            parts = self._in_parts(choose, time, flat)
+        joints, covariance, activation = self.part(choose(time), time, *flat)
         if len(batch) == 1:
-            return parts
-        joints, covariance, activation = parts
+            return joints, covariance, activation
         return (
             joints.reshape(*batch, -1),
             covariance.reshape(*batch, *covariance.shape[-2:]),
@@ -191,20 +184,6 @@ class TaskUpdate:
         if jacobian.shape[:-2] != matrix.shape[:-2]:
             jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
         return _flat(torch.cat((matrix, jacobian), -1), batch), _flat(shift, batch)
-
-    def _in_parts(
-        self, choose: Callable[[Tensor], Tables], time: Tensor, flat: Sequence[Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Part by part, of robots that are at about the same time: few components count."""
-        order = time.argsort() if time.ndim else torch.arange(len(flat[0]))
-        results = []
-        for part in order.split(PART):
-            now = time[part] if time.ndim else time
-            results.append(self.part(choose(now), now, *(x[part] for x in flat)))
-        joints, covariance, activation = zip(*results, strict=True)
-        back = order.argsort()
-        every = torch.cat(activation)[back] if time.ndim else activation[0]
-        return torch.cat(joints)[back], torch.cat(covariance)[back], every
 
     def part(
         self,

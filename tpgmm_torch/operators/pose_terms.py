@@ -83,9 +83,10 @@ class PoseTerms:
                 matrix[index, :, row : row + 3, block] = operator.gain * product[:, 1:]
                 matrix[index, :, height, block] = product[:, 0]
                 column += 4
-        self._matrix = matrix.flatten(0, 1).flatten(1).to(device, dtype)
+        # transposed: the rows of M side by side, as they are multiplied with
+        self._matrix = matrix.mT.flatten(0, 1).flatten(1).to(device, dtype)
         self._shift = shift.flatten(0, 1).to(device, dtype)
-        self._shape = (height + 1, width)
+        self._shape = (width, height + 1)
         self._pairs = torch.tensor([*first, *second], device=device)
         every = list(range(6 * len(links)))
         self._rows = None if rows == every else torch.tensor(rows, device=device)
@@ -110,8 +111,8 @@ class PoseTerms:
         half = len(self._pairs) // 2
         first, second = pairs.narrow(-2, 0, half), pairs.narrow(-2, half, half)
         products = first.unsqueeze(-1) * second.unsqueeze(-2)
-        matrix = (products.flatten(-3) @ self._matrix).unflatten(-1, self._shape)
-        shift = torch.cat(every, -2).flatten(-2) @ self._shift
+        matrix = _product(products.flatten(-3), self._matrix).unflatten(-1, self._shape).mT
+        shift = _product(torch.cat(every, -2).flatten(-2), self._shift)
         jacobian = state.jacobians.flatten(-3, -2)
         if self._rows is not None:
             jacobian = jacobian.index_select(-2, self._rows)
@@ -150,6 +151,13 @@ def pose_terms(
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):
         return PoseTerms(operators, links, dtype, device)
+
+
+def _product(row: Tensor, matrix: Tensor) -> Tensor:
+    """``row @ matrix``; for a compiler a sum, which is a loop that others can join."""
+    if torch.compiler.is_compiling():
+        return (row.unsqueeze(-1) * matrix).sum(-2)
+    return row @ matrix
 
 
 def _quaternion_products() -> Tensor:
