@@ -196,9 +196,8 @@ class _Tick(torch.nn.Module):
 
     def __init__(self, terms: PoseTerms, update: TaskUpdate, robot: Robot) -> None:
         super().__init__()
-        assert update.task is not None
         self._terms, self._robot = terms, robot
-        self._update = CompiledUpdate(update.task, robot, robot.lower)
+        self._update = CompiledUpdate(update.sides)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         names = self._terms.names

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.component_tables import Tables
-from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.operators import Linearization, Stack
+from tpgmm_torch.operators import Linearization
 
 __all__ = ["CompiledUpdate"]
 
@@ -23,22 +22,12 @@ class CompiledUpdate:
 
     Parameters
     ----------
-    task : Stack
-        Of operators whose coordinates are positions and quaternions, with three rows each.
-    kinematics : Kinematics
-    like : Tensor
-        Of the dtype and on the device that are wanted.
+    sides : Tensor of shape (m, D), optional
+        Which coordinates are the quaternion that a row is about.
     """
 
-    def __init__(self, task: Stack, kinematics: Kinematics, like: Tensor) -> None:
-        width = task.dimension(kinematics)
-        starts = set(task.quaternion_starts(kinematics))
-        self._sides = like.new_zeros(3 * len(task.leaves), width)  # of rows, by coordinates
-        column = 0
-        for index, leaf in enumerate(task.leaves):
-            if column in starts:
-                self._sides[3 * index : 3 * index + 3, column : column + 4] = 1.0
-            column += leaf.dimension(kinematics)
+    def __init__(self, sides: Tensor | None) -> None:
+        self._sides = sides
 
     def __call__(
         self, tables: Tables, time: Tensor, at: Linearization, joints: Tensor
@@ -74,20 +63,21 @@ class CompiledUpdate:
         weights = torch.softmax(
             tables.log_weights - 0.5 * tables.time_precision * apart * apart, -1
         )
-        mean = (tables.mean + tables.gain * apart[:, None, None]).squeeze(-1)  # (A, D + n)
+        mean = tables.mean + tables.gain * apart.unsqueeze(-1)  # (A, D + n)
         task, negative = mean[:, :width], mean[:, width:]
 
         # M mu and M S, J C and J (-m), of each component in turn: (A, D + 1, m, B) and so on
-        tasks = _mapped(tables.covariance[:, :width, :width], task, matrix)
-        cross = _mapped(tables.covariance[:, width:, width:], negative, jacobian)
-        # a mean quaternion on the other side of the sphere is minus itself, and so are its rows
-        sides = (task[:, None] * self._sides).unsqueeze(-1) * present  # (A, m, D, B)
-        signs = torch.where(sides.sum(2) < 0, -1.0, 1.0)
+        tasks = _mapped(tables.tasks, task, matrix)
+        cross = _mapped(tables.joints, negative, jacobian)
         h = (tasks[:, :-1].unsqueeze(3) * matrix.unsqueeze(1)).sum(1)  # (A, m, m, B)
-        h = h * signs.unsqueeze(1) * signs.unsqueeze(2)
+        measured = tasks[:, -1]  # (A, m, B)
+        if self._sides is not None:
+            # a mean quaternion on the other side of the sphere is minus itself, as are its rows
+            sides = (task.unsqueeze(1) * self._sides).unsqueeze(-1) * present  # (A, m, D, B)
+            signs = torch.where(sides.sum(2) < 0, -1.0, 1.0)
+            measured, h = measured * signs, h * signs.unsqueeze(1) * signs.unsqueeze(2)
         h = h + (cross[:, :-1].unsqueeze(3) * jacobian.unsqueeze(1)).sum(1)
-        innovation = tasks[:, -1] * signs + cross[:, -1]  # (A, m, B)
-        innovation = innovation + shift + (jacobian * joints.unsqueeze(1)).sum(0)
+        innovation = measured + cross[:, -1] + shift + (jacobian * joints.unsqueeze(1)).sum(0)
 
         right = torch.cat((cross[:, :-1].transpose(1, 2), innovation.unsqueeze(2)), 2)
         white = _whitened(torch.cat((h, right), 2).permute(1, 2, 0, 3))  # (m, n + 1, A, B)
@@ -97,8 +87,7 @@ class CompiledUpdate:
         joints = (each * by_component).sum(1)
         # within the components C - G^T G, and between them: the law of total variance
         apart = each - joints.unsqueeze(1)
-        n = len(joints)
-        covariance = (by_component * tables.prior).sum(0).reshape(n, n, 1)
+        covariance = (by_component.unsqueeze(-1) * tables.joints).sum(0).unsqueeze(-1)
         covariance = covariance - ((gain * by_component).unsqueeze(2) * gain.unsqueeze(1)).sum(
             (0, 3)
         )

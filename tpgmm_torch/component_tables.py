@@ -26,13 +26,13 @@ class Tables:
         The time marginals [s], [1/s^2].
     log_weights : Tensor of shape (A,)
         Of the components, with what of the time marginal's density does not change.
-    mean, gain : Tensor of shape (A, D + n, 1)
+    mean, gain : Tensor of shape (A, D + n)
         Local coordinates of the D task dimensions, and the *negative* n joints:
         ``E[x | t] = mean + gain (t - time_mean)``.
-    covariance : Tensor of shape (A, D + n, D + n)
-        Of these given time: a block for each task, and the prior's C.
-    prior : Tensor of shape (A, n * n)
-        C once more.
+    tasks : Tensor of shape (A, D, D)
+        Covariances of the task coordinates given time: a block for each task.
+    joints : Tensor of shape (A, n, n)
+        Those of the joints, C.
     """
 
     places: Tensor
@@ -41,16 +41,19 @@ class Tables:
     log_weights: Tensor
     mean: Tensor
     gain: Tensor
-    covariance: Tensor
-    prior: Tensor
+    tasks: Tensor
+    joints: Tensor
 
     def select(self, components: Sequence[int]) -> Tables:
         """Only some of the components."""
         index = torch.tensor(components, device=self.time_mean.device)
         chosen = Tables(*(getattr(self, field.name)[index] for field in fields(self)))
         # stored row by row of all components, which are multiplied with at once
-        rows = chosen.covariance.transpose(0, 1).contiguous()
-        return replace(chosen, covariance=rows.transpose(0, 1))
+        tasks, joints = (
+            table.transpose(0, 1).contiguous().transpose(0, 1)
+            for table in (chosen.tasks, chosen.joints)
+        )
+        return replace(chosen, tasks=tasks, joints=joints)
 
     def padded(self, components: Sequence[int], count: int) -> Tables:
         """Some of the components, and others without weight up to ``count``."""
@@ -97,12 +100,12 @@ class Tables:
         parts = [recentred(mixture) for mixture in tasks]
         parts.append(_product([recentred(mixture) for mixture in priors]))
         means, gains, covariances = zip(*parts, strict=True)
-        size = sum(mean.shape[-1] for mean in means)
-        blocks, start = [], 0
-        for covariance in covariances:
+        size, start, blocks = sum(mean.shape[-1] for mean in means[:-1]), 0, []
+        for covariance in covariances[:-1]:
             end = start + covariance.shape[-1]
             blocks.append(torch.nn.functional.pad(covariance, (start, size - end)))
             start = end
+        whole = torch.cat(blocks, -2) if blocks else means[-1].new_zeros(len(time_mean), 0, 0)
         count = len(time_mean)
         return cls(
             torch.eye(count, dtype=like.dtype, device=like.device),
@@ -112,10 +115,10 @@ class Tables:
                     time_mean,
                     1 / variance,
                     log_weights.double() - 0.5 * variance.log(),
-                    torch.cat((*means[:-1], -means[-1]), -1)[..., None],
-                    torch.cat((*gains[:-1], -gains[-1]), -1)[..., None],
-                    torch.cat(blocks, -2),
-                    covariances[-1].flatten(1),
+                    torch.cat((*means[:-1], -means[-1]), -1),
+                    torch.cat((*gains[:-1], -gains[-1]), -1),
+                    whole,
+                    covariances[-1],
                 )
             ),
         )

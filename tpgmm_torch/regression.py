@@ -120,28 +120,27 @@ class Regression:
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """:meth:`step` from joint vectors: kinematics included, without candidates."""
-        joints = self.kinematics.joint_tensor(joints)
-        update = self._update
-        names = update.task.references() if update is not None and update.task else ()
-        poses = {name: frames[name] for name in names if name in frames}
-        batch = gaussians.common_shape(
-            joints.shape[:-1],
-            time.shape or joints.shape[:-1],
-            *(pose.batch_shape for pose in poses.values()),
-        )
-        if update is None or batch.numel() <= PART or time.is_cuda:
+        if not isinstance(joints, Tensor):
+            joints = self.kinematics.joint_tensor(joints)
+        counts = [frame.position.numel() // 3 for frame in frames.values()]
+        count = max(joints.numel() // self.kinematics.n_joints, time.numel(), *counts)
+        if count <= PART or time.is_cuda or self._update is None:
             return self.step(time, self.kinematics.state(joints), frames, False, bounds)
-        return self.bounded(*self._in_parts(update, time, joints, poses, batch), bounds)
+        return self.bounded(*self._in_parts(self._update, time, joints, frames), bounds)
 
     def _in_parts(
         self,
         update: TaskUpdate,
         time: Tensor,
         joints: Tensor,
-        poses: Mapping[str, Frame],
-        batch: torch.Size,
+        frames: Mapping[str, Frame],
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Part by part, of robots that are at about the same time: few components count."""
+        joints = self.kinematics.joint_tensor(joints)
+        names = update.task.references() if update.task is not None else ()
+        poses = {name: frames[name] for name in names if name in frames}
+        shapes = [pose.batch_shape for pose in poses.values()]
+        batch = torch.broadcast_shapes(joints.shape[:-1], time.shape, *shapes)
         rows = [joints, *(p.position for p in poses.values())]
         rows += [p.orientation for p in poses.values()]
         if time.ndim:

@@ -9,8 +9,9 @@ Gaussians is then the Kalman update
 
 the information form by the matrix inversion lemma: as many dimensions as the
 tasks have (12 for two hands) in place of as many as there are joints, no pseudo-inverse and no
-epsilon. Inside, the A components stand in the first dimension and B robots in the second, so
-that what all robots share enters one matrix product per component.
+epsilon. Inside, B robots stand in the first dimension. What they share, the covariances of all
+A components side by side, enters one matrix product; then each has its components beside each
+other, so that sums over them are products too.
 """
 
 from __future__ import annotations
@@ -81,17 +82,11 @@ class TaskUpdate:
         self.task = Stack(*tasks) if tasks else None
         self.tables = Tables.prepared(mixtures[0], local, priors, log_weights)
         like = self.tables.mean
-        self._width = 0 if self.task is None else self.task.dimension(kinematics)
-        starts = () if self.task is None else self.task.quaternion_starts(kinematics)
-        self._blocks: Tensor | None = None
-        if starts:
-            self._blocks = like.new_zeros(self._width, like.shape[-2])
-            for start in starts:
-                self._blocks[start : start + 4, start : start + 4] = 1.0
+        #: Which coordinates (D) are the quaternion that a row (m) is about, if any.
+        self.sides: Tensor | None = None
+        if self.task is not None and self.task.quaternion_starts(kinematics):
+            self.sides = _sides(self.task, kinematics).to(like)
         self._one = like.new_ones(())
-        # tasks make the covariance smaller, what keeps the components apart makes it larger
-        height = 3 * len(self.task.leaves) if self.task else 0
-        self._signature = torch.cat((-like.new_ones(height), like.new_ones(1)))
 
     @staticmethod
     def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
@@ -142,56 +137,40 @@ class TaskUpdate:
             at.displacement.shape[:-1],
             time.shape or joints.shape[:-1],
         )
-        row, shift = self.measurement(at, joints, batch)
         present = at.present
-        if present is None and self.task is not None:
+        if present is None and self.sides is not None:
+            assert self.task is not None
             present = self.task.coordinates(state, frames)
-        flat = [row, shift] if present is None else [row, shift, _flat(present, batch, 1)]
+        # robot by robot, as libraries want matrices
+        jacobian, matrix = (_flat(x, batch).contiguous() for x in (at.jacobian, at.matrix))
+        shift = torch.baddbmm(
+            _flat(at.displacement, batch, 1).unsqueeze(-1),
+            jacobian,
+            _flat(joints, batch, 1).unsqueeze(-1),
+        )
+        if present is not None:
+            present = _flat(present, batch, 1)
         if time.ndim:
             time = _flat(time, batch, 0)
-        joints, covariance, activation = self.part(choose(time), time, *flat)
+        mean, covariance, activation = self._corrected(
+            choose(time), time, jacobian, matrix, shift, present
+        )
         if len(batch) == 1:
-            return joints, covariance, activation
+            return mean, covariance, activation
         return (
-            joints.reshape(*batch, -1),
+            mean.reshape(*batch, -1),
             covariance.reshape(*batch, *covariance.shape[-2:]),
             activation.reshape(*batch, -1) if time.ndim else activation,
         )
 
-    @staticmethod
-    def measurement(
-        at: Linearization, joints: Tensor, batch: torch.Size
-    ) -> tuple[Tensor, Tensor]:
-        """``y - J (m - q_{t-1}) = [M, J] (mu; -m) + c + J q_{t-1}``, for :meth:`part`.
-
-        Parameters
-        ----------
-        at : Linearization
-            With Jacobian and matrix.
-        joints : Tensor of shape (..., n)
-            The joints q_{t-1}.
-        batch : torch.Size
-            Of B robots.
-
-        Returns
-        -------
-        row : Tensor of shape (B, m, D + n)
-        shift : Tensor of shape (B, m, 1)
-        """
-        jacobian, matrix = at.jacobian, at.matrix
-        assert jacobian is not None and matrix is not None
-        shift = at.displacement.unsqueeze(-1) + jacobian @ joints.unsqueeze(-1)
-        if jacobian.shape[:-2] != matrix.shape[:-2]:
-            jacobian, matrix = (x.expand(*batch, -1, -1) for x in (jacobian, matrix))
-        return _flat(torch.cat((matrix, jacobian), -1), batch), _flat(shift, batch)
-
-    def part(
+    def _corrected(
         self,
         tables: Tables,
         time: Tensor,
-        row: Tensor,
+        jacobian: Tensor,
+        matrix: Tensor,
         shift: Tensor,
-        present: Tensor | None = None,
+        present: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The same for B robots that have been linearised.
 
@@ -199,124 +178,64 @@ class TaskUpdate:
         ----------
         tables : Tables
         time : Tensor of shape () or (B,)
-        row : Tensor of shape (B, m, D + n)
-            ``[M, J]``.
+        jacobian : Tensor of shape (B, m, n)
+        matrix : Tensor of shape (B, m, D)
         shift : Tensor of shape (B, m, 1)
             ``c + J q_{t-1}``.
         present : Tensor of shape (B, D), optional
             The present quaternions.
-
-        Returns
-        -------
-        joints : Tensor of shape (B, n)
-        covariance : Tensor of shape (B, n, n)
-        activation : Tensor of shape (K,) or (B, K)
         """
+        (b, m, n), a = jacobian.shape, len(tables.places)
         apart = (time.unsqueeze(-1) if time.ndim else time) - tables.time_mean
         log_h = torch.addcmul(
             tables.log_weights, tables.time_precision, apart * apart, value=-0.5
         )
         weights = torch.softmax(log_h, -1)  # (A,), or (B, A)
-        mean = torch.addcmul(tables.mean, tables.gain, apart.unsqueeze(-1).unsqueeze(-1))
-        # (A, B or 1, D + n, 1)
-        mean = mean.transpose(0, 1) if time.ndim else mean.unsqueeze(1)
-        if present is not None and self._blocks is not None:
-            signs = self._signs(mean, present)
-            # nearly always all components are on one side; a graph cannot depend on that
-            alike = not torch.compiler.is_compiling() and torch.equal(
-                signs, signs[:1].expand_as(signs)
-            )
-            row = row * (signs[0] if alike else signs)
-        measured = self._shared if row.ndim == 3 else self._own
-        h, right = measured(tables.covariance, mean, row, shift)
-        joints, covariance = self._corrected(tables.prior, weights, mean, h, right)
-        return joints, covariance, weights @ tables.places
+        # (mu; -m), (A, D + n) or (B, A, D + n)
+        mean = torch.addcmul(tables.mean, tables.gain, apart.unsqueeze(-1))
+        width = matrix.shape[-1]
+        task, negative = mean.narrow(-1, 0, width), mean.narrow(-1, width, n)
+        other = None
+        if present is not None and self.sides is not None:
+            signs = self._signs(task, present)  # (B, A, m)
+            # nearly always all components are on one side
+            first = signs.narrow(1, 0, 1)
+            matrix = matrix * first.mT
+            other = None if torch.equal(signs, first.expand_as(signs)) else signs * first
 
-    def _shared(
-        self, covariance: Tensor, mean: Tensor, row: Tensor, shift: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """H, and beside each other J C and the innovation: rows that all components share.
+        # J C and M S of all components; H, and the innovation y - J (m - q_{t-1})
+        crossed = _mapped(jacobian, tables.joints)  # (B, m A, n)
+        h = torch.bmm(_mapped(matrix, tables.tasks), matrix.mT)  # (B, m A, m)
+        innovation = matrix @ task.mT  # (B, m, A)
+        if other is not None:
+            h = h.view(b, m, a, m) * other.mT.unsqueeze(-1) * other.unsqueeze(1)
+            h, innovation = h.view(b, m * a, m), innovation * other.mT
+        h = torch.baddbmm(h, crossed, jacobian.mT)
+        innovation = innovation + (jacobian @ negative.mT + shift)
 
-        Parameters
-        ----------
-        covariance : Tensor of shape (A, D + n, D + n)
-        mean : Tensor of shape (A, B or 1, D + n, 1)
-            ``(mu; -m)``.
-        row : Tensor of shape (B, m, D + n)
-            ``[M, J]``.
-        shift : Tensor of shape (B, m, 1)
-            ``c + J q_{t-1}``.
-
-        Returns
-        -------
-        h : Tensor of shape (A B, m, m)
-        right : Tensor of shape (A B, m, n + 1)
-        """
-        a, (b, m, size) = len(covariance), row.shape
-        wide = covariance.transpose(0, 1).reshape(size, a * size)
-        cross = (row.reshape(b * m, size) @ wide).reshape(b, m * a, size)
-        h = torch.bmm(cross, row.mT).reshape(b, m, a, m).permute(2, 0, 1, 3)
-        cross = cross.reshape(b, m, a, size).permute(2, 0, 1, 3)
-        means = mean.squeeze(-1).permute(1, 2, 0)  # (B or 1, D + n, A)
-        innovation = row @ (means[0] if len(means) == 1 else means) + shift  # (B, m, A)
-        innovation = innovation.permute(2, 0, 1).unsqueeze(-1)
-        n = size - self._width
-        right = torch.cat((cross.narrow(-1, self._width, n), innovation), -1)
-        return h.reshape(a * b, m, m), right.reshape(a * b, m, n + 1)
-
-    def _own(
-        self, covariance: Tensor, mean: Tensor, row: Tensor, shift: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The same where each component has its own rows (A, B, m, D + n)."""
-        a, b, m, size = row.shape
-        rows = row.reshape(a, b * m, size)
-        cross = torch.bmm(rows, covariance).reshape(a * b, m, size)
-        row = rows.reshape(a * b, m, size)
-        h = torch.bmm(cross, row.mT)
-        if mean.shape[1] == b:
-            shift = shift.expand(a, b, m, 1).reshape(a * b, m, 1)
-            innovation = torch.baddbmm(shift, row, mean.reshape(a * b, size, 1))
-        else:  # one time for all: one product per component
-            innovation = torch.baddbmm(shift.reshape(1, b * m, 1), rows, mean.squeeze(1))
-            innovation = innovation.reshape(a * b, m, 1)
-        joints = cross.narrow(-1, self._width, size - self._width)
-        return h, torch.cat((joints, innovation), -1)
-
-    def _corrected(
-        self, prior: Tensor, weights: Tensor, mean: Tensor, h: Tensor, right: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Mean (B, n) and covariance (B, n, n) of the mixture of the updated components.
-
-        Parameters
-        ----------
-        prior : Tensor of shape (A, n * n)
-            C of each component.
-        weights : Tensor of shape (A,) or (B, A)
-        mean : Tensor of shape (A, B or 1, D + n, 1)
-        h, right : Tensor
-            See :meth:`_shared`.
-        """
-        m, n, a = h.shape[-1], right.shape[-1] - 1, len(mean)
-        b = len(h) // a
+        # component by component: [J C, innovation] in the coordinates where H is the identity
+        h = h.view(b, m, a, m).transpose(1, 2).reshape(b * a, m, m)
+        right = torch.cat(
+            (crossed.view(b, m, a, n).transpose(1, 2), innovation.mT.unsqueeze(-1)), -1
+        ).view(b * a, m, n + 1)
         factor = gaussians.cholesky(h, "the covariance of the tasks")
-        white = torch.linalg.solve_triangular(factor, right, upper=False)  # (A B, m, n + 1)
+        # transposed, so that the result is stored row by row
+        white = torch.linalg.solve_triangular(factor.mT, right.mT, upper=True, left=False).mT
         gain, innovation = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
-        negative = mean.narrow(-2, self._width, n).expand(a, b, n, 1).reshape(a * b, n, 1)
-        each = torch.baddbmm(negative, gain.mT, innovation, beta=-1).reshape(a, b, n)
-        by_component = (weights.T if weights.ndim == 2 else weights.unsqueeze(-1)).unsqueeze(-1)
-        joints = (by_component * each).sum(0)
+        negative = negative.expand(b, a, n).reshape(b * a, n, 1)
+        each = torch.baddbmm(negative, gain.mT, innovation, beta=-1).view(b, a, n)
+
+        heavy = weights.unsqueeze(-1)  # (A, 1), or (B, A, 1)
+        joints = (heavy * each).sum(1)
         # within the components C - G^T G, and between them: the law of total variance
-        apart = (each - joints).reshape(a, b, 1, n)
-        spread = torch.cat((gain.reshape(a, b, m, n), apart), -2)
-        weighted = spread * (by_component * self._signature).unsqueeze(-1)
-        if b == 1:
-            spread, weighted = (x.reshape(1, a * (m + 1), n) for x in (spread, weighted))
-        else:
-            spread, weighted = (
-                x.transpose(0, 1).reshape(b, a * (m + 1), n) for x in (spread, weighted)
-            )
-        within = (weights @ prior).reshape(-1, n, n)
-        return joints, torch.baddbmm(within, spread.mT, weighted)
+        covariance = (weights @ tables.joints.flatten(1)).reshape(-1, n, n)
+        weighted = gain.view(b, a, m, n) * heavy.unsqueeze(-1)
+        covariance = torch.baddbmm(
+            covariance, weighted.view(b, a * m, n).mT, gain.view(b, a * m, n), alpha=-1
+        )
+        apart = each - joints.unsqueeze(1)
+        covariance = torch.baddbmm(covariance, (apart * heavy).mT, apart)
+        return joints, covariance, weights @ tables.places
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         joints = state.joints
@@ -328,12 +247,31 @@ class TaskUpdate:
             )
         return self.task.linearize(state, frames)
 
-    def _signs(self, mean: Tensor, present: Tensor) -> Tensor:
-        """Signs (A, B, 1, D + n) that bring each mean quaternion to the present one's side."""
-        assert self._blocks is not None
-        inner = (mean.narrow(-2, 0, self._width).squeeze(-1) * present) @ self._blocks
+    def _signs(self, task: Tensor, present: Tensor) -> Tensor:
+        """Signs (B, A, m) that bring each mean quaternion to the present one's side."""
+        assert self.sides is not None
+        inner = (task * present.unsqueeze(1)) @ self.sides.mT
         # where no quaternion stands, inner is zero of either sign
-        return torch.copysign(self._one, inner + 1e-30).unsqueeze(-2)
+        return torch.copysign(self._one, inner + 1e-30)
+
+
+def _sides(task: Stack, kinematics: Kinematics) -> Tensor:
+    """1 where a row (m) is about a quaternion's coordinates (D); each leaf has three rows."""
+    sides = torch.zeros(3 * len(task.leaves), task.dimension(kinematics), dtype=torch.float64)
+    column = 0
+    for index, leaf in enumerate(task.leaves):
+        for start in leaf.quaternion_starts(kinematics):
+            sides[3 * index : 3 * index + 3, column + start : column + start + 4] = 1.0
+        column += leaf.dimension(kinematics)
+    return sides
+
+
+def _mapped(rows: Tensor, covariances: Tensor) -> Tensor:
+    """``R C`` of rows (B, m, D) and each of A covariances (A, D, D), (B, m A, D)."""
+    b, m, d = rows.shape
+    a = len(covariances)
+    wide = covariances.transpose(0, 1).reshape(d, a * d)
+    return (rows.reshape(b * m, d) @ wide).view(b, m * a, d)
 
 
 def _flat(tensor: Tensor, batch: torch.Size, own: int = 2) -> Tensor:
