@@ -95,9 +95,20 @@ class TreeKinematics:
             # where joints mimic others, several frames add up to one column
             columns = list(range(len(frames)))
             self._mimic = constant(follow[[row[c] for c in columns]])  # (C, n)
+        # which numbers of the matrices are wanted: columns of poses, and the first one of H+
         bodies = [row[len(frames) + link] for link in range(len(links))]
-        wanted = [*bodies, *(row[c] for c in columns), *(body + 1 for body in bodies)]
-        self._wanted, self._n_links = index(wanted), len(links)
+        movers = [row[c] for c in columns]
+        wanted = [
+            [16 * matrix + 4 * line + place for matrix in matrices for line in range(lines)]
+            for matrices, lines, place in (
+                (bodies, 3, 3),  # where links are
+                (movers, 3, 3),  # where the frames that move columns are,
+                (movers, 3, 2),  # and their axes
+                ([body + 1 for body in bodies], 4, 0),  # how links are turned
+            )
+        ]
+        self._wanted = index([number for numbers in wanted for number in numbers])
+        self._sizes = tuple(map(len, wanted))
         moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
         mask = np.reshape(moved, (len(columns), len(links), 1, 1))
         slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1, 1)
@@ -120,27 +131,23 @@ class TreeKinematics:
         jacobians : Tensor of shape (B, L, 6, n_joints)
             Linear rows above angular rows.
         """
-        batch, n_links, compiling = len(joints), self._n_links, torch.compiler.is_compiling()
+        batch, compiling = len(joints), torch.compiler.is_compiling()
         if compiling:  # a sum is a loop that others can join
             moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
         else:
             moved = torch.addmm(self._shift, self._follow, joints.T)  # (N, B)
-        if batch == 1 and not compiling:
-            # matrices in the last dimensions, where libraries want them
-            matrices = self._products(self._local(moved.view(-1, 1, 1)), batch)
-            chosen = matrices.index_select(0, self._wanted).unsqueeze(-1)
-        else:
-            matrices = self._products(self._local(moved.view(len(moved), 1, 1, batch)), batch)
-            chosen = matrices.index_select(0, self._wanted)
-        # of the links and of what moves columns the poses, of the links H+
-        poses, turns = chosen.split((len(chosen) - n_links, n_links))
-        quaternion = turns.select(2, 0)  # the first column, (L, 4, B)
+        # of one robot, matrices stand in the last dimensions, where libraries want them
+        alone = batch == 1 and not compiling
+        moved = moved.view(-1, 1, 1) if alone else moved.view(len(moved), 1, 1, batch)
+        matrices = self._products(self._local(moved), batch)
+        numbers = matrices.reshape(16 * len(moved), batch).index_select(0, self._wanted)
+        position, origin, axis, quaternion = numbers.split(self._sizes)
+        columns, links = self._turns.shape[:2]
+        position, quaternion = position.view(links, 3, batch), quaternion.view(links, 4, batch)
         quaternion = quaternion * torch.copysign(self._one, quaternion.narrow(1, 0, 1))
-        origins = poses[:, :3, 3]
-        position, origin = origins[:n_links], origins[n_links:]
-        axis = poses[n_links:, None, :3, 2]
+        origin, axis = (x.view(columns, 1, 3, batch) for x in (origin, axis))
         turning = axis * self._turns  # (C, L, 3, B)
-        linear = _cross(turning, position - origin.unsqueeze(1))
+        linear = _cross(turning, position - origin)
         if self._slides is not None:
             linear = linear + axis * self._slides
         jacobians = torch.cat((linear, turning), 2).permute(3, 1, 2, 0)  # (B, L, 6, C)
