@@ -83,14 +83,27 @@ class PoseTerms:
                 matrix[index, :, row : row + 3, block] = operator.gain * product[:, 1:]
                 matrix[index, :, height, block] = product[:, 0]
                 column += 4
-        # transposed: the rows of M side by side, as they are multiplied with
-        self._matrix = matrix.mT.flatten(0, 1).flatten(1).to(device, dtype)
-        self._shift = shift.flatten(0, 1).to(device, dtype)
+        # M transposed, since its rows are multiplied with, and c beside it: both are linear in
+        # products of two numbers of `numbers` below, positions being multiplied by one
+        size = width * (height + 1)
+        terms = matrix.new_zeros(16 * len(operators) + 3 * n_poses, size + height)
+        terms[: 16 * len(operators), :size] = matrix.mT.flatten(0, 1).flatten(1)
+        terms[16 * len(operators) :, size:] = shift.flatten(0, 1)
+        self._terms = terms.to(device, dtype)
         self._shape = (width, height + 1)
-        self._pairs = torch.tensor([*first, *second], device=device)
+        identity = 7 * n_poses
+        left = [
+            3 * n_poses + 4 * pose + i for pose in first for i in range(4) for _ in range(4)
+        ]
+        right = [
+            3 * n_poses + 4 * pose + j for pose in second for _ in range(4) for j in range(4)
+        ]
+        left += range(3 * n_poses)
+        right += [identity] * (3 * n_poses)
+        self._pairs = torch.tensor([*left, *right], device=device)
         every = list(range(6 * len(links)))
         self._rows = None if rows == every else torch.tensor(rows, device=device)
-        self._identity = quaternions.identity(dtype, device)[None]
+        self._identity = quaternions.identity(dtype, device)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J``, ``M``, ``c`` and the present quaternions of the stack."""
@@ -100,23 +113,19 @@ class PoseTerms:
         if positions.shape[:-2] != batch:
             positions = positions.expand(*batch, -1, 3)
             orientations = orientations.expand(*batch, -1, 4)
-        identity = self._identity.expand(*batch, 1, 4) if batch else self._identity
-        every, turned = [positions], [orientations]
-        for frame in poses:
-            if frame.position.shape[:-1] != batch:
-                frame = frame.expand(batch)
-            every.append(frame.position.unsqueeze(-2))
-            turned.append(frame.orientation.unsqueeze(-2))
-        pairs = torch.cat((*turned, identity), -2).index_select(-2, self._pairs)
-        half = len(self._pairs) // 2
-        first, second = pairs.narrow(-2, 0, half), pairs.narrow(-2, half, half)
-        products = first.unsqueeze(-1) * second.unsqueeze(-2)
-        matrix = _product(products.flatten(-3), self._matrix).unflatten(-1, self._shape).mT
-        shift = _product(torch.cat(every, -2).flatten(-2), self._shift)
+        poses = [p if p.position.shape[:-1] == batch else p.expand(batch) for p in poses]
+        numbers = [positions.flatten(-2), *(pose.position for pose in poses)]
+        numbers += [orientations.flatten(-2), *(pose.orientation for pose in poses)]
+        numbers.append(self._identity.expand(*batch, 4) if batch else self._identity)
+        left, right = torch.cat(numbers, -1).index_select(-1, self._pairs).chunk(2, -1)
+        both = _product(left * right, self._terms)
+        width, rows = self._shape
+        matrix = both.narrow(-1, 0, width * rows).unflatten(-1, self._shape).mT
+        height = rows - 1
+        shift = both.narrow(-1, width * rows, height)
         jacobian = state.jacobians.flatten(-3, -2)
         if self._rows is not None:
             jacobian = jacobian.index_select(-2, self._rows)
-        height = shift.shape[-1]
         present = matrix.select(-2, height)
         return Linearization(jacobian, matrix.narrow(-2, 0, height), shift, present)
 
