@@ -18,6 +18,7 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.compiled import PART
 from tpgmm_torch.exceptions import DataError, DependencyError, NotFittedError
 
 URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="lower"/>
@@ -121,13 +122,27 @@ def test_without_a_compiler_there_is_a_clear_error(monkeypatch):
         fitted().compile()
 
 
-# of torch's own compiler
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
-@pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs g++")
-def test_the_graph_of_the_default_backend():
+def test_the_graphs_of_the_default_backend():
     plain, compiled = fitted(), fitted().compile()
     with torch.inference_mode():
         for time in (0.0, 0.45, 1.0):
             actual = compiled.step(time, [0.2, 0.5], cup())
             assert_same(actual, plain.step(time, [0.2, 0.5], cup()))
+    # it asks nothing about strides: rows, columns and repetitions must come as it knows them
+    turned = torch.rand(2, PART + 3, dtype=torch.float64).T
+    for joints in (turned, turned[::2], turned[:1], turned[0].expand(3, 2)):
+        for frames in (cup(), cup(len(joints))):
+            assert_same(compiled.step(0.4, joints, frames), plain.step(0.4, joints, frames))
+    grid = turned[:6].reshape(2, 3, 2)
+    assert_same(compiled.step(0.4, grid, cup(3)), plain.step(0.4, grid, cup(3)))
+    assert len(compiled._regression()._graphs) == 2
+
+
+def test_a_direction_without_variance_is_an_error_and_no_number():
+    model = fitted().compile("aot_eager")
+    tables = model._regression()._update.tables
+    tables.tasks.mul_(-1)
+    model._regression()._selected.clear()
+    with pytest.raises(DataError, match="covariance of the tasks is not positive definite"):
+        model.step(0.5, [0.2, 0.5], cup())

@@ -33,7 +33,7 @@ from tpgmm_torch.task_update import TaskUpdate
 
 __all__ = ["CompiledRegression", "check_compiler"]
 
-#: Robots of a graph that serves many.
+#: Robots of the graph that serves many, whose numbers a processor's cache holds.
 PART = 64
 
 
@@ -65,7 +65,7 @@ class CompiledRegression(Regression):
     Parameters
     ----------
     backend : str
-        Of ``torch.compile``.
+        ``"inductor"`` compiles ahead of time; others are those of ``torch.compile``.
 
     Raises
     ------
@@ -126,12 +126,13 @@ class CompiledRegression(Regression):
     def _many(
         self, rows: Sequence[Tensor], batch: torch.Size, shared: Sequence[Tensor]
     ) -> Sequence[Tensor]:
-        """The same of robots of any number, each time of so many that the cache holds them."""
+        """The same of robots of any number; on a processor part by part, one graph for all."""
         count, n = batch.numel(), rows[0].shape[-1]
         flat = [row.expand(*batch, row.shape[-1]).reshape(count, row.shape[-1]) for row in rows]
-        if spare := -count % PART:
+        size = count if rows[0].is_cuda else PART
+        if spare := -count % size:
             flat = [torch.cat((row, row[:1].expand(spare, -1))) for row in flat]
-        parts = zip(*(row.contiguous().split(PART) for row in flat), strict=True)
+        parts = zip(*(row.contiguous().split(size) for row in flat), strict=True)
         joints, covariance, activation = zip(
             *(self._run([*part, *shared]) for part in parts), strict=True
         )
@@ -141,13 +142,13 @@ class CompiledRegression(Regression):
         return whole, covariances.reshape(*batch, n, n), activation[0]
 
     def _run(self, inputs: list[Tensor]) -> Sequence[Tensor]:
-        dimensions = inputs[0].ndim
-        if dimensions not in self._graphs:
-            self._graphs[dimensions] = self._compile(inputs)
-        return self._graphs[dimensions](inputs)
+        shape = inputs[0].shape
+        if shape not in self._graphs:
+            self._graphs[shape] = self._compile(inputs)
+        return self._graphs[shape](inputs)
 
     @cached_property
-    def _graphs(self) -> dict[int, Callable[[list[Tensor]], Sequence[Tensor]]]:
+    def _graphs(self) -> dict[torch.Size, Callable[[list[Tensor]], Sequence[Tensor]]]:
         return {}
 
     def _compile(self, inputs: Sequence[Tensor]) -> Callable[[list[Tensor]], Sequence[Tensor]]:

@@ -44,7 +44,7 @@ class Reproduction:
     kinematics_: Kinematics
     frame_names_: tuple[str, ...]
     time_: Tensor
-    #: Of torch.compile; None until :meth:`compile` is called.
+    #: What compiles; None until :meth:`compile` is called.
     _backend: str | None = None
 
     def predict(
@@ -126,17 +126,19 @@ class Reproduction:
     def compile(self, backend: str = "inductor", n_robots: int = 1) -> Self:
         """Make :meth:`step`, :meth:`synthesis` and :meth:`predict` one compiled graph.
 
-        Kinematics, operators and fusion of a tick run as one graph of ``torch.compile``;
-        what they give is the same. The graph of one robot is compiled at once, which takes a
-        minute or so: not while a robot waits. Ticks with candidates, with several times or
-        that are differentiated run as before.
+        Kinematics, operators and fusion of a tick run as one graph, compiled ahead of time by
+        AOTInductor; what they give is the same. There is a graph for one robot and one for
+        any number of robots. The one that is asked for is compiled at once, which takes about
+        a minute: not while a robot waits. Ticks with candidates, with several times or that
+        are differentiated run as before.
 
         Parameters
         ----------
         backend : str, default="inductor"
-            Of ``torch.compile``; the default needs a C++ compiler.
+            AOTInductor, which needs a C++ compiler; others are those of ``torch.compile``.
         n_robots : int, default=1
-            Batch size to compile for; any other is compiled when it first comes.
+            How many robots to compile for now, one or several; the other graph is compiled
+            when it is first needed.
 
         Returns
         -------
