@@ -80,19 +80,18 @@ class CompiledUpdate:
         innovation = measured + cross[:, -1] + shift + (jacobian * joints.unsqueeze(1)).sum(0)
 
         right = torch.cat((cross[:, :-1].transpose(1, 2), innovation.unsqueeze(2)), 2)
-        white = _whitened(torch.cat((h, right), 2).permute(1, 2, 0, 3))  # (m, n + 1, A, B)
-        gain, innovation = white[:, :-1], white[:, -1:]
-        by_component = weights.unsqueeze(-1)  # (A, 1)
-        each = (gain * innovation).sum(0) - negative.T.unsqueeze(-1)  # (n, A, B)
-        joints = (each * by_component).sum(1)
+        white = _whitened(torch.cat((h, right), 2).transpose(0, 1))  # (m, A, n + 1, B)
+        gain, innovation = white[:, :, :-1], white[:, :, -1:]
+        by_component = weights[:, None, None]  # (A, 1, 1)
+        each = (gain * innovation).sum(0) - negative.unsqueeze(-1)  # (A, n, B)
+        joints = (each * by_component).sum(0)
         # within the components C - G^T G, and between them: the law of total variance
-        apart = each - joints.unsqueeze(1)
-        covariance = (by_component.unsqueeze(-1) * tables.joints).sum(0).unsqueeze(-1)
-        covariance = covariance - ((gain * by_component).unsqueeze(2) * gain.unsqueeze(1)).sum(
-            (0, 3)
-        )
-        between = ((apart * by_component).unsqueeze(1) * apart).sum(2)
-        return joints, covariance + between, (by_component * tables.places).sum(0)
+        apart = each - joints
+        covariance = (by_component * tables.joints).sum(0).unsqueeze(-1)
+        less = ((gain * by_component).unsqueeze(3) * gain.unsqueeze(2)).sum((0, 1))
+        between = ((apart * by_component).unsqueeze(2) * apart.unsqueeze(1)).sum(0)
+        activation = (weights.unsqueeze(-1) * tables.places).sum(0)
+        return joints, covariance - less + between, activation
 
 
 def _mapped(covariance: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
@@ -106,10 +105,11 @@ def _mapped(covariance: Tensor, mean: Tensor, rows: Tensor) -> Tensor:
 
 
 def _whitened(matrix: Tensor) -> Tensor:
-    """``L^-1 R`` of ``[H, R]`` (m, m + r, ...), with H = L L^T: elimination, row by row."""
+    """``L^-1 R`` of ``[H, R]`` (m, A, m + r, B), with H = L L^T: elimination, row by row."""
     rows = []
     for left in range(len(matrix), 0, -1):  # what is left of H
-        row = matrix[0] * torch.rsqrt(matrix[0, :1])
-        rows.append(row[left:])
-        matrix = matrix[1:, 1:] - row[1:left].unsqueeze(1) * row[1:]
+        row = matrix[0] * torch.rsqrt(matrix[0, :, :1])
+        rows.append(row[:, left:])
+        below = row[:, 1:left].transpose(0, 1).unsqueeze(2)
+        matrix = matrix[1:, :, 1:] - below * row[:, 1:]
     return torch.stack(rows)

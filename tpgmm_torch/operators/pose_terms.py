@@ -163,8 +163,8 @@ def pose_terms(
 
 
 def _product(row: Tensor, matrix: Tensor) -> Tensor:
-    """``row @ matrix``; for a compiler a sum, which is a loop that others can join."""
-    if torch.compiler.is_compiling():
+    """``row @ matrix``; of one robot, for a compiler, a sum: a loop that others can join."""
+    if torch.compiler.is_compiling() and row.numel() == row.shape[-1]:
         return (row.unsqueeze(-1) * matrix).sum(-2)
     return row @ matrix
 
