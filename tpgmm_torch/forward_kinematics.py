@@ -10,6 +10,7 @@ and fewer operations than going from joint to joint, which is what a controller 
 robots at once go level by level. Inside, the B robots stand in the last dimension.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -81,11 +82,14 @@ class TreeKinematics:
         self._factors = {3: one.unbind(0), 4: many.unbind(0)}
         self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
         self._hops = [index(hop) for hop in _hops(parents)]
-        ends = np.cumsum([1, *(2 * np.bincount(depths)[1:])]).tolist()
-        self._levels = [
-            (index([parent - first for parent in parents[start:end]]), start, end)
-            for first, start, end in zip([0, *ends], ends, ends[1:], strict=False)
-        ]
+        # level by level: how many there are, and whose products with their parents they are
+        self._counts = [1, *(2 * np.bincount(depths)[1:]).tolist()]
+        self._parents: list[Tensor | None] = []
+        first, start = 0, 1
+        for before, number in itertools.pairwise(self._counts):
+            places = [parent - first for parent in parents[start : start + number]]
+            first, start = start, start + number
+            self._parents.append(None if places == list(range(before)) else index(places))
 
         # each column of the Jacobians is moved by a frame, or by none
         column = {frame.joint: f for f, frame in enumerate(frames)}
@@ -168,9 +172,14 @@ class TreeKinematics:
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
             return local
-        levels = [local[:1]]
-        for parents, start, end in self._levels:
-            levels.append(_product(levels[-1].index_select(0, parents), local[start:end]))
+        base, *others = local.unsqueeze(1).split(self._counts)
+        level = base.squeeze(1)
+        levels = [level]
+        for parents, part in zip(self._parents, others, strict=True):
+            if parents is not None:
+                level = level.index_select(0, parents)
+            level = (level.unsqueeze(3) * part).sum(2)
+            levels.append(level)
         return torch.cat(levels)
 
 
