@@ -19,7 +19,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.compiled import PART
-from tpgmm_torch.exceptions import DataError, DependencyError, NotFittedError
+from tpgmm_torch.exceptions import DataError, DependencyError, NotFittedError, ShapeError
 
 URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="lower"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
@@ -134,6 +134,15 @@ def test_the_graphs_of_the_default_backend():
     for joints in (turned, turned[::2], turned[:1], turned[0].expand(3, 2)):
         for frames in (cup(), cup(len(joints))):
             assert_same(compiled.step(0.4, joints, frames), plain.step(0.4, joints, frames))
+    # nor about types, nor whether there are more components than anywhere in time
+    single = {OBJECT: Frame(cup()[OBJECT].position.float())}
+    now, near = torch.tensor(0.4), compiled.kinematics_.joint_tensor([0.2, 0.5])
+    actual = compiled._regression().tick(now, near.float(), single)
+    assert_same(actual, plain.step(0.4, [0.2, 0.5], cup()), atol=1e-7)
+    assert_same(compiled.step(50.0, near, cup()), plain.step(50.0, near, cup()))
+    with pytest.raises(ShapeError, match=r"shape \(\.\.\., 2\)"):
+        compiled.step(0.4, near[:1], cup())
+    assert compiled.step(0.4, turned[:0], cup()).joints.shape == (0, 2)
     grid = turned[:6].reshape(2, 3, 2)
     assert_same(compiled.step(0.4, grid, cup(3)), plain.step(0.4, grid, cup(3)))
     assert len(compiled._regression()._graphs) == 2

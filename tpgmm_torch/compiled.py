@@ -84,20 +84,22 @@ class CompiledRegression(Regression):
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """One tick from the joints q_{t-1}; see :meth:`Regression.tick`."""
-        names = self._terms.names
+        names, n = self._terms.names, self.kinematics.n_joints
         poses = [frames[name] for name in names if name in frames]
-        learning = torch.is_grad_enabled() and getattr(joints, "requires_grad", False)
+        if not isinstance(joints, Tensor) or joints.shape[-1:] != (n,):
+            joints = self.kinematics.joint_tensor(joints)
+        learning = torch.is_grad_enabled() and joints.requires_grad
         if time.ndim or learning or len(poses) < len(names):
             return super().tick(time, joints, frames, bounds)
-        like = self.kinematics.lower
-        if not isinstance(joints, Tensor) or joints.dtype != like.dtype:
-            joints = self.kinematics.joint_tensor(joints)
         batch = gaussians.common_shape(joints.shape[:-1], *(pose.batch_shape for pose in poses))
+        tables = self._tables(time)
+        if batch.numel() == 0 or len(tables.places) > self._windows.largest:
+            return super().tick(time, joints, frames, bounds)
+        like = self.kinematics.lower
         rows = [joints, *(p.position for p in poses), *(p.orientation for p in poses)]
+        rows = [row.to(like) for row in rows]  # a graph does not ask what it is given
         run = self._one if batch.numel() == 1 else self._many
-        mean, covariance, activation = run(
-            rows, batch, [time, *vars(self._tables(time)).values()]
-        )
+        mean, covariance, activation = run(rows, batch, [time.to(like), *vars(tables).values()])
         if not math.isfinite(mean.sum().item()):
             self.kinematics.joint_tensor(joints)  # were they finite?
             raise DataError(
@@ -188,7 +190,7 @@ class CompiledRegression(Regression):
         return terms
 
     def _select(self, update: TaskUpdate, active: tuple[int, ...]) -> Tables:
-        """Tables of one size at all instants: what is added has no weight."""
+        """Tables of one size within the windows: what is added has no weight."""
         return update.tables.padded(active, max(self._windows.largest, len(active)))
 
 
