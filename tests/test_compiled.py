@@ -134,18 +134,30 @@ def test_the_graphs_of_the_default_backend():
     for joints in (turned, turned[::2], turned[:1], turned[0].expand(3, 2)):
         for frames in (cup(), cup(len(joints))):
             assert_same(compiled.step(0.4, joints, frames), plain.step(0.4, joints, frames))
-    # nor about types, nor whether there are more components than anywhere in time
+    # nor about types
     single = {OBJECT: Frame(cup()[OBJECT].position.float())}
     now, near = torch.tensor(0.4), compiled.kinematics_.joint_tensor([0.2, 0.5])
     actual = compiled._regression().tick(now, near.float(), single)
     assert_same(actual, plain.step(0.4, [0.2, 0.5], cup()), atol=1e-7)
-    assert_same(compiled.step(50.0, near, cup()), plain.step(50.0, near, cup()))
     with pytest.raises(ShapeError, match=r"shape \(\.\.\., 2\)"):
         compiled.step(0.4, near[:1], cup())
     assert compiled.step(0.4, turned[:0], cup()).joints.shape == (0, 2)
     grid = turned[:6].reshape(2, 3, 2)
     assert_same(compiled.step(0.4, grid, cup(3)), plain.step(0.4, grid, cup(3)))
     assert len(compiled._regression()._graphs) == 2
+
+
+def test_more_components_than_the_graph_knows_run_as_before():
+    plain, compiled = (fitted().set_params(negligible=1e-2) for _ in range(2))
+    compiled.compile("aot_eager")
+    regression = compiled._regression()
+    assert regression._windows.largest < compiled.n_components
+    tables = []
+    graph = regression._graphs[torch.Size([2])]
+    regression._graphs[torch.Size([2])] = lambda inputs: tables.append(inputs) or graph(inputs)
+    for time, served in ((0.4, 1), (50.0, 1), (0.5, 2)):
+        assert_same(compiled.step(time, [0.2, 0.5], cup()), plain.step(time, [0.2, 0.5], cup()))
+        assert len(tables) == served
 
 
 def test_a_direction_without_variance_is_an_error_and_no_number():
