@@ -78,8 +78,8 @@ class TreeKinematics:
             follow[turn], shift[turn] = follow[pose] / 2, shift[pose] / 2
 
         # (N, 4, 4) each, for one robot, and with a dimension for many
-        one, many = constant(factors), constant(factors[..., None])
-        self._factors = {3: one.unbind(0), 4: many.unbind(0)}
+        one = constant(factors)
+        self._factors = {3: one.unbind(0), 4: one.unsqueeze(-1).unbind(0)}
         self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
         self._hops = [index(hop) for hop in _hops(parents)]
         # level by level: how many there are, and whose products with their parents they are
