@@ -73,6 +73,14 @@ def test_thousands_of_robots_are_parts_of_a_few(alike):
         torch.testing.assert_close(whole.covariance[index], one.covariance, rtol=0, atol=1e-8)
 
 
+def test_frames_that_no_operator_asks_for_make_no_batch():
+    problem = Problem.of(CASES["the paper's"], 5)
+    regression, at = problem.regression(), (times(), problem.state.joints)
+    other = Frame(torch.zeros(PART + 1, 3, dtype=torch.float64))
+    alone = regression.tick(*at, problem.frames)
+    assert_same(regression.tick(*at, {**problem.frames, "other": other}), alone)
+
+
 def test_float32_is_float64_to_its_own_precision():
     problem = Problem.of(CASES["the paper's"], 4, 3)
     double = problem.regression()

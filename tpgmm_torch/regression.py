@@ -145,7 +145,7 @@ class Regression:
         rows += [p.orientation for p in poses.values()]
         if time.ndim:
             rows.append(time.unsqueeze(-1))
-        rows = [row.expand(*batch, row.shape[-1]).flatten(0, -2) for row in rows]
+        rows = [row.expand(*batch, row.shape[-1]).reshape(-1, row.shape[-1]) for row in rows]
         if time.ndim:
             order = rows[-1].squeeze(-1).argsort()
             rows = [row[order] for row in rows]
@@ -157,11 +157,11 @@ class Regression:
             results.append(update(self._tables, now, self.kinematics.state(start), here))
         means, covariances, activations = zip(*results, strict=True)
         back = order.argsort() if time.ndim else slice(None)
-        mean = torch.cat(means)[back].unflatten(0, batch)
-        covariance = torch.cat(covariances)[back].unflatten(0, batch)
+        mean = torch.cat(means)[back].reshape(*batch, -1)
+        covariance = torch.cat(covariances)[back].reshape(*mean.shape, -1)
         if time.ndim == 0:
             return mean, covariance, activations[0]
-        return mean, covariance, torch.cat(activations)[back].unflatten(0, batch)
+        return mean, covariance, torch.cat(activations)[back].reshape(*batch, -1)
 
     @staticmethod
     def bounded(
