@@ -248,3 +248,29 @@ def test_worst_points_are_the_worst(monkeypatch):
     expected = torch.cat(blocks, 1)[density.argsort()[:300]]
     torch.testing.assert_close(worst_points(parameters, points, 300), expected)
     assert worst_points(parameters, points, 10**5).shape == (points.total, sum(WIDTHS))
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0], ids=["good start", "poor start"])
+def test_the_first_pass_leaves_components_out_too(shift, monkeypatch):
+    monkeypatch.setattr("tpgmm_torch.block_gaussians.CHUNK_SIZE", {"cpu": 2**12})
+    evaluated = []
+    joint = sufficient_statistics.PackedStatistics.joint
+    monkeypatch.setattr(
+        sufficient_statistics.PackedStatistics,
+        "joint",
+        lambda self, chosen: evaluated.append(chosen) or joint(self, chosen),
+    )
+    points, units = standardized(movements())
+    start = binned(points, family(units), 20)
+    start = Parameters(start.weights, tuple(m + shift for m in start.means), start.factors)
+    [dense] = expect([start], points)
+    assert all(chosen is None for chosen in evaluated)
+    evaluated.clear()
+    [gated] = expect([start], points, workspace=Workspace(points))
+    if shift:  # the guess fails, and that is noticed
+        assert len(evaluated) > len(list(points))
+    else:
+        assert sum(len(chosen) < 20 for chosen in evaluated if chosen is not None) > 0
+    assert gated.bound == pytest.approx(dense.bound, rel=1e-9)
+    for own, expected in zip(gated.moments, dense.moments, strict=True):
+        torch.testing.assert_close(own, expected, rtol=1e-9, atol=1e-9)

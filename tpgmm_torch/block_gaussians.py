@@ -36,7 +36,8 @@ CHUNK_SIZE = {"cpu": 3 * 2**17, "gpu": 2**25}
 #: Least regularisation, as a share of the variance, that survives rounding.
 SMALLEST_SHARE = {torch.float64: 1e-12, torch.float32: 2e-6}
 
-#: One chunk of points: for each block the columns (x; 1), shape (D_j + 1, n).
+#: One chunk of points: for each block the columns (x; 1), shape (D_j + 1, n), a point after
+#: the other in memory.
 Chunk = tuple[Tensor, ...]
 
 
@@ -200,30 +201,21 @@ class Standardization:
         whole = whole * 8 // dtype.itemsize
         size = whole // min(n_components * sum(widths), packed) // group_size + 1
         size *= group_size
-        shift, scale = torch.cat(self.shifts)[:, None], torch.cat(self.scales)[:, None]
+        shift, scale = torch.cat(self.shifts), torch.cat(self.scales)
         # few long operations, which leave Python to other threads
-        columns = _columns(points, order).to(shift.device, torch.float64)
-        standard = columns.contiguous().sub_(shift).div_(scale)
-        n_points = standard.shape[1]
-        # one piece of memory for all chunks of a block: many small ones would scatter
-        stores = [shift.new_ones(width * n_points, dtype=dtype) for width in widths]
-        whole_size = n_points // size * size
-        for store, width, inner in zip(
-            stores, widths, standard.split([width - 1 for width in widths]), strict=True
+        rows = _rows(points, order).to(shift.device, torch.float64)
+        standard = torch.sub(rows, shift).div_(scale)
+        blocks = []
+        for width, inner in zip(
+            widths, standard.split([w - 1 for w in widths], 1), strict=True
         ):
-            for start, stop, step in ((0, whole_size, size), (whole_size, n_points, None)):
-                if stop > start:
-                    part = store[width * start : width * stop].view(
-                        -1, width, step or stop - start
-                    )
-                    divided = inner[:, start:stop].unflatten(1, (len(part), -1))
-                    part[:, :-1] = divided.transpose(0, 1)
+            # one piece of memory for all chunks of a block: many small ones would scatter
+            block = shift.new_ones(len(rows), width, dtype=dtype)
+            block[:, :-1] = inner
+            blocks.append(block)
         return [
-            tuple(
-                store[width * start : width * min(start + size, n_points)].view(width, -1)
-                for store, width in zip(stores, widths, strict=True)
-            )
-            for start in range(0, n_points, size)
+            tuple(block[start : start + size].T for block in blocks)
+            for start in range(0, len(rows), size)
         ]
 
     def standardize(self, parameters: Parameters) -> Parameters:
@@ -237,13 +229,15 @@ class Standardization:
         return parameters.affine(self.scales, self.shifts)
 
 
-def _columns(points: NDArray[np.floating], order: NDArray[np.intp] | None) -> Tensor:
-    """Rows (n, D), or some of them in another order, as columns (D, n): a copy."""
-    chosen = slice(None) if order is None else torch.from_numpy(order)
-    points = np.require(points, requirements="W")  # torch warns of any other
+def _rows(points: NDArray[np.floating], order: NDArray[np.intp] | None) -> Tensor:
+    """Rows (n, D), or some of them in another order, stored as they are."""
+    rows = torch.from_numpy(np.require(points, requirements="W"))  # torch warns of any other
+    if order is None:
+        return rows
+    chosen = torch.from_numpy(order)
     if points.flags.f_contiguous:
-        return torch.from_numpy(points.T)[:, chosen].clone()
-    return torch.from_numpy(points)[chosen].T.clone(memory_format=torch.contiguous_format)
+        return rows.T.index_select(1, chosen).T
+    return rows.index_select(0, chosen)
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,8 @@ def obituary(dead: Tensor, expectation: Expectation, points: Points, n_iter: int
         The iteration.
     """
     components = dead.nonzero()[:, 0].tolist()
-    masses = ", ".join(f"{float(expectation.mass[k]):.3g}" for k in components)
+    # to the digits that do not depend on what the gate left out
+    masses = ", ".join(f"{round(float(expectation.mass[k]), 9):.3g}" for k in components)
     return (
         f"component(s) {components} in iteration {n_iter} "
         f"(left: {masses} of {points.total} points)"

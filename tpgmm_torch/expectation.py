@@ -94,20 +94,22 @@ def expect(
         So many consecutive points have one responsibility together: that of the geometric
         mean of their densities. The chunks end where groups end.
     workspace : Workspace, optional
-        What earlier passes over the same points left.
+        What earlier passes over the same points left; without it all components are evaluated.
     previous : sequence of Expectation, optional
         One per mixture, from a pass with nearby mixtures and with this workspace, which tells
-        the gate what to expect; without it all components are evaluated.
+        the gate what to expect.
 
     Returns
     -------
     list of Expectation
         One per mixture.
     """
+    gated = workspace is not None
     workspace = workspace or Workspace(points)
-    parties = _parties(mixtures, points, workspace, previous)
+    parties = _parties(mixtures, points, workspace, previous, gated=gated)
     for index, chunk in enumerate(points):
-        workspace.gate.record(index, chunk)
+        if gated:
+            workspace.gate.record(index, chunk)
         for party in parties:
             party.take(index, chunk, group_size)
     sums = points.combine(*(total for party in parties for total in party.sums))
@@ -142,6 +144,8 @@ def _parties(
     points: Points,
     workspace: Workspace,
     previous: Sequence[Expectation],
+    *,
+    gated: bool,
 ) -> "list[_Party]":
     """Those that can be packed together, the others one by one: they have nothing to share."""
     joined = Parameters.joined(mixtures)
@@ -160,8 +164,9 @@ def _parties(
             else WhitenedStatistics(whitener, points.dtype)
         )
         selections: Iterator[Selection | None] = repeat(None)
-        if previous:
-            guess = torch.stack([previous[number].least for number in numbers], 1)
+        if gated:
+            last = [previous[number].least for number in numbers if previous]
+            guess = torch.stack(last, 1) if last else None
             peaks = whitener.peaks.unflatten(0, (len(numbers), -1))
             selections = workspace.gate.selections(joined, peaks, guess)
         chosen = [mixtures[number] for number in numbers]
@@ -182,7 +187,7 @@ class _Party:
         self.numbers, self.mixtures = numbers, mixtures
         self._statistics, self._selections = statistics, selections
         self._total = torch.zeros_like(mixtures[0].weights[:1]).repeat(len(mixtures))
-        self._least: list[Tensor] = []
+        self._least: list[list[float]] = []
 
     @property
     def sums(self) -> tuple[Tensor, ...]:
@@ -195,11 +200,11 @@ class _Party:
         selection = next(self._selections)
         components = None if selection is None else selection.components
         responsibilities, densities = self._evaluate(components, group_size)
-        least = densities.amin(1).double()
+        least = densities.amin(1).tolist()
         if selection is not None and not selection.confirmed(least):
             components = Selection.above(selection.ceilings, least).components
             responsibilities, densities = self._evaluate(components, group_size)
-            least = densities.amin(1).double()
+            least = densities.amin(1).tolist()
         self._statistics.gather(responsibilities, components)
         self._total += densities.sum(1, dtype=torch.float64)
         self._least.append(least)
@@ -221,7 +226,7 @@ class _Party:
         *gathered, total = sums
         moments = self._statistics.moments(*gathered)
         bounds = (total / n_points).tolist()
-        least = torch.stack(self._least or [total[:0].expand(0, len(total))], 0)
+        least = total.new_tensor(self._least).view(-1, len(total))
         n_components = len(self.mixtures[0].weights)
         for place, parameters in enumerate(self.mixtures):
             own = slice(place * n_components, (place + 1) * n_components)

@@ -9,12 +9,13 @@ where ``gap_kjd`` is the distance of the mean from ``[a_d, b_d]`` in column d of
 ``sigma_kjd`` the component's standard deviation there: no Mahalanobis distance is less than
 that of a marginal. A component is left out where ``ub_k <= lo - 36`` and ``lo`` is the least
 log-density among the points of the chunk: each responsibility that is not counted is below
-exp(-36) = 2e-16. Which ones those are is guessed from ``lo`` in the last pass, and the chunk
-is done again in the rare case that the present ``lo`` does not confirm it.
+exp(-36) = 2e-16. Which ones those are is guessed, mostly from ``lo`` in the last pass, and the
+chunk is done again in the rare case that the present ``lo`` does not confirm it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import ge
 
 import torch
 from torch import Tensor
@@ -30,6 +31,10 @@ NEGLIGIBLE = 36.0
 #: has to be done again.
 SLACK = 4.0
 
+#: By how much the least log-density of a chunk is thought to lie below the highest bound of a
+#: component, before any pass.
+DEPTH = 80.0
+
 #: So many numbers are bounded at a time.
 SLAB = 2**17
 
@@ -42,29 +47,30 @@ class Selection:
     ----------
     ceilings : Tensor of shape (S, K)
         What no log-density of the components exceeds in the chunk.
-    least : Tensor of shape (S,)
-        The selection holds where no point's log-density is below this.
+    least : list of float
+        S numbers: the selection holds where no point's log-density is below these.
     components : Tensor of shape (S * A,) or None
         Numbers of the components among all S * K; None is all of them.
     """
 
     ceilings: Tensor
-    least: Tensor
+    least: list[float]
     components: Tensor | None
 
     @classmethod
-    def above(cls, ceilings: Tensor, least: Tensor) -> "Selection":
+    def above(cls, ceilings: Tensor, least: list[float]) -> "Selection":
         """The components that are not negligible where ``least`` is the least log-density."""
         n_components = ceilings.shape[1]
-        count = int((ceilings > (least - NEGLIGIBLE)[:, None]).sum(1).max())
+        limits = ceilings.new_tensor(least)[:, None] - NEGLIGIBLE
+        count = int((ceilings > limits).sum(1).max())
         if count == n_components:
             return cls(ceilings, least, None)
         chosen = _numbered(ceilings.topk(count, dim=1).indices, n_components)
         return cls(ceilings, least, chosen.reshape(-1))
 
-    def confirmed(self, least: Tensor) -> bool:
-        """Whether the least log-densities (S,) of the selected components confirm it."""
-        return self.components is None or bool((least >= self.least).all())
+    def confirmed(self, least: Sequence[float]) -> bool:
+        """Whether the least log-densities (S) of the selected components confirm it."""
+        return self.components is None or all(map(ge, least, self.least))
 
 
 class Gate:
@@ -74,20 +80,27 @@ class Gate:
     """
 
     def __init__(self) -> None:
-        self._lowest: list[Tensor] = []
-        self._highest: list[Tensor] = []
+        self._boxes = torch.empty(0)
+        self._count = 0
 
     def record(self, index: int, chunk: Chunk) -> None:
         """Measure the box of a chunk, unless that has been done."""
-        if index == len(self._lowest):
-            extremes = [torch.aminmax(block[:-1], dim=1) for block in chunk]
-            self._lowest.append(torch.cat([extreme.min for extreme in extremes]).double())
-            self._highest.append(torch.cat([extreme.max for extreme in extremes]).double())
+        if index < self._count:
+            return
+        extremes = [torch.aminmax(block[:-1], dim=1) for block in chunk]
+        box = torch.stack([torch.cat(sides) for sides in zip(*extremes, strict=True)]).double()
+        if self._count == len(self._boxes):
+            # in one piece: small ones that stay would keep the memory around them from use
+            self._boxes = torch.cat(
+                [self._boxes.to(box), box.new_empty(self._count + 64, *box.shape)]
+            )
+        self._boxes[self._count] = box
+        self._count += 1
 
     def selections(
-        self, mixtures: Parameters, peaks: Tensor, guess: Tensor
+        self, mixtures: Parameters, peaks: Tensor, guess: Tensor | None = None
     ) -> Iterator[Selection]:
-        """What each chunk probably needs.
+        """What each chunk probably needs, of those that are recorded when it is asked for.
 
         Parameters
         ----------
@@ -95,7 +108,7 @@ class Gate:
             S mixtures of K components, one after the other.
         peaks : Tensor of shape (S, K)
             Log of weight times density at the components' means.
-        guess : Tensor of shape (n_chunks, S)
+        guess : Tensor of shape (n_chunks, S), optional
             Least log-density of each chunk in the last pass.
         """
         n_starts, n_components = peaks.shape
@@ -103,21 +116,24 @@ class Gate:
         narrowness = torch.cat([f.square().sum(-1).rsqrt() for f in mixtures.factors], 1)
         widths = [mean.shape[1] for mean in mixtures.means]
         slab = max(1, SLAB // means.numel())
-        for first in range(0, len(guess), slab):
-            lowest = torch.stack(self._lowest[first : first + slab])[:, None]
-            highest = torch.stack(self._highest[first : first + slab])[:, None]
+        first = 0
+        while first < self._count:
+            part = slice(first, min(first + slab, self._count))
+            lowest, highest = self._boxes[part, :, None].unbind(1)
             gap = torch.maximum(lowest - means, means - highest).clamp_(min=0)
             gap.mul_(narrowness).square_()
             distance = torch.stack([g.amax(-1) for g in gap.split(widths, -1)]).sum(0)
             ceilings = peaks - distance.unflatten(1, (n_starts, n_components)) / 2
-            least = guess[first : first + slab] - SLACK
+            least = ceilings.amax(-1) - DEPTH if guess is None else guess[part] - SLACK
             needed = ceilings > (least - NEGLIGIBLE)[..., None]
             # none at all, if the guess is far too high
             counts = needed.sum(-1).amax(-1).clamp_(min=1).tolist()
             ranked = _numbered(ceilings.topk(max(counts), dim=-1).indices, n_components)
+            limits = least.tolist()
             for row, count in enumerate(counts):
                 chosen = None if count == n_components else ranked[row, :, :count].reshape(-1)
-                yield Selection(ceilings[row], least[row], chosen)
+                yield Selection(ceilings[row], limits[row], chosen)
+            first = part.stop
 
 
 def _numbered(chosen: Tensor, n_components: int) -> Tensor:

@@ -91,20 +91,30 @@ class WhitenedStatistics:
             torch.zeros_like(whitening) for whitening in whitener.maps
         )
         self._chunk: Chunk = ()
+        self._room: list[Tensor] = []
+        self._squares = torch.empty(0)
         self._whitened: list[Tensor] = []
 
     def load(self, index: int, chunk: Chunk) -> None:
         """Turn to the chunk with this number."""
+        sizes = [len(self._constant) * x.numel() for x in chunk]
+        if not self._room or len(self._room[0]) < sizes[0]:
+            # taken anew for each chunk, so much memory would not stay in the cache
+            self._room = [x.new_empty(size) for x, size in zip(chunk, sizes, strict=True)]
+            self._squares = chunk[0].new_empty(max(sizes))
         self._chunk = chunk
 
     def joint(self, components: Tensor | None) -> Tensor:
         """Log of ``pi_k prod_j N(x_j | mu_kj, Sigma_kj)``, shape (A, n)."""
         joint = _chosen(self._constant, components)
         self._whitened = []
-        for maps, x in zip(self._maps, self._chunk, strict=True):
+        for maps, x, room in zip(self._maps, self._chunk, self._room, strict=True):
             chosen = _chosen(maps, components)
-            y = (chosen.view(-1, len(x)) @ x).view(len(chosen), len(x), -1)
-            joint = torch.sub(joint, y.square().sum(1), alpha=0.5)
+            shape = len(chosen), len(x), x.shape[1]
+            y = room[: chosen[:, 0].numel() * x.shape[1]].view(shape)
+            torch.mm(chosen.view(-1, len(x)), x, out=y.view(-1, x.shape[1]))
+            squares = torch.mul(y, y, out=self._squares[: y.numel()].view(shape))
+            joint = torch.sub(joint, squares.sum(1), alpha=0.5)
             self._whitened.append(y)
         return joint
 
@@ -166,7 +176,7 @@ class Features:
     def _prepare(self, chunk: Chunk, n_points: int) -> None:
         """Make room, and the views that need not be made again for each chunk."""
         self._phi = chunk[0].new_empty(self.count, n_points)
-        self._points = [torch.empty_like(x) for x in chunk]
+        self._points = [x.new_empty(x.shape) for x in chunk]
         self._products, start = [], 0
         for x in self._points:
             for first in range(0, len(x), STRIDE):
