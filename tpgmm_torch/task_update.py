@@ -23,6 +23,7 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.component_tables import Tables
+from tpgmm_torch.corrections import corrections
 from tpgmm_torch.frames import Frame
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
@@ -210,31 +211,17 @@ class TaskUpdate:
         if other is not None:
             h = h.view(b, m, a, m) * other.mT.unsqueeze(-1) * other.unsqueeze(1)
             h, innovation = h.view(b, m * a, m), innovation * other.mT
-        h = torch.baddbmm(h, crossed, jacobian.mT)
-        innovation = innovation + (jacobian @ negative.mT + shift)
+        h.baddbmm_(crossed, jacobian.mT)
+        innovation += jacobian @ negative.mT + shift
 
-        # component by component: [J C, innovation] in the coordinates where H is the identity
-        h = h.view(b, m, a, m).transpose(1, 2).reshape(b * a, m, m)
-        right = torch.cat(
-            (crossed.view(b, m, a, n).transpose(1, 2), innovation.mT.unsqueeze(-1)), -1
-        ).view(b * a, m, n + 1)
-        factor = gaussians.cholesky(h, "the covariance of the tasks")
-        # transposed, so that the result is stored row by row
-        white = torch.linalg.solve_triangular(factor.mT, right.mT, upper=True, left=False).mT
-        gain, innovation = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
-        negative = negative.expand(b, a, n).reshape(b * a, n, 1)
-        each = torch.baddbmm(negative, gain.mT, innovation, beta=-1).view(b, a, n)
-
+        prior = (weights @ tables.joints.flatten(1)).reshape(-1, n, n)
+        moves, covariance = corrections(h, crossed, innovation, weights, prior)
+        each = moves - negative
         heavy = weights.unsqueeze(-1)  # (A, 1), or (B, A, 1)
         joints = (heavy * each).sum(1)
-        # within the components C - G^T G, and between them: the law of total variance
-        covariance = (weights @ tables.joints.flatten(1)).reshape(-1, n, n)
-        weighted = gain.view(b, a, m, n) * heavy.unsqueeze(-1)
-        covariance = torch.baddbmm(
-            covariance, weighted.view(b, a * m, n).mT, gain.view(b, a * m, n), alpha=-1
-        )
+        # within the components, and between them: the law of total variance
         apart = each - joints.unsqueeze(1)
-        covariance = torch.baddbmm(covariance, (apart * heavy).mT, apart)
+        covariance.baddbmm_((apart * heavy).mT, apart)
         return joints, covariance, weights @ tables.places
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
