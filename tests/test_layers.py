@@ -43,6 +43,7 @@ LAYERS = (
         "local_mixtures",
         "windows",
         "component_tables",
+        "corrections",
         "task_update",
         "joint_limits",
         "regression",

@@ -51,7 +51,11 @@ def corrections(
     """
     given = (h, crossed, innovation, weights, prior)
     n_systems = innovation.shape[0] * innovation.shape[2]
-    if h.dtype == torch.float32 and n_systems >= MANY and not any(tensor.requires_grad for tensor in given):
+    if (
+        h.dtype == torch.float32
+        and n_systems >= MANY
+        and not any(tensor.requires_grad for tensor in given)
+    ):
         found = _eliminated(*given)
         if bool(found[0].isfinite().all()):
             return found

@@ -2,12 +2,14 @@
 
 Each joint turns or slides along the z axis of its own frame, so that its axis is a column of
 the frame's pose, and the pose of a frame in its parent is linear in the sine and the cosine of
-the joint (or in the joint itself, where it slides). So is H+ of its unit quaternion in those of
-half the joint; both are 4 x 4 matrices, and multiply along the tree in the same operations.
+the joint (or in the joint itself, where it slides). So is Hbar of its unit quaternion in those
+of half the joint: as ``eps_parent * eps = Hbar(eps) eps_parent``, its transpose takes the
+parent's quaternion, a row, to the frame's own. Poses and turns are 4 x 4 matrices alike.
 One batch of matrix products multiplies all of them by their parents; every further one doubles
 the number of joints that are behind: ten joints in a row need four. That costs more arithmetic
-and fewer operations than going from joint to joint, which is what a controller wants; many
-robots at once go level by level. Inside, the B robots stand in the last dimension.
+and fewer operations than going from joint to joint, which is what a controller wants. Many
+robots at once go level by level, with only the rows that are wanted: three of a pose, one of a
+turn. Inside, the B robots stand in the last dimension.
 """
 
 import itertools
@@ -51,29 +53,30 @@ class TreeKinematics:
         def index(values: Any) -> Tensor:
             return torch.tensor(values, dtype=torch.long, device=device)
 
-        # bodies are the moving frames and, fixed to them, the links; each has two matrices
+        # bodies are the moving frames and, fixed to them, the links; behind the base's and
+        # theirs, in order of depth, stand the matrices that turn
         frames, links = tree.frames, tree.links
         carriers = [frame.parent for frame in frames] + [link.frame for link in links]
         depths = [1 + len(tree.moved_by(carrier)) for carrier in carriers]
         order = np.argsort(depths, kind="stable").tolist()
-        row = {-1: 0} | {body: 1 + 2 * place for place, body in enumerate(order)}
-        count = 1 + 2 * len(order)
-        factors = np.zeros((4, count, 4, 4))  # of 1, sine, cosine, joint
-        factors[0, 0] = np.eye(4)
-        follow, shift = np.zeros((count, n_joints)), np.zeros((count, 1))
+        row = {-1: 0} | {body: 1 + place for place, body in enumerate(order)}
+        count = len(row)
+        factors = np.zeros((4, 2 * count, 4, 4))  # of 1, sine, cosine, joint
+        factors[0, [0, count]] = np.eye(4)
+        follow, shift = np.zeros((2 * count, n_joints)), np.zeros((2 * count, 1))
         parents = [0] * count
         turned = {-1: np.eye(4)} | {f: _z_to(frame.axis) for f, frame in enumerate(frames)}
         for body, carrier in enumerate(carriers):
-            pose, turn = row[body], row[body] + 1
-            parents[pose], parents[turn] = row[carrier], row[carrier] + (carrier >= 0)
+            pose, turn = row[body], count + row[body]
+            parents[pose] = row[carrier]
             if body >= len(frames):
                 offset = turned[carrier].T @ links[body - len(frames)].pose
-                factors[0, pose], factors[0, turn] = offset, _left_matrix(offset)
+                factors[0, pose], factors[0, turn] = offset, _turn(offset)
                 continue
             frame = frames[body]
             offset = turned[carrier].T @ frame.offset @ turned[body]
             factors[:, pose] = offset @ (SLIDE if frame.prismatic else TURN)
-            factors[:, turn] = _left_matrix(offset) @ (STAY if frame.prismatic else HALF_TURN)
+            factors[:, turn] = _turn(offset) @ (STAY if frame.prismatic else HALF_TURN)
             follow[pose, frame.joint], shift[pose] = frame.multiplier, frame.shift
             follow[turn], shift[turn] = follow[pose] / 2, shift[pose] / 2
 
@@ -81,9 +84,10 @@ class TreeKinematics:
         one = constant(factors)
         self._factors = {3: one.unbind(0), 4: one.unsqueeze(-1).unbind(0)}
         self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
-        self._hops = [index(hop) for hop in _hops(parents)]
-        # level by level: how many there are, and whose products with their parents they are
-        self._counts = [1, *(2 * np.bincount(depths)[1:]).tolist()]
+        hops = _hops(parents)
+        self._hops = [index(hop + [count + parent for parent in hop]) for hop in hops]
+        # level by level: how many bodies there are, and whom they are carried by
+        self._counts = [1, *np.bincount(depths)[1:].tolist()]
         self._parents: list[Tensor | None] = []
         first, start = 0, 1
         for before, number in itertools.pairwise(self._counts):
@@ -99,19 +103,22 @@ class TreeKinematics:
             # where joints mimic others, several frames add up to one column
             columns = list(range(len(frames)))
             self._mimic = constant(follow[[row[c] for c in columns]])  # (C, n)
-        # which numbers of the matrices are wanted: columns of poses, and the first one of H+
+        # which numbers of the matrices are wanted: columns of poses, and the rows that turn
         bodies = [row[len(frames) + link] for link in range(len(links))]
         movers = [row[c] for c in columns]
-        wanted = [
-            [16 * matrix + 4 * line + place for matrix in matrices for line in range(lines)]
-            for matrices, lines, place in (
-                (bodies, 3, 3),  # where links are
-                (movers, 3, 3),  # where the frames that move columns are,
-                (movers, 3, 2),  # and their axes
-                ([body + 1 for body in bodies], 4, 0),  # how links are turned
-            )
-        ]
-        self._wanted = index([number for numbers in wanted for number in numbers])
+        self._wanted = {}  # of whole matrices, for one robot, and of their first rows
+        for dimensions, pose_size, turn_size in ((3, 16, 16), (4, 12, 4)):
+            wanted = [
+                [pose_size * pose + 4 * line + place for pose in poses for line in range(3)]
+                for poses, place in (
+                    (bodies, 3),  # where links are
+                    (movers, 3),  # where the frames that move columns are,
+                    (movers, 2),  # and their axes
+                )
+            ]
+            turns = [pose_size * count + turn_size * body for body in bodies]
+            wanted.append([turn + place for turn in turns for place in range(4)])
+            self._wanted[dimensions] = index([number for part in wanted for number in part])
         self._sizes = tuple(map(len, wanted))
         moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
         mask = np.reshape(moved, (len(columns), len(links), 1, 1))
@@ -143,8 +150,7 @@ class TreeKinematics:
         # of one robot, matrices stand in the last dimensions, where libraries want them
         alone = batch == 1 and not compiling
         moved = moved.view(-1, 1, 1) if alone else moved.view(len(moved), 1, 1, batch)
-        matrices = self._products(self._local(moved), batch)
-        numbers = matrices.reshape(16 * len(moved), batch).index_select(0, self._wanted)
+        numbers = self._products(self._local(moved), batch)
         position, origin, axis, quaternion = numbers.split(self._sizes)
         columns, links = self._turns.shape[:2]
         position, quaternion = position.view(links, 3, batch), quaternion.view(links, 4, batch)
@@ -167,20 +173,21 @@ class TreeKinematics:
         return torch.addcmul(local, sliding, moved) if self._slides is not None else local
 
     def _products(self, local: Tensor, batch: int) -> Tensor:
-        """Those in the base: the products along the tree, of the same shape."""
+        """The numbers that are wanted of the products along the tree, (W, B)."""
         if batch < MANY and not torch.compiler.is_compiling():
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
-            return local
-        base, *others = local.unsqueeze(1).split(self._counts)
-        level = base.squeeze(1)
-        levels = [level]
-        for parents, part in zip(self._parents, others, strict=True):
-            if parents is not None:
-                level = level.index_select(0, parents)
-            level = (level.unsqueeze(3) * part).sum(2)
-            levels.append(level)
-        return torch.cat(levels)
+            return local.reshape(16 * len(local), batch).index_select(0, self._wanted[3])
+        pose, turn = (half.split(self._counts) for half in local.chunk(2))
+        poses, turns = [pose[0][:, :3]], [turn[0][:, :1]]
+        for place, parents in enumerate(self._parents, 1):
+            for rows, matrices in ((poses, pose[place]), (turns, turn[place])):
+                before = rows[-1]
+                if parents is not None:
+                    before = before.index_select(0, parents)
+                rows.append((before.unsqueeze(3) * matrices.unsqueeze(1)).sum(2))
+        numbers = torch.cat([rows.flatten(0, 2) for rows in (*poses, *turns)])
+        return numbers.index_select(0, self._wanted[4])
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
@@ -209,10 +216,10 @@ def _z_to(axis: Array) -> Array:
     return matrix
 
 
-def _left_matrix(pose: Array) -> Array:
-    """``H+`` of a pose's unit quaternion."""
+def _turn(pose: Array) -> Array:
+    """The transpose of ``Hbar`` of a pose's unit quaternion."""
     rotation = torch.from_numpy(np.ascontiguousarray(pose[:3, :3]))
-    return quaternions.left_matrix(quaternions.from_matrix(rotation)).numpy()
+    return quaternions.right_matrix(quaternions.from_matrix(rotation)).mT.numpy()
 
 
 def _hops(parents: Sequence[int]) -> list[list[int]]:
@@ -225,8 +232,8 @@ def _hops(parents: Sequence[int]) -> list[list[int]]:
 
 
 #: A frame's pose after its joint's motion, as the factors of 1, of the joint's sine and cosine,
-#: and of the joint itself: a turn about the z axis, and a way along it. Then H+ of the same, in
-#: the sine and the cosine of half the joint.
+#: and of the joint itself: a turn about the z axis, and a way along it. Then the transposed
+#: Hbar of the same, in the sine and the cosine of half the joint.
 TURN = np.zeros((4, 4, 4))
 TURN[0, [2, 3], [2, 3]] = 1.0
 TURN[1, [1, 0], [0, 1]] = 1.0, -1.0
@@ -235,7 +242,7 @@ SLIDE = np.zeros((4, 4, 4))
 SLIDE[0] = np.eye(4)
 SLIDE[3, 2, 3] = 1.0
 HALF_TURN = np.zeros((4, 4, 4))
-HALF_TURN[1, [3, 2, 1, 0], [0, 1, 2, 3]] = 1.0, 1.0, -1.0, -1.0
+HALF_TURN[1, [3, 2, 1, 0], [0, 1, 2, 3]] = -1.0, 1.0, -1.0, 1.0
 HALF_TURN[2] = np.eye(4)
 STAY = np.zeros((4, 4, 4))
 STAY[0] = np.eye(4)
