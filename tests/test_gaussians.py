@@ -355,3 +355,33 @@ def test_nothing_is_modified_in_place(seed):
     gaussians.condition(means, covariances, 1)
     assert torch.equal(means, before[0])
     assert torch.equal(covariances, before[1])
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("smallest", [1.0, 1e-1, 1e-2, 1e-4, 1e-9, 0.0])
+def test_the_pseudo_inverse_is_moore_and_penrose_s_at_any_rank(smallest, dtype):
+    generator = torch.Generator().manual_seed(0)
+    left, _ = torch.linalg.qr(torch.randn(5, 6, 6, generator=generator, dtype=torch.float64))
+    right, _ = torch.linalg.qr(torch.randn(5, 9, 6, generator=generator, dtype=torch.float64))
+    values = torch.ones(5, 6, dtype=torch.float64)
+    values[2, 4] = smallest  # one of them may lack a direction
+    matrix = ((left * values[:, None]) @ right.mT).to(dtype)
+    expected = torch.linalg.pinv(matrix)
+    found = gaussians.pseudo_inverse(matrix)
+    tolerance = torch.finfo(dtype).eps ** (2 / 3) * expected.abs().max()
+    torch.testing.assert_close(found, expected, rtol=0, atol=float(tolerance))
+    tall = gaussians.pseudo_inverse(matrix.mT)
+    torch.testing.assert_close(
+        tall, torch.linalg.pinv(matrix.mT), rtol=0, atol=float(tolerance)
+    )
+
+
+@pytest.mark.parametrize("shape", [(0, 5), (3, 0, 5), (0, 2, 5), (5, 0)])
+def test_the_pseudo_inverse_of_nothing_has_its_shape(shape):
+    empty = torch.empty(*shape)
+    assert gaussians.pseudo_inverse(empty).shape == empty.mT.shape
+
+
+def test_the_pseudo_inverse_has_gradients():
+    matrix = torch.randn(2, 3, 5, dtype=torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(gaussians.pseudo_inverse, matrix)

@@ -45,6 +45,7 @@ LAYERS = (
         "component_tables",
         "corrections",
         "task_update",
+        "projections",
         "joint_limits",
         "regression",
         "compiled_update",

@@ -8,8 +8,8 @@ parent's quaternion, a row, to the frame's own. Poses and turns are 4 x 4 matric
 One batch of matrix products multiplies all of them by their parents; every further one doubles
 the number of joints that are behind: ten joints in a row need four. That costs more arithmetic
 and fewer operations than going from joint to joint, which is what a controller wants. Many
-robots at once go level by level, with only the rows that are wanted: three of a pose, one of a
-turn. Inside, the B robots stand in the last dimension.
+robots at once go level by level, in the end with only the rows that are wanted: three of a
+pose, one of a turn. Inside, the B robots stand in the last dimension.
 """
 
 import itertools
@@ -28,6 +28,9 @@ __all__ = ["TreeKinematics"]
 
 #: Joint vectors at once from which arithmetic costs more than the number of operations.
 MANY = 16
+
+#: ... and from which it is worth two runs to leave out the rows that are not wanted.
+PLENTY = 128
 
 Array = NDArray[np.float64]
 
@@ -178,16 +181,25 @@ class TreeKinematics:
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
             return local.reshape(16 * len(local), batch).index_select(0, self._wanted[3])
-        pose, turn = (half.split(self._counts) for half in local.chunk(2))
-        poses, turns = [pose[0][:, :3]], [turn[0][:, :1]]
-        for place, parents in enumerate(self._parents, 1):
-            for rows, matrices in ((poses, pose[place]), (turns, turn[place])):
-                before = rows[-1]
-                if parents is not None:
-                    before = before.index_select(0, parents)
-                rows.append((before.unsqueeze(3) * matrices.unsqueeze(1)).sum(2))
-        numbers = torch.cat([rows.flatten(0, 2) for rows in (*poses, *turns)])
+        halves = local.view(2, -1, 4, 4, batch)
+        if batch < PLENTY and not torch.compiler.is_compiling():
+            matrices = self._down(halves, 4)
+            return matrices.view(-1, batch).index_select(0, self._wanted[3])
+        parts = (self._down(halves[:1], 3), self._down(halves[1:], 1))
+        numbers = torch.cat([part.view(-1, batch) for part in parts])
         return numbers.index_select(0, self._wanted[4])
+
+    def _down(self, local: Tensor, rows: int) -> Tensor:
+        """The first rows of the products, level by level; local is (H, N, 4, 4, B)."""
+        base, *others = local.split(self._counts, 1)
+        level = base[:, :, :rows]
+        levels = [level]
+        for parents, matrices in zip(self._parents, others, strict=True):
+            if parents is not None:
+                level = level.index_select(1, parents)
+            level = (level.unsqueeze(4) * matrices.unsqueeze(2)).sum(3)
+            levels.append(level)
+        return torch.cat(levels, 1)
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:

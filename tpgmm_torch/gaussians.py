@@ -23,6 +23,7 @@ __all__ = [
     "log_density",
     "moment_match",
     "product",
+    "pseudo_inverse",
 ]
 
 
@@ -275,3 +276,39 @@ def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
     half_log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     constant = 0.5 * math.log(2 * math.pi) * x.shape[-1]
     return -0.5 * white.square().sum(-1) - half_log_det - constant
+
+
+def pseudo_inverse(matrix: Tensor) -> Tensor:
+    """The Moore-Penrose inverse ``J^+``, of eq. (1)'s A and b.
+
+    Parameters
+    ----------
+    matrix : Tensor of shape (..., m, n)
+
+    Returns
+    -------
+    Tensor of shape (..., n, m)
+        Where all matrices are well conditioned, ``J^T (J J^T)^-1``: a singular value
+        decomposition takes some ten times as long.
+
+    Examples
+    --------
+    >>> pseudo_inverse(torch.tensor([[2.0, 0.0, 0.0], [0.0, 0.0, 0.0]])).T.tolist()
+    [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    """
+    m, n = matrix.shape[-2:]
+    if m <= n and matrix.numel():
+        matrix = matrix.contiguous()  # products of matrices stored otherwise are slow
+        gram = matrix @ matrix.mT
+        factor, info = torch.linalg.cholesky_ex(gram)
+        inverse = torch.cholesky_inverse(factor)
+        # as many digits go as the condition number has: at most a third of them
+        most = torch.finfo(matrix.dtype).eps ** (-1 / 3)
+        condition = _size(gram) * _size(inverse)
+        if bool(((condition < most) & (info == 0)).all()):
+            return matrix.mT @ inverse
+    return torch.linalg.pinv(matrix)
+
+
+def _size(matrix: Tensor) -> Tensor:
+    return torch.linalg.matrix_norm(matrix.detach())

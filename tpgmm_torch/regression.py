@@ -21,7 +21,8 @@ from tpgmm_torch.frames import Frame
 from tpgmm_torch.joint_limits import within
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
-from tpgmm_torch.operators import Linearization, Operator
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.projections import Projection, hemispheres
 from tpgmm_torch.task_update import TaskUpdate
 from tpgmm_torch.trajectories import Candidate
 from tpgmm_torch.windows import Windows
@@ -107,10 +108,7 @@ class Regression:
         estimate = self.bounded(joints, covariance, activation, bounds)
         if not candidates:
             return estimate
-        active = self._active(time)
-        projections = self._projections(active, time, state, frames)
-        alone = _candidates(projections, activation[..., active], state.joints)
-        return replace(estimate, candidates=alone)
+        return replace(estimate, candidates=self._candidates(time, state, frames, activation))
 
     def tick(
         self,
@@ -235,7 +233,16 @@ class Regression:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Eq. (2) for operators of any kind, in the form and with the weights asked for."""
         active = self._active(time)
-        projections = self._projections(active, time, state, frames)
+        projections = []
+        for operator, mixture in zip(
+            self.operators, self._components(active, time), strict=True
+        ):
+            mean, gain, covariance = self._local(operator, mixture, time, state, frames)
+            columns = mean.unsqueeze(-1)
+            if self.activation != "time":
+                columns = torch.stack(torch.broadcast_tensors(mean, gain), dim=-1)
+            at = operator.linearize(state, frames)
+            projections.append(Projection.of(at, columns, covariance))
         if self.fusion == "covariance":
             projections = [p.in_joint_space(self.epsilon) for p in projections]
         precision, vector, square = self._sum(projections, state)
@@ -250,21 +257,52 @@ class Regression:
         activation[..., active] = weights
         return state.joints + mean, covariance, activation
 
-    def _projections(
+    def _components(self, active: tuple[int, ...], time: Tensor) -> Sequence[LocalMixture]:
+        """Of the mixtures, the components that count."""
+        if len(active) == len(self.log_weights):
+            return self.mixtures
+        index = torch.tensor(active, device=time.device)
+        return [mixture.select(index) for mixture in self.mixtures]
+
+    def _candidates(
         self,
-        active: tuple[int, ...],
         time: Tensor,
         state: RobotState,
         frames: Mapping[str, Frame],
-    ) -> list[_Projection]:
-        mixtures = self.mixtures
-        if len(active) < len(self.log_weights):
-            index = torch.tensor(active, device=time.device)
-            mixtures = [mixture.select(index) for mixture in mixtures]
-        return [
-            self._project(operator, mixture, time, state, frames)
-            for operator, mixture in zip(self.operators, mixtures, strict=True)
+        activation: Tensor,
+    ) -> tuple[Candidate, ...]:
+        """Eq. (1) for each operator, mixed over the components, and each one's share."""
+        active = self._active(time)
+        weights = activation[..., active]
+        alone = []
+        for operator, mixture in zip(
+            self.operators, self._components(active, time), strict=True
+        ):
+            at = operator.linearize(state, frames)
+            # mixing commutes with the affine map, and is less work before it
+            mean, _, covariance = self._local(operator, mixture, time, state, frames)
+            mean, covariance = gaussians.moment_match(weights, mean, covariance)
+            columns = mean[..., None, :, None]
+            one = Projection.of(at, columns, covariance[..., None, :, :]).in_joint_space()
+            alone.append((one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]))
+        shapes = [
+            part.shape[:end] for pair in alone for part, end in zip(pair, (-1, -2), strict=True)
         ]
+        batch = torch.broadcast_shapes(state.joints.shape[:-1], *shapes)
+        alone = [
+            (mean.expand(*batch, -1), covariance.expand(*batch, -1, -1))
+            for mean, covariance in alone
+        ]
+        variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in alone])
+        # where J^+ has no row but rounding, an operator does not touch the joint and has no say
+        touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
+        precisions = touched / torch.where(touched, variances, 1.0)
+        total = precisions.sum(0)
+        shares = precisions / torch.where(total > 0, total, 1.0)
+        return tuple(
+            Candidate(state.joints + mean, covariance, share)
+            for (mean, covariance), share in zip(alone, shares, strict=True)
+        )
 
     def _product_activation(
         self, time: Tensor, precision: Tensor, vector: Tensor, square: Tensor
@@ -285,34 +323,25 @@ class Regression:
         log_h = self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
         return torch.log_softmax(log_h, dim=-1)
 
-    def _project(
+    def _local(
         self,
         operator: Operator,
         mixture: LocalMixture,
         time: Tensor,
         state: RobotState,
         frames: Mapping[str, Frame],
-    ) -> _Projection:
-        at = operator.linearize(state, frames)
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, their time derivatives and covariances, on the present quaternions' side."""
         mean, gain, covariance = mixture.at(time), mixture.gain, mixture.covariance
-        matrix = None if at.matrix is None else at.matrix[..., None, :, :]
         starts = operator.quaternion_starts(self.kinematics)
         if starts:
-            signs = _hemispheres(mean, operator.coordinates(state, frames), starts)
+            signs = hemispheres(mean, operator.coordinates(state, frames), starts)
             mean, gain = signs * mean, signs * gain
             covariance = signs[..., None] * covariance * signs[..., None, :]
-        if matrix is not None:
-            mean = (matrix @ mean[..., None])[..., 0]
-            gain = (matrix @ gain[..., None])[..., 0]
-            covariance = matrix @ covariance @ matrix.mT
-        target = mean + at.displacement[..., None, :]
-        targets = torch.stack(torch.broadcast_tensors(target, gain), dim=-1)
-        if self.activation == "time":
-            targets = targets[..., :1]
-        return _Projection(at, targets, covariance)
+        return mean, gain, covariance
 
     def _sum(
-        self, projections: Sequence[_Projection], state: RobotState
+        self, projections: Sequence[Projection], state: RobotState
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Sums over the operators, in terms of the step ``q - q_{t-1}``."""
         terms = [
@@ -328,62 +357,3 @@ class Regression:
             identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
             precision = precision + identity / self.prior_std**2
         return precision, vector, square
-
-
-def _hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:
-    """Signs (..., K, D) that bring each mean quaternion to the side of the present one."""
-    batch = gaussians.common_shape(mean.shape[:-2], present.shape[:-1])
-    signs = mean.new_ones(*batch, *mean.shape[-2:])
-    for start in starts:
-        block = slice(start, start + 4)
-        inner = (mean[..., block] * present[..., None, block]).sum(-1, keepdim=True)
-        signs[..., block] = torch.where(inner < 0, -1.0, 1.0)
-    return signs
-
-
-@dataclass(frozen=True, eq=False)
-class _Projection:
-    """Components in task space: ``J (q - q_{t-1}) ~ N(targets, covariance)``.
-
-    ``targets`` (..., K, m, r) holds the mean and, for the product activation, its time
-    derivative, as columns.
-    """
-
-    at: Linearization
-    targets: Tensor
-    covariance: Tensor
-
-    @property
-    def jacobian(self) -> Tensor | None:
-        return None if self.at.jacobian is None else self.at.jacobian[..., None, :, :]
-
-    def in_joint_space(self, epsilon: float = 0.0) -> _Projection:
-        """Eq. (1): ``A mu + b - q_{t-1}`` and ``A Sigma A^T + epsilon I`` as the task."""
-        targets, covariance = self.targets, self.covariance
-        if self.jacobian is not None:
-            inverse = torch.linalg.pinv(self.jacobian)
-            targets, covariance = inverse @ targets, inverse @ covariance @ inverse.mT
-        if epsilon:
-            size = covariance.shape[-1]
-            identity = torch.eye(size, dtype=covariance.dtype, device=covariance.device)
-            covariance = covariance + epsilon * identity
-        at = Linearization(None, None, self.at.displacement)
-        return _Projection(at, targets, covariance)
-
-
-def _candidates(
-    projections: Sequence[_Projection], weights: Tensor, joints: Tensor
-) -> tuple[Candidate, ...]:
-    """Eq. (1) for each operator, mixed over the components, and each one's share."""
-    alone = [p.in_joint_space() for p in projections]
-    mixed = [gaussians.moment_match(weights, p.targets[..., 0], p.covariance) for p in alone]
-    variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in mixed])
-    # where J^+ has no row but rounding, an operator does not touch the joint and has no say
-    touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
-    precisions = touched / torch.where(touched, variances, 1.0)
-    total = precisions.sum(0)
-    shares = precisions / torch.where(total > 0, total, 1.0)
-    return tuple(
-        Candidate(joints + mean, covariance, share)
-        for (mean, covariance), share in zip(mixed, shares, strict=True)
-    )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
+from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.demonstrations import Demonstration
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.frames import Frame
@@ -141,7 +141,9 @@ class Operator(ABC):
         if matrix is None:
             size = at.displacement.shape[-1]
             matrix = torch.eye(size, dtype=state.joints.dtype, device=state.joints.device)
-        linear = matrix if at.jacobian is None else torch.linalg.pinv(at.jacobian) @ matrix
+        linear = (
+            matrix if at.jacobian is None else gaussians.pseudo_inverse(at.jacobian) @ matrix
+        )
         batch = torch.broadcast_shapes(state.joints.shape[:-1], linear.shape[:-2])
         return linear.expand(*batch, *linear.shape[-2:])
 
@@ -150,7 +152,7 @@ class Operator(ABC):
         at = self.linearize(state, frames)
         if at.jacobian is None:
             return at.displacement + state.joints
-        inverse = torch.linalg.pinv(at.jacobian)
+        inverse = gaussians.pseudo_inverse(at.jacobian)
         return (inverse @ at.displacement[..., None])[..., 0] + state.joints
 
     def local(self, demonstration: Demonstration, kinematics: Kinematics) -> Tensor:
