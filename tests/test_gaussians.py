@@ -370,6 +370,13 @@ def test_the_pseudo_inverse_is_moore_and_penrose_s_at_any_rank(smallest, dtype):
     found = gaussians.pseudo_inverse(matrix)
     tolerance = torch.finfo(dtype).eps ** (2 / 3) * expected.abs().max()
     torch.testing.assert_close(found, expected, rtol=0, atol=float(tolerance))
+    matrix[3, :, 5] = matrix[3, 2] = 0.0  # a coordinate or a row that is not there at all
+    torch.testing.assert_close(
+        gaussians.pseudo_inverse(matrix),
+        torch.linalg.pinv(matrix),
+        rtol=0,
+        atol=float(tolerance),
+    )
     tall = gaussians.pseudo_inverse(matrix.mT)
     torch.testing.assert_close(
         tall, torch.linalg.pinv(matrix.mT), rtol=0, atol=float(tolerance)

@@ -301,12 +301,12 @@ def pseudo_inverse(matrix: Tensor) -> Tensor:
         matrix = matrix.contiguous()  # products of matrices stored otherwise are slow
         gram = matrix @ matrix.mT
         factor, info = torch.linalg.cholesky_ex(gram)
-        inverse = torch.cholesky_inverse(factor)
-        # as many digits go as the condition number has: at most a third of them
-        most = torch.finfo(matrix.dtype).eps ** (-1 / 3)
-        condition = _size(gram) * _size(inverse)
-        if bool(((condition < most) & (info == 0)).all()):
-            return matrix.mT @ inverse
+        if not bool(info.any()):
+            inverse = torch.cholesky_inverse(factor)
+            # as many digits go as the condition number has: at most a third of them
+            most = torch.finfo(matrix.dtype).eps ** (-1 / 3)
+            if bool((_size(gram) * _size(inverse) < most).all()):
+                return matrix.mT @ inverse
     return torch.linalg.pinv(matrix)
 
 
