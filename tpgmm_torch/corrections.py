@@ -100,6 +100,6 @@ def _eliminated(
     gain, innovation = system[:, m:-1], system[:, -1:]
     moves = (gain * innovation).sum(0).permute(2, 1, 0).contiguous()
     # with the root of its weight, one matrix is both factors of the product
-    gain *= weights.sqrt().mT if weights.ndim > 1 else weights.sqrt().unsqueeze(-1)
+    gain *= weights.sqrt().reshape(-1, a).mT
     gain = gain.permute(3, 2, 0, 1).reshape(b, a * m, n)
     return moves, torch.baddbmm(prior, gain.mT, gain, alpha=-1)

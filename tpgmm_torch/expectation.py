@@ -199,18 +199,18 @@ class _Party:
         self._statistics.load(index, chunk)
         selection = next(self._selections)
         components = None if selection is None else selection.components
-        responsibilities, densities = self._evaluate(components, group_size)
-        least = densities.amin(1).tolist()
+        responsibilities, densities, least = self._evaluate(components, group_size)
         if selection is not None and not selection.confirmed(least):
             components = Selection.above(selection.ceilings, least).components
-            responsibilities, densities = self._evaluate(components, group_size)
-            least = densities.amin(1).tolist()
+            responsibilities, densities, least = self._evaluate(components, group_size)
         self._statistics.gather(responsibilities, components)
         self._total += densities.sum(1, dtype=torch.float64)
         self._least.append(least)
 
-    def _evaluate(self, components: Tensor | None, group_size: int) -> tuple[Tensor, Tensor]:
-        """Responsibilities (S * A, n), and log-densities (S, n)."""
+    def _evaluate(
+        self, components: Tensor | None, group_size: int
+    ) -> tuple[Tensor, Tensor, list[float]]:
+        """Responsibilities (S * A, n), log-densities (S, n), and the least of them (S)."""
         joint = self._statistics.joint(components)
         joint = joint.view(len(self.numbers), -1, joint.shape[1])
         _share(joint, group_size)
@@ -219,7 +219,8 @@ class _Party:
         relative = joint.sub_(largest).clamp_(min=SMALLEST[joint.dtype]).exp_()
         norm = relative.sum(1, keepdim=True)
         densities = largest.add_(norm.log())[:, 0]
-        return relative.div_(norm).view(-1, joint.shape[2]), densities
+        responsibilities = relative.div_(norm).view(-1, joint.shape[2])
+        return responsibilities, densities, densities.amin(1).tolist()
 
     def expectations(self, sums: Sequence[Tensor], n_points: int) -> Iterator[Expectation]:
         """One per mixture, from the sums over all processes and the number of their points."""

@@ -109,20 +109,23 @@ class TreeKinematics:
         # which numbers of the matrices are wanted: columns of poses, and the rows that turn
         bodies = [row[len(frames) + link] for link in range(len(links))]
         movers = [row[c] for c in columns]
-        self._wanted = {}  # of whole matrices, for one robot, and of their first rows
-        for dimensions, pose_size, turn_size in ((3, 16, 16), (4, 12, 4)):
-            wanted = [
-                [pose_size * pose + 4 * line + place for pose in poses for line in range(3)]
+
+        def wanted(pose_size: int, turn_size: int) -> Tensor:
+            numbers = [
+                pose_size * pose + 4 * line + place
                 for poses, place in (
                     (bodies, 3),  # where links are
                     (movers, 3),  # where the frames that move columns are,
                     (movers, 2),  # and their axes
                 )
+                for pose in poses
+                for line in range(3)
             ]
             turns = [pose_size * count + turn_size * body for body in bodies]
-            wanted.append([turn + place for turn in turns for place in range(4)])
-            self._wanted[dimensions] = index([number for part in wanted for number in part])
-        self._sizes = tuple(map(len, wanted))
+            return index(numbers + [turn + place for turn in turns for place in range(4)])
+
+        self._in_matrices, self._in_rows = wanted(16, 16), wanted(12, 4)
+        self._sizes = 3 * len(bodies), 3 * len(movers), 3 * len(movers), 4 * len(bodies)
         moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
         mask = np.reshape(moved, (len(columns), len(links), 1, 1))
         slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1, 1)
@@ -180,14 +183,14 @@ class TreeKinematics:
         if batch < MANY and not torch.compiler.is_compiling():
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
-            return local.reshape(16 * len(local), batch).index_select(0, self._wanted[3])
+            return local.reshape(16 * len(local), batch).index_select(0, self._in_matrices)
         halves = local.view(2, -1, 4, 4, batch)
         if batch < PLENTY and not torch.compiler.is_compiling():
             matrices = self._down(halves, 4)
-            return matrices.view(-1, batch).index_select(0, self._wanted[3])
+            return matrices.view(-1, batch).index_select(0, self._in_matrices)
         parts = (self._down(halves[:1], 3), self._down(halves[1:], 1))
         numbers = torch.cat([part.view(-1, batch) for part in parts])
-        return numbers.index_select(0, self._wanted[4])
+        return numbers.index_select(0, self._in_rows)
 
     def _down(self, local: Tensor, rows: int) -> Tensor:
         """The first rows of the products, level by level; local is (H, N, 4, 4, B)."""
@@ -197,13 +200,13 @@ class TreeKinematics:
         for parents, matrices in zip(self._parents, others, strict=True):
             if parents is not None:
                 level = level.index_select(1, parents)
-            level = (level.unsqueeze(4) * matrices.unsqueeze(2)).sum(3)
+            level = _product(level, matrices)
             levels.append(level)
         return torch.cat(levels, 1)
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
-    """Products of matrices (N, 4, 4), or (N, 4, 4, B) with robots in the last dimension."""
+    """Products of matrices (N, 4, 4), or (..., 4, 4, B) with robots in the last dimension."""
     if first.ndim == 3:
         return torch.bmm(first, second)
     return (first.unsqueeze(-2) * second.unsqueeze(-4)).sum(-3)

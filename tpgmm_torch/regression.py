@@ -8,7 +8,7 @@ mix the components.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +21,7 @@ from tpgmm_torch.frames import Frame
 from tpgmm_torch.joint_limits import within
 from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.local_mixtures import LocalMixture
-from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators import Linearization, Operator
 from tpgmm_torch.projections import Projection, hemispheres
 from tpgmm_torch.task_update import TaskUpdate
 from tpgmm_torch.trajectories import Candidate
@@ -108,7 +108,7 @@ class Regression:
         estimate = self.bounded(joints, covariance, activation, bounds)
         if not candidates:
             return estimate
-        return replace(estimate, candidates=self._candidates(time, state, frames, activation))
+        return replace(estimate, candidates=self._candidates(time, state, frames, estimate))
 
     def tick(
         self,
@@ -234,14 +234,10 @@ class Regression:
         """Eq. (2) for operators of any kind, in the form and with the weights asked for."""
         active = self._active(time)
         projections = []
-        for operator, mixture in zip(
-            self.operators, self._components(active, time), strict=True
-        ):
-            mean, gain, covariance = self._local(operator, mixture, time, state, frames)
+        for at, mean, gain, covariance in self._local(active, time, state, frames):
             columns = mean.unsqueeze(-1)
             if self.activation != "time":
                 columns = torch.stack(torch.broadcast_tensors(mean, gain), dim=-1)
-            at = operator.linearize(state, frames)
             projections.append(Projection.of(at, columns, covariance))
         if self.fusion == "covariance":
             projections = [p.in_joint_space(self.epsilon) for p in projections]
@@ -257,42 +253,25 @@ class Regression:
         activation[..., active] = weights
         return state.joints + mean, covariance, activation
 
-    def _components(self, active: tuple[int, ...], time: Tensor) -> Sequence[LocalMixture]:
-        """Of the mixtures, the components that count."""
-        if len(active) == len(self.log_weights):
-            return self.mixtures
-        index = torch.tensor(active, device=time.device)
-        return [mixture.select(index) for mixture in self.mixtures]
-
     def _candidates(
         self,
         time: Tensor,
         state: RobotState,
         frames: Mapping[str, Frame],
-        activation: Tensor,
+        estimate: Estimate,
     ) -> tuple[Candidate, ...]:
         """Eq. (1) for each operator, mixed over the components, and each one's share."""
         active = self._active(time)
-        weights = activation[..., active]
+        weights = estimate.activation[..., active]
         alone = []
-        for operator, mixture in zip(
-            self.operators, self._components(active, time), strict=True
-        ):
-            at = operator.linearize(state, frames)
+        for at, mean, _, covariance in self._local(active, time, state, frames):
             # mixing commutes with the affine map, and is less work before it
-            mean, _, covariance = self._local(operator, mixture, time, state, frames)
             mean, covariance = gaussians.moment_match(weights, mean, covariance)
             columns = mean[..., None, :, None]
             one = Projection.of(at, columns, covariance[..., None, :, :]).in_joint_space()
-            alone.append((one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]))
-        shapes = [
-            part.shape[:end] for pair in alone for part, end in zip(pair, (-1, -2), strict=True)
-        ]
-        batch = torch.broadcast_shapes(state.joints.shape[:-1], *shapes)
-        alone = [
-            (mean.expand(*batch, -1), covariance.expand(*batch, -1, -1))
-            for mean, covariance in alone
-        ]
+            step, covariance = one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]
+            covariance = covariance.expand_as(estimate.covariance)
+            alone.append((step.expand_as(estimate.joints), covariance))
         variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in alone])
         # where J^+ has no row but rounding, an operator does not touch the joint and has no say
         touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
@@ -300,8 +279,8 @@ class Regression:
         total = precisions.sum(0)
         shares = precisions / torch.where(total > 0, total, 1.0)
         return tuple(
-            Candidate(state.joints + mean, covariance, share)
-            for (mean, covariance), share in zip(alone, shares, strict=True)
+            Candidate(state.joints + step, covariance, share)
+            for (step, covariance), share in zip(alone, shares, strict=True)
         )
 
     def _product_activation(
@@ -325,20 +304,27 @@ class Regression:
 
     def _local(
         self,
-        operator: Operator,
-        mixture: LocalMixture,
+        active: tuple[int, ...],
         time: Tensor,
         state: RobotState,
         frames: Mapping[str, Frame],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, their time derivatives and covariances, on the present quaternions' side."""
-        mean, gain, covariance = mixture.at(time), mixture.gain, mixture.covariance
-        starts = operator.quaternion_starts(self.kinematics)
-        if starts:
-            signs = hemispheres(mean, operator.coordinates(state, frames), starts)
-            mean, gain = signs * mean, signs * gain
-            covariance = signs[..., None] * covariance * signs[..., None, :]
-        return mean, gain, covariance
+    ) -> Iterator[tuple[Linearization, Tensor, Tensor, Tensor]]:
+        """Each operator here, and means, time derivatives and covariances of components.
+
+        They are those that count, on the side of the present quaternions.
+        """
+        mixtures = self.mixtures
+        if len(active) < len(self.log_weights):
+            index = torch.tensor(active, device=time.device)
+            mixtures = [mixture.select(index) for mixture in mixtures]
+        for operator, mixture in zip(self.operators, mixtures, strict=True):
+            mean, gain, covariance = mixture.at(time), mixture.gain, mixture.covariance
+            starts = operator.quaternion_starts(self.kinematics)
+            if starts:
+                signs = hemispheres(mean, operator.coordinates(state, frames), starts)
+                mean, gain = signs * mean, signs * gain
+                covariance = signs[..., None] * covariance * signs[..., None, :]
+            yield operator.linearize(state, frames), mean, gain, covariance
 
     def _sum(
         self, projections: Sequence[Projection], state: RobotState

@@ -9,6 +9,7 @@ once, for all components, into the products of its coordinates, whereupon densit
 moments are one matrix product each; it loses twice as many.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -111,7 +112,7 @@ class WhitenedStatistics:
         for maps, x, room in zip(self._maps, self._chunk, self._room, strict=True):
             chosen = _chosen(maps, components)
             shape = len(chosen), len(x), x.shape[1]
-            y = room[: chosen[:, 0].numel() * x.shape[1]].view(shape)
+            y = room[: math.prod(shape)].view(shape)
             torch.mm(chosen.view(-1, len(x)), x, out=y.view(-1, x.shape[1]))
             squares = torch.mul(y, y, out=self._squares[: y.numel()].view(shape))
             joint = torch.sub(joint, squares.sum(1), alpha=0.5)
