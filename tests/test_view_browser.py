@@ -92,14 +92,15 @@ def test_live_an_object_is_dragged_and_the_skill_reproduced_anew():
         draws(page)
         page.wait_for("document.body.innerText.includes('time [s]')")
         camera, size = view.scene.server.initial_camera, view.scene.frames["bottle"].scale
-        start, end = (seen_at(page, camera, before + d * up) for d in (size, size + 0.05))
+        # from within the arrow, in steps that stay on it: a busy browser may forget the capture
+        start, end = (seen_at(page, camera, before + (0.85 * size + d) * up) for d in (0, 0.05))
         planned = view.trajectory
         deadline = time.monotonic() + browser.PATIENCE
         while yellow(page.screenshot()) < 10:  # pressed too early, the mouse turns the camera
             assert time.monotonic() < deadline, "the handle does not feel the mouse"
             page.mouse("mouseMoved", start + time.monotonic() % 2, buttons=0)
         page.mouse("mousePressed", start)
-        for share in np.linspace(0, 1, 6):
+        for share in np.linspace(0, 1, 17):
             page.mouse("mouseMoved", start + share * (end - start))
         page.mouse("mouseReleased", end, buttons=0)
         deadline = time.monotonic() + browser.PATIENCE
