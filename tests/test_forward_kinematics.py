@@ -28,6 +28,17 @@ def test_many_robots_are_each_one_alone(make, count):
             )
 
 
+def test_one_robot_has_any_shape():
+    robot = zoo()
+    joints = random_joints(robot, 3)[1]
+    alone = robot.state(joints)
+    for batch in ((1,), (1, 1)):
+        state = robot.state(joints.expand(*batch, -1))
+        for name in ("positions", "orientations", "jacobians"):
+            part, whole = getattr(alone, name), getattr(state, name)
+            assert torch.equal(whole, part.expand(*batch, *part.shape))
+
+
 def test_no_robot_at_all_is_a_batch_too():
     state = upper_body().state(torch.zeros(0, 17))
     assert state.positions.shape == (0, 2, 3)

@@ -8,7 +8,7 @@ import torch
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.frames import Frame
+from tpgmm_torch.frames import Frame, as_tensor
 
 HALF = math.sqrt(0.5)
 
@@ -82,6 +82,15 @@ def test_frames_refuse_wrong_shapes(position, orientation, message):
 def test_frames_refuse_quaternions_that_are_not_of_unit_norm(orientation):
     with pytest.raises(DataError, match=r"unit quaternion \(w, x, y, z\): a norm is off by"):
         Frame([0.0, 0.0, 0.0], orientation)
+
+
+def test_numbers_are_finite_though_their_sum_is_not():
+    for count in (2, 1000):  # added by Python, and by torch
+        huge = torch.full((count, 2), 1e308, dtype=torch.float64)
+        assert torch.equal(as_tensor(huge.T, "it"), huge.T)
+        huge[-1, 1] = math.inf
+        with pytest.raises(DataError, match=rf"it holds 1 .* at index \[1, {count - 1}\]"):
+            as_tensor(huge.T, "it")
 
 
 def test_frames_name_what_is_nan():

@@ -67,8 +67,10 @@ class CompiledUpdate:
         task, negative = mean[:, :width], mean[:, width:]
 
         # M mu and M S, J C and J (-m), of each component in turn: (A, D + 1, m, B) and so on
-        tasks = _mapped(tables.tasks, task, matrix)
-        cross = _mapped(tables.joints, negative, jacobian)
+        n = len(jacobian)
+        priors = tables.priors.view(-1, n, n)
+        tasks = _mapped(tables.tasks.view(width, -1, width).transpose(0, 1), task, matrix)
+        cross = _mapped(priors, negative, jacobian)
         h = (tasks[:, :-1].unsqueeze(3) * matrix.unsqueeze(1)).sum(1)  # (A, m, m, B)
         measured = tasks[:, -1]  # (A, m, B)
         if self._sides is not None:
@@ -87,7 +89,7 @@ class CompiledUpdate:
         joints = (each * by_component).sum(0)
         # within the components C - G^T G, and between them: the law of total variance
         apart = each - joints
-        covariance = (by_component * tables.joints).sum(0).unsqueeze(-1)
+        covariance = (by_component * priors).sum(0).unsqueeze(-1)
         less = ((gain * by_component).unsqueeze(3) * gain.unsqueeze(2)).sum((0, 1))
         between = ((apart * by_component).unsqueeze(2) * apart.unsqueeze(1)).sum(0)
         activation = (weights.unsqueeze(-1) * tables.places).sum(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -29,10 +29,13 @@ class Tables:
     mean, gain : Tensor of shape (A, D + n)
         Local coordinates of the D task dimensions, and the *negative* n joints:
         ``E[x | t] = mean + gain (t - time_mean)``.
-    tasks : Tensor of shape (A, D, D)
-        Covariances of the task coordinates given time: a block for each task.
-    joints : Tensor of shape (A, n, n)
+    tasks : Tensor of shape (D, A D)
+        Covariances of the task coordinates given time, a block for each task; those of all
+        components side by side, since all are multiplied with at once.
+    joints : Tensor of shape (n, A n)
         Those of the joints, C.
+    priors : Tensor of shape (A, n n)
+        The same once more, each in one row, to be summed.
     """
 
     places: Tensor
@@ -43,17 +46,19 @@ class Tables:
     gain: Tensor
     tasks: Tensor
     joints: Tensor
+    priors: Tensor
 
     def select(self, components: Sequence[int]) -> Tables:
         """Only some of the components."""
         index = torch.tensor(components, device=self.time_mean.device)
-        chosen = Tables(*(getattr(self, field.name)[index] for field in fields(self)))
-        # stored row by row of all components, which are multiplied with at once
-        tasks, joints = (
-            table.transpose(0, 1).contiguous().transpose(0, 1)
-            for table in (chosen.tasks, chosen.joints)
-        )
-        return replace(chosen, tasks=tasks, joints=joints)
+        rows = {f.name: getattr(self, f.name) for f in fields(self)}
+        wide = {name: rows.pop(name) for name in ("tasks", "joints")}
+        chosen = {name: table[index] for name, table in rows.items()}
+        for name, table in wide.items():
+            size = len(table)
+            each = table.view(size, len(self.time_mean), size)[:, index]
+            chosen[name] = each.reshape(size, len(index) * size)
+        return Tables(**chosen)
 
     def padded(self, components: Sequence[int], count: int) -> Tables:
         """Some of the components, and others without weight up to ``count``."""
@@ -105,8 +110,9 @@ class Tables:
             end = start + covariance.shape[-1]
             blocks.append(torch.nn.functional.pad(covariance, (start, size - end)))
             start = end
-        whole = torch.cat(blocks, -2) if blocks else means[-1].new_zeros(len(time_mean), 0, 0)
         count = len(time_mean)
+        whole = torch.cat(blocks, -2) if blocks else means[-1].new_zeros(count, 0, 0)
+        joints = covariances[-1]
         return cls(
             torch.eye(count, dtype=like.dtype, device=like.device),
             *(
@@ -117,8 +123,9 @@ class Tables:
                     log_weights.double() - 0.5 * variance.log(),
                     torch.cat((*means[:-1], -means[-1]), -1),
                     torch.cat((*gains[:-1], -gains[-1]), -1),
-                    whole,
-                    covariances[-1],
+                    whole.transpose(0, 1).reshape(size, count * size),
+                    joints.transpose(0, 1).flatten(1),
+                    joints.flatten(1),
                 )
             ),
         )

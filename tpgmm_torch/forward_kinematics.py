@@ -9,7 +9,7 @@ One batch of matrix products multiplies all of them by their parents; every furt
 the number of joints that are behind: ten joints in a row need four. That costs more arithmetic
 and fewer operations than going from joint to joint, which is what a controller wants. Many
 robots at once go level by level, in the end with only the rows that are wanted: three of a
-pose, one of a turn. Inside, the B robots stand in the last dimension.
+pose, one of a turn. Inside, the B robots stand in the last dimension; one robot has none.
 """
 
 import itertools
@@ -87,8 +87,12 @@ class TreeKinematics:
         one = constant(factors)
         self._factors = {3: one.unbind(0), 4: one.unsqueeze(-1).unbind(0)}
         self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
+        self._shift_of_one = self._shift[:, 0]
         hops = _hops(parents)
         self._hops = [index(hop + [count + parent for parent in hop]) for hop in hops]
+        # of one robot, number by number, which is sooner done than row by row
+        numbers = torch.arange(16, device=device).view(4, 4)
+        self._hops_of_one = [16 * hop.view(-1, 1, 1) + numbers for hop in self._hops]
         # level by level: how many bodies there are, and whom they are carried by
         self._counts = [1, *np.bincount(depths)[1:].tolist()]
         self._parents: list[Tensor | None] = []
@@ -127,10 +131,16 @@ class TreeKinematics:
         self._in_matrices, self._in_rows = wanted(16, 16), wanted(12, 4)
         self._sizes = 3 * len(bodies), 3 * len(movers), 3 * len(movers), 4 * len(bodies)
         moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
-        mask = np.reshape(moved, (len(columns), len(links), 1, 1))
-        slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1, 1)
-        self._turns = constant(mask * ~slide)  # (C, L, 1, 1)
-        self._slides = constant(mask * slide) if slide.any() else None
+        mask = np.reshape(moved, (len(columns), len(links), 1))
+        slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1)
+
+        def both(values: Any) -> dict[int, Tensor]:
+            """(C, L, 1) for one robot, and with a dimension for many."""
+            return {3: constant(values), 4: constant(values).unsqueeze(-1)}
+
+        self._turns, self._slides = both(mask * ~slide), None
+        if slide.any():
+            self._slides = both(mask * slide)
         self._one = constant(1.0)
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -138,38 +148,44 @@ class TreeKinematics:
 
         Parameters
         ----------
-        joints : Tensor of shape (B, n_joints)
+        joints : Tensor of shape (B, n_joints), or (n_joints,)
 
         Returns
         -------
-        positions : Tensor of shape (B, L, 3)
-        orientations : Tensor of shape (B, L, 4)
+        positions : Tensor of shape (B, L, 3), or (L, 3)
+        orientations : Tensor of shape (B, L, 4), or (L, 4)
             Unit quaternions, real part not negative.
-        jacobians : Tensor of shape (B, L, 6, n_joints)
+        jacobians : Tensor of shape (B, L, 6, n_joints), or (L, 6, n_joints)
             Linear rows above angular rows.
         """
-        batch, compiling = len(joints), torch.compiler.is_compiling()
-        if compiling:  # a sum is a loop that others can join
+        batch = joints.shape[:-1]
+        if torch.compiler.is_compiling():  # a sum is a loop that others can join
             moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
-        else:
+        elif batch:
             moved = torch.addmm(self._shift, self._follow, joints.T)  # (N, B)
-        # of one robot, matrices stand in the last dimensions, where libraries want them
-        alone = batch == 1 and not compiling
-        moved = moved.view(-1, 1, 1) if alone else moved.view(len(moved), 1, 1, batch)
-        numbers = self._products(self._local(moved), batch)
+        else:
+            moved = torch.addmv(self._shift_of_one, self._follow, joints)
+        local = self._local(moved.view(len(moved), 1, 1, *batch))
+        numbers = self._products(local, batch)
         position, origin, axis, quaternion = numbers.split(self._sizes)
-        columns, links = self._turns.shape[:2]
-        position, quaternion = position.view(links, 3, batch), quaternion.view(links, 4, batch)
+        columns, links = self._turns[3].shape[:2]
+        position = position.view(links, 3, *batch)
+        quaternion = quaternion.view(links, 4, *batch)
         quaternion = quaternion * torch.copysign(self._one, quaternion.narrow(1, 0, 1))
-        origin, axis = (x.view(columns, 1, 3, batch) for x in (origin, axis))
-        turning = axis * self._turns  # (C, L, 3, B)
+        origin, axis = (x.view(columns, 1, 3, *batch) for x in (origin, axis))
+        turning = axis * self._turns[axis.ndim]  # (C, L, 3[, B])
         linear = _cross(turning, position - origin)
         if self._slides is not None:
-            linear = linear + axis * self._slides
-        jacobians = torch.cat((linear, turning), 2).permute(3, 1, 2, 0)  # (B, L, 6, C)
+            linear = linear + axis * self._slides[axis.ndim]
+        jacobians = torch.cat((linear, turning), 2)
+        if batch:
+            position, quaternion = position.permute(2, 0, 1), quaternion.permute(2, 0, 1)
+            jacobians = jacobians.permute(3, 1, 2, 0)  # (B, L, 6, C)
+        else:
+            jacobians = jacobians.permute(1, 2, 0)
         if self._mimic is not None:
             jacobians = jacobians @ self._mimic
-        return position.permute(2, 0, 1), quaternion.permute(2, 0, 1), jacobians
+        return position, quaternion, jacobians
 
     def _local(self, moved: Tensor) -> Tensor:
         """The matrices of all bodies in their carriers, the base first, (N, 4, 4[, B])."""
@@ -178,18 +194,23 @@ class TreeKinematics:
         local = torch.addcmul(local, cosine, moved.cos())
         return torch.addcmul(local, sliding, moved) if self._slides is not None else local
 
-    def _products(self, local: Tensor, batch: int) -> Tensor:
-        """The numbers that are wanted of the products along the tree, (W, B)."""
-        if batch < MANY and not torch.compiler.is_compiling():
+    def _products(self, local: Tensor, batch: torch.Size) -> Tensor:
+        """The numbers that are wanted of the products along the tree, (W[, B])."""
+        if not batch:
+            for numbers in self._hops_of_one:
+                local = torch.bmm(local.take(numbers), local)
+            return local.view(-1).index_select(0, self._in_matrices)
+        count = None if torch.compiler.is_compiling() else batch.numel()
+        if count is not None and count < MANY:
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
-            return local.reshape(16 * len(local), batch).index_select(0, self._in_matrices)
-        halves = local.view(2, -1, 4, 4, batch)
-        if batch < PLENTY and not torch.compiler.is_compiling():
+            return local.reshape(16 * len(local), *batch).index_select(0, self._in_matrices)
+        halves = local.view(2, -1, 4, 4, *batch)
+        if count is not None and count < PLENTY:
             matrices = self._down(halves, 4)
-            return matrices.view(-1, batch).index_select(0, self._in_matrices)
+            return matrices.view(-1, *batch).index_select(0, self._in_matrices)
         parts = (self._down(halves[:1], 3), self._down(halves[1:], 1))
-        numbers = torch.cat([part.view(-1, batch) for part in parts])
+        numbers = torch.cat([part.view(-1, *batch) for part in parts])
         return numbers.index_select(0, self._in_rows)
 
     def _down(self, local: Tensor, rows: int) -> Tensor:
@@ -206,15 +227,14 @@ class TreeKinematics:
 
 
 def _product(first: Tensor, second: Tensor) -> Tensor:
-    """Products of matrices (N, 4, 4), or (..., 4, 4, B) with robots in the last dimension."""
-    if first.ndim == 3:
-        return torch.bmm(first, second)
+    """Products of matrices (..., 4, 4, B)."""
     return (first.unsqueeze(-2) * second.unsqueeze(-4)).sum(-3)
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    """Cross products along the third dimension of (C, L, 3, B)."""
-    if first.shape[-1] < MANY and not torch.compiler.is_compiling():
+    """Cross products along the third dimension of (C, L, 3), or (C, L, 3, B)."""
+    few = first.ndim == 3 or first.shape[-1] < MANY
+    if few and not torch.compiler.is_compiling():
         return torch.linalg.cross(first, second, dim=2)
     x, y, z = first.unbind(2)
     u, v, w = second.unbind(2)

@@ -24,6 +24,9 @@ __all__ = ["UNIT_NORM_TOLERANCE", "Frame", "as_tensor"]
 #: (float32 recordings, a few printed digits) and brought to unit norm.
 UNIT_NORM_TOLERANCE = 1e-3
 
+#: So many numbers are added sooner by Python than by torch.
+FEW = 64
+
 
 def as_tensor(values: Any, name: str) -> Tensor:
     """Convert what a user gives into a finite floating tensor, without sharing memory.
@@ -57,7 +60,8 @@ def as_tensor(values: Any, name: str) -> Tensor:
         except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise DataError(f"{name} must be an array of numbers: {error}") from error
     # every tick asks: a sum is quickly had, and is not finite if a number is not
-    if math.isfinite(tensor.detach().sum().item()):
+    few = tensor.numel() <= FEW
+    if math.isfinite(sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()):
         return tensor
     finite = torch.isfinite(tensor)
     if not bool(finite.all()):

@@ -51,16 +51,14 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
     DataError
         If a matrix is not positive definite.
     """
-    try:
-        return torch.linalg.cholesky(matrix)
-    except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
-        info = torch.linalg.cholesky_ex(matrix).info
-        bad = int((info != 0).sum())
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    if info.any():
         raise DataError(
-            f"{name} is not positive definite ({bad} of {info.numel()} matrices of size "
-            f"{matrix.shape[-1]}): a direction has no variance; a larger regularisation "
-            "(reg_covar, or epsilon of the covariance form) gives it some"
-        ) from error
+            f"{name} is not positive definite ({int((info != 0).sum())} of {info.numel()} "
+            f"matrices of size {matrix.shape[-1]}): a direction has no variance; a larger "
+            "regularisation (reg_covar, or epsilon of the covariance form) gives it some"
+        )
+    return factor
 
 
 def affine(

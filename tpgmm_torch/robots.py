@@ -141,10 +141,13 @@ class Robot(Kinematics):
         """
         joints = self.joint_tensor(joints)
         batch = joints.shape[:-1]
-        if len(batch) == 1:
+        # to a compiler, one robot is a batch as well
+        alone = not torch.compiler.is_compiling() and batch.numel() == 1
+        if len(batch) == (0 if alone else 1):
             return RobotState(joints, self.links, *self.forward_kinematics(joints))
-        rows = joints.reshape(batch.numel(), self.n_joints)
-        poses = (part.reshape(batch + part.shape[1:]) for part in self.forward_kinematics(rows))
+        rows = joints.reshape(*(() if alone else (batch.numel(),)), self.n_joints)
+        parts = self.forward_kinematics(rows)
+        poses = (part.reshape(batch + part.shape[rows.ndim - 1 :]) for part in parts)
         return RobotState(joints, self.links, *poses)
 
     def to(

@@ -142,19 +142,16 @@ class TaskUpdate:
         if present is None and self.sides is not None:
             assert self.task is not None
             present = self.task.coordinates(state, frames)
-        # robot by robot, as libraries want matrices
-        jacobian, matrix = (_flat(x, batch).contiguous() for x in (at.jacobian, at.matrix))
-        shift = torch.baddbmm(
-            _flat(at.displacement, batch, 1).unsqueeze(-1),
-            jacobian,
-            _flat(joints, batch, 1).unsqueeze(-1),
-        )
+        jacobian, matrix = _flat(at.jacobian, batch), _flat(at.matrix, batch)
+        if batch.numel() > 1:  # robot by robot, as libraries want matrices
+            jacobian, matrix = jacobian.contiguous(), matrix.contiguous()
+        shift, joints = _flat(at.displacement, batch, 1), _flat(joints, batch, 1)
         if present is not None:
             present = _flat(present, batch, 1)
         if time.ndim:
             time = _flat(time, batch, 0)
         mean, covariance, activation = self._corrected(
-            choose(time), time, jacobian, matrix, shift, present
+            choose(time), time, joints, jacobian, matrix, shift, present
         )
         if len(batch) == 1:
             return mean, covariance, activation
@@ -168,6 +165,7 @@ class TaskUpdate:
         self,
         tables: Tables,
         time: Tensor,
+        joints: Tensor,
         jacobian: Tensor,
         matrix: Tensor,
         shift: Tensor,
@@ -179,10 +177,12 @@ class TaskUpdate:
         ----------
         tables : Tables
         time : Tensor of shape () or (B,)
+        joints : Tensor of shape (B, n)
+            The joints q_{t-1}.
         jacobian : Tensor of shape (B, m, n)
         matrix : Tensor of shape (B, m, D)
-        shift : Tensor of shape (B, m, 1)
-            ``c + J q_{t-1}``.
+        shift : Tensor of shape (B, m)
+            The displacement c.
         present : Tensor of shape (B, D), optional
             The present quaternions.
         """
@@ -196,32 +196,26 @@ class TaskUpdate:
         mean = torch.addcmul(tables.mean, tables.gain, apart.unsqueeze(-1))
         width = matrix.shape[-1]
         task, negative = mean.narrow(-1, 0, width), mean.narrow(-1, width, n)
-        other = None
-        if present is not None and self.sides is not None:
-            signs = self._signs(task, present)  # (B, A, m)
-            # nearly always all components are on one side
-            first = signs.narrow(1, 0, 1)
-            matrix = matrix * first.mT
-            other = None if torch.equal(signs, first.expand_as(signs)) else signs * first
+        matrix, other = self._sided(matrix, task, present)
 
         # J C and M S of all components; H, and the innovation y - J (m - q_{t-1})
-        crossed = _mapped(jacobian, tables.joints)  # (B, m A, n)
-        h = torch.bmm(_mapped(matrix, tables.tasks), matrix.mT)  # (B, m A, m)
-        innovation = matrix @ task.mT  # (B, m, A)
+        crossed = (jacobian @ tables.joints).view(b, m * a, n)
+        h = torch.bmm((matrix @ tables.tasks).view(b, m * a, width), matrix.mT)  # (B, m A, m)
+        expected = matrix @ task.mT  # (B, m, A)
         if other is not None:
             h = h.view(b, m, a, m) * other.mT.unsqueeze(-1) * other.unsqueeze(1)
-            h, innovation = h.view(b, m * a, m), innovation * other.mT
+            h, expected = h.view(b, m * a, m), expected * other.mT
         h.baddbmm_(crossed, jacobian.mT)
-        innovation += jacobian @ negative.mT + shift
+        away = joints.unsqueeze(-1) + negative.mT  # (B, n, A)
+        innovation = torch.baddbmm(shift.unsqueeze(-1), jacobian, away).add_(expected)
 
-        prior = (weights @ tables.joints.flatten(1)).reshape(-1, n, n)
+        prior = (weights @ tables.priors).view(-1, n, n)
         moves, covariance = corrections(h, crossed, innovation, weights, prior)
         each = moves - negative
-        heavy = weights.unsqueeze(-1)  # (A, 1), or (B, A, 1)
-        joints = (heavy * each).sum(1)
+        joints = torch.bmm(weights.view(-1, 1, a).expand(b, 1, a), each).squeeze(1)
         # within the components, and between them: the law of total variance
         apart = each - joints.unsqueeze(1)
-        covariance.baddbmm_((apart * heavy).mT, apart)
+        covariance.baddbmm_((apart * weights.unsqueeze(-1)).mT, apart)
         return joints, covariance, weights @ tables.places
 
     def _linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
@@ -234,12 +228,25 @@ class TaskUpdate:
             )
         return self.task.linearize(state, frames)
 
-    def _signs(self, task: Tensor, present: Tensor) -> Tensor:
-        """Signs (B, A, m) that bring each mean quaternion to the present one's side."""
-        assert self.sides is not None
+    def _sided(
+        self, matrix: Tensor, task: Tensor, present: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """M for mean quaternions on the present one's side of the sphere.
+
+        A mean on the other side is minus itself, as are its rows. Where that differs between
+        components, there are signs (B, A, m) by which theirs differ from the first one's.
+        """
+        if present is None or self.sides is None:
+            return matrix, None
+        # where no quaternion stands, inner is zero
         inner = (task * present.unsqueeze(1)) @ self.sides.mT
-        # where no quaternion stands, inner is zero of either sign
-        return torch.copysign(self._one, inner + 1e-30)
+        if inner.numel() == 0 or inner.min().item() >= 0:  # often all are there
+            return matrix, None
+        signs = torch.where(inner < 0, -self._one, self._one)
+        first = signs.narrow(1, 0, 1)
+        matrix = matrix * first.mT
+        # nearly always all components are on one side
+        return matrix, None if torch.equal(signs, first.expand_as(signs)) else signs * first
 
 
 def _sides(task: Stack, kinematics: Kinematics) -> Tensor:
@@ -251,14 +258,6 @@ def _sides(task: Stack, kinematics: Kinematics) -> Tensor:
             sides[3 * index : 3 * index + 3, column + start : column + start + 4] = 1.0
         column += leaf.dimension(kinematics)
     return sides
-
-
-def _mapped(rows: Tensor, covariances: Tensor) -> Tensor:
-    """``R C`` of rows (B, m, D) and each of A covariances (A, D, D), (B, m A, D)."""
-    b, m, d = rows.shape
-    a = len(covariances)
-    wide = covariances.transpose(0, 1).reshape(d, a * d)
-    return (rows.reshape(b * m, d) @ wide).view(b, m * a, d)
 
 
 def _flat(tensor: Tensor, batch: torch.Size, own: int = 2) -> Tensor:

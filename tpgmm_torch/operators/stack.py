@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -54,7 +55,7 @@ class Stack(Operator):
                 raise DataError(f"Stack takes operators, got {type(operator).__name__}")
         object.__setattr__(self, "operators", operators)
 
-    @property
+    @cached_property
     def leaves(self) -> tuple[Operator, ...]:
         """The members, and those of members that are stacks themselves, in their order."""
         return tuple(
