@@ -49,6 +49,7 @@ DATA = {"random": random_data, "badly scaled": badly_scaled, "singular": nearly_
 @pytest.mark.parametrize("name", DATA)
 def test_iterations_equal_the_reference(name, form, kept, monkeypatch):
     monkeypatch.setattr(sufficient_statistics, "MOST_KEPT", 2**23 if kept else 0)
+    monkeypatch.setattr(sufficient_statistics, "MANY_COMPONENTS", 0)
     if form == "whitened":
         monkeypatch.setattr(sufficient_statistics, "MANY_POINTS", 10**9)
     points, units = standardized(DATA[name]())
@@ -274,3 +275,23 @@ def test_the_first_pass_leaves_components_out_too(shift, monkeypatch):
     assert gated.bound == pytest.approx(dense.bound, rel=1e-9)
     for own, expected in zip(gated.moments, dense.moments, strict=True):
         torch.testing.assert_close(own, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("components", "kept", "copies", "packed"),
+    [(8, True, 1, True), (8, False, 1, False), (40, False, 1, True), (8, False, 5, True)],
+    ids=["kept", "few components", "many components", "restarts"],
+)
+def test_products_are_made_where_they_pay(components, kept, copies, packed, monkeypatch):
+    if not kept:
+        monkeypatch.setattr(sufficient_statistics, "MOST_KEPT", 0)
+    used = []
+    for form in ("Packed", "Whitened"):
+        make = getattr(sufficient_statistics, f"{form}Statistics")
+        monkeypatch.setattr(
+            f"tpgmm_torch.expectation.{form}Statistics",
+            lambda *given, make=make, form=form: used.append(form) or make(*given),
+        )
+    points, units = standardized(random_data())
+    expect([binned(points, family(units), components)] * copies, points)
+    assert used == ["Packed" if packed else "Whitened"] * (1 if packed else copies)

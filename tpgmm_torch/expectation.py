@@ -150,7 +150,7 @@ def _parties(
     """Those that can be packed together, the others one by one: they have nothing to share."""
     joined = Parameters.joined(mixtures)
     whitener = Whitener(joined, points.dtype)
-    packed = packs(whitener, len(mixtures), points.total, points.dtype)
+    packed = packs(whitener, len(mixtures), workspace.features, points.total, points.dtype)
     together = [number for number, fits in enumerate(packed) if fits]
     alone = [number for number, fits in enumerate(packed) if not fits]
     parties = []

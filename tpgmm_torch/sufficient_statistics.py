@@ -27,6 +27,10 @@ SHARPEST = 1e7
 #: ... and from this number of points on: fewer gain nothing worth a digit.
 MANY_POINTS = 4096
 
+#: ... and where the products are kept, or from this number of components on: fewer are sooner
+#: whitened than the products written and read again, for which no cache near the core has room.
+MANY_COMPONENTS = 32
+
 #: By how much a mean log-density may be off, relative to 1 and to itself.
 ROUNDING = {torch.float64: 2e-13, torch.float32: 1e-5}
 
@@ -153,11 +157,15 @@ class Features:
     def __init__(self, widths: Sequence[int], n_points: int) -> None:
         self.pairs = [_pairs(width + 1) for width in widths]
         self.count = sum(pairs.shape[1] for pairs in self.pairs)
-        self._keeps = self.count * n_points <= MOST_KEPT
+        self._keeps = self.few(n_points)
         self._kept: dict[int, Tensor] = {}
         self._phi = torch.empty(0)
         self._points: list[Tensor] = []
         self._products: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def few(self, n_points: int) -> bool:
+        """Whether so many points are few enough."""
+        return self.count * n_points <= MOST_KEPT
 
     def of(self, index: int, chunk: Chunk) -> Tensor:
         """Features of the chunk with this number, shape (F, n), valid until the next call."""
@@ -279,7 +287,9 @@ def sharpness(whitener: Whitener) -> Tensor:
     return torch.stack(traces).sum(0)
 
 
-def packs(whitener: Whitener, n_mixtures: int, n_points: int, dtype: torch.dtype) -> list[bool]:
+def packs(
+    whitener: Whitener, n_mixtures: int, features: Features, n_points: int, dtype: torch.dtype
+) -> list[bool]:
     """For which mixtures the packed form is accurate enough, and worth it.
 
     Parameters
@@ -288,12 +298,14 @@ def packs(whitener: Whitener, n_mixtures: int, n_points: int, dtype: torch.dtype
         Of several mixtures of equal size, one after the other.
     n_mixtures : int
         How many they are.
+    features : Features
     n_points : int
-        Of all processes.
+        Of all processes, which have to agree.
     dtype : torch.dtype
         Precision of the points.
     """
-    if n_points < MANY_POINTS or dtype != torch.float64:
+    worth_it = len(whitener.constant) >= MANY_COMPONENTS or features.few(n_points)
+    if n_points < MANY_POINTS or dtype != torch.float64 or not worth_it:
         return [False] * n_mixtures
     fits = sharpness(whitener).view(n_mixtures, -1).amax(1) < SHARPEST
     found: list[bool] = fits.tolist()
