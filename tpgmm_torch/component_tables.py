@@ -51,14 +51,16 @@ class Tables:
     def select(self, components: Sequence[int]) -> Tables:
         """Only some of the components."""
         index = torch.tensor(components, device=self.time_mean.device)
-        rows = {f.name: getattr(self, f.name) for f in fields(self)}
-        wide = {name: rows.pop(name) for name in ("tasks", "joints")}
-        chosen = {name: table[index] for name, table in rows.items()}
-        for name, table in wide.items():
+
+        def chosen(name: str) -> Tensor:
+            table: Tensor = getattr(self, name)
+            if name not in ("tasks", "joints"):
+                return table[index]
             size = len(table)
             each = table.view(size, len(self.time_mean), size)[:, index]
-            chosen[name] = each.reshape(size, len(index) * size)
-        return Tables(**chosen)
+            return each.reshape(size, len(index) * size)
+
+        return Tables(*(chosen(field.name) for field in fields(self)))
 
     def padded(self, components: Sequence[int], count: int) -> Tables:
         """Some of the components, and others without weight up to ``count``."""

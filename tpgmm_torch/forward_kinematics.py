@@ -66,7 +66,7 @@ class TreeKinematics:
         count = len(row)
         factors = np.zeros((4, 2 * count, 4, 4))  # of 1, sine, cosine, joint
         factors[0, [0, count]] = np.eye(4)
-        follow, shift = np.zeros((2 * count, n_joints)), np.zeros((2 * count, 1))
+        follow, shift = np.zeros((2 * count, n_joints)), np.zeros(2 * count)
         parents = [0] * count
         turned = {-1: np.eye(4)} | {f: _z_to(frame.axis) for f, frame in enumerate(frames)}
         for body, carrier in enumerate(carriers):
@@ -86,8 +86,7 @@ class TreeKinematics:
         # (N, 4, 4) each, for one robot, and with a dimension for many
         one = constant(factors)
         self._factors = {3: one.unbind(0), 4: one.unsqueeze(-1).unbind(0)}
-        self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N, 1)
-        self._shift_of_one = self._shift[:, 0]
+        self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N,)
         hops = _hops(parents)
         self._hops = [index(hop + [count + parent for parent in hop]) for hop in hops]
         # of one robot, number by number, which is sooner done than row by row
@@ -160,11 +159,11 @@ class TreeKinematics:
         """
         batch = joints.shape[:-1]
         if torch.compiler.is_compiling():  # a sum is a loop that others can join
-            moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
+            moved = self._shift.unsqueeze(-1) + (self._follow.unsqueeze(-1) * joints.T).sum(1)
         elif batch:
-            moved = torch.addmm(self._shift, self._follow, joints.T)  # (N, B)
+            moved = torch.addmm(self._shift.unsqueeze(-1), self._follow, joints.T)  # (N, B)
         else:
-            moved = torch.addmv(self._shift_of_one, self._follow, joints)
+            moved = torch.addmv(self._shift, self._follow, joints)
         local = self._local(moved.view(len(moved), 1, 1, *batch))
         numbers = self._products(local, batch)
         position, origin, axis, quaternion = numbers.split(self._sizes)
@@ -200,13 +199,13 @@ class TreeKinematics:
             for numbers in self._hops_of_one:
                 local = torch.bmm(local.take(numbers), local)
             return local.view(-1).index_select(0, self._in_matrices)
-        count = None if torch.compiler.is_compiling() else batch.numel()
-        if count is not None and count < MANY:
+        count = PLENTY if torch.compiler.is_compiling() else batch.numel()
+        if count < MANY:
             for hop in self._hops:
                 local = _product(local.index_select(0, hop), local)
             return local.reshape(16 * len(local), *batch).index_select(0, self._in_matrices)
         halves = local.view(2, -1, 4, 4, *batch)
-        if count is not None and count < PLENTY:
+        if count < PLENTY:
             matrices = self._down(halves, 4)
             return matrices.view(-1, *batch).index_select(0, self._in_matrices)
         parts = (self._down(halves[:1], 3), self._down(halves[1:], 1))

@@ -145,9 +145,9 @@ class Robot(Kinematics):
         alone = not torch.compiler.is_compiling() and batch.numel() == 1
         if len(batch) == (0 if alone else 1):
             return RobotState(joints, self.links, *self.forward_kinematics(joints))
-        rows = joints.reshape(*(() if alone else (batch.numel(),)), self.n_joints)
-        parts = self.forward_kinematics(rows)
-        poses = (part.reshape(batch + part.shape[rows.ndim - 1 :]) for part in parts)
+        rows = (self.n_joints,) if alone else (batch.numel(), self.n_joints)
+        parts = self.forward_kinematics(joints.reshape(rows))
+        poses = (part.reshape(batch + part.shape[len(rows) - 1 :]) for part in parts)
         return RobotState(joints, self.links, *poses)
 
     def to(

@@ -87,7 +87,6 @@ class TaskUpdate:
         self.sides: Tensor | None = None
         if self.task is not None and self.task.quaternion_starts(kinematics):
             self.sides = _sides(self.task, kinematics).to(like)
-        self._one = like.new_ones(())
 
     @staticmethod
     def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
@@ -242,7 +241,7 @@ class TaskUpdate:
         inner = (task * present.unsqueeze(1)) @ self.sides.mT
         if inner.numel() == 0 or inner.min().item() >= 0:  # often all are there
             return matrix, None
-        signs = torch.where(inner < 0, -self._one, self._one)
+        signs = torch.where(inner < 0, -1.0, 1.0).to(inner)
         first = signs.narrow(1, 0, 1)
         matrix = matrix * first.mT
         # nearly always all components are on one side
