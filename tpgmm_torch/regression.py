@@ -108,7 +108,7 @@ class Regression:
         estimate = self.bounded(joints, covariance, activation, bounds)
         if not candidates:
             return estimate
-        return replace(estimate, candidates=self._candidates(time, state, frames, estimate))
+        return replace(estimate, candidates=self.candidates(time, state, frames, estimate))
 
     def tick(
         self,
@@ -177,6 +177,39 @@ class Regression:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
         weights = self._time_activation(time).exp()
         return (weights[..., None] * self.mixtures[operator].at(time)).sum(-2)
+
+    def candidates(
+        self,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        estimate: Estimate,
+    ) -> tuple[Candidate, ...]:
+        """Eq. (1) for each operator, mixed over the components, and each one's share.
+
+        ``estimate`` is what was found at ``time`` from the state q_{t-1}.
+        """
+        active = self._active(time)
+        weights = estimate.activation[..., active]
+        alone = []
+        for at, mean, _, covariance in self._local(active, time, state, frames):
+            # mixing commutes with the affine map, and is less work before it
+            mean, covariance = gaussians.moment_match(weights, mean, covariance)
+            columns = mean[..., None, :, None]
+            one = Projection.of(at, columns, covariance[..., None, :, :]).in_joint_space()
+            step, covariance = one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]
+            covariance = covariance.expand_as(estimate.covariance)
+            alone.append((step.expand_as(estimate.joints), covariance))
+        variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in alone])
+        # where J^+ has no row but rounding, an operator does not touch the joint and has no say
+        touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
+        precisions = touched / torch.where(touched, variances, 1.0)
+        total = precisions.sum(0)
+        shares = precisions / torch.where(total > 0, total, 1.0)
+        return tuple(
+            Candidate(state.joints + step, covariance, share)
+            for (step, covariance), share in zip(alone, shares, strict=True)
+        )
 
     def _time_activation(self, time: Tensor) -> Tensor:
         """``log h_i(t)`` from pi_i N(t | mu_t, sigma_tt), the time marginal taken once."""
@@ -252,36 +285,6 @@ class Regression:
         activation = weights.new_zeros(*weights.shape[:-1], len(self.log_weights))
         activation[..., active] = weights
         return state.joints + mean, covariance, activation
-
-    def _candidates(
-        self,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        estimate: Estimate,
-    ) -> tuple[Candidate, ...]:
-        """Eq. (1) for each operator, mixed over the components, and each one's share."""
-        active = self._active(time)
-        weights = estimate.activation[..., active]
-        alone = []
-        for at, mean, _, covariance in self._local(active, time, state, frames):
-            # mixing commutes with the affine map, and is less work before it
-            mean, covariance = gaussians.moment_match(weights, mean, covariance)
-            columns = mean[..., None, :, None]
-            one = Projection.of(at, columns, covariance[..., None, :, :]).in_joint_space()
-            step, covariance = one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]
-            covariance = covariance.expand_as(estimate.covariance)
-            alone.append((step.expand_as(estimate.joints), covariance))
-        variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in alone])
-        # where J^+ has no row but rounding, an operator does not touch the joint and has no say
-        touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
-        precisions = touched / torch.where(touched, variances, 1.0)
-        total = precisions.sum(0)
-        shares = precisions / torch.where(total > 0, total, 1.0)
-        return tuple(
-            Candidate(state.joints + step, covariance, share)
-            for (step, covariance), share in zip(alone, shares, strict=True)
-        )
 
     def _product_activation(
         self, time: Tensor, precision: Tensor, vector: Tensor, square: Tensor

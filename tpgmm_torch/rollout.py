@@ -9,7 +9,7 @@ from torch import Tensor
 
 from tpgmm_torch.demonstrations import Situation
 from tpgmm_torch.frames import Frame
-from tpgmm_torch.regression import Estimate, Regression
+from tpgmm_torch.regression import PART, Estimate, Regression
 from tpgmm_torch.trajectories import Candidate, Trajectory
 
 __all__ = ["Synthesis", "minimum_jerk", "rollout", "stacked"]
@@ -64,17 +64,26 @@ def rollout(
         batch = [situations[index] for index in members]
         time = batch[0].time
         assert time is not None  # the estimator fills it in
-        references, estimates = _loop(regression, batch, time, blend, keep_limits, candidates)
-        covariance = torch.stack([estimate.covariance for estimate in estimates])
-        alone = [
-            tuple(torch.stack(parts) for parts in zip(*map(_fields, over_time), strict=True))
-            for over_time in zip(*(estimate.candidates for estimate in estimates), strict=True)
-        ]
+        frames = {name: stacked([s.frames[name] for s in batch]) for name in batch[0].frames}
+        start = torch.stack([situation.joints for situation in batch])
+        loop = Synthesis(regression, start, blend, keep_limits)
+        references, estimates = [start], []
+        for k, now in enumerate(time):
+            estimates.append(loop.step(now, _at(frames, k)))
+            references.append(loop.reference)
+        joints = torch.stack(references)
+        found = Estimate(
+            *(
+                torch.stack([getattr(estimate, name) for estimate in estimates])
+                for name in ("joints", "covariance", "activation")
+            )
+        )
+        alone = _alone(regression, time, joints[:-1], frames, found) if candidates else ()
         for row, index in enumerate(members):
             results[index] = Trajectory(
                 time,
-                references[:, row],
-                covariance[:, row],
+                joints[1:, row],
+                found.covariance[:, row],
                 tuple(Candidate(*(part[:, row] for part in parts)) for parts in alone),
                 regression.kinematics.joint_names,
             )
@@ -169,23 +178,34 @@ class Synthesis:
         return (1 - minimum_jerk((now - self._first) / self.blend)) * self._gap
 
 
-def _loop(
+def _alone(
     regression: Regression,
-    batch: Sequence[Situation],
     time: Tensor,
-    blend: float,
-    keep_limits: bool,
-    candidates: bool,
-) -> tuple[Tensor, list[Estimate]]:
-    frames = {name: stacked([s.frames[name] for s in batch]) for name in batch[0].frames}
-    start = torch.stack([situation.joints for situation in batch])
-    loop = Synthesis(regression, start, blend, keep_limits)
-    references, estimates = [], []
-    for k, now in enumerate(time):
-        poses = {name: f[k] if f.position.ndim == 3 else f for name, f in frames.items()}
-        estimates.append(loop.step(now, poses, candidates=candidates))
-        references.append(loop.reference)
-    return torch.stack(references), estimates
+    joints: Tensor,
+    frames: Mapping[str, Frame],
+    found: Estimate,
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Each operator's own estimates, (T, B, ...), of which no instant needs another's."""
+    size = max(1, PART // joints.shape[1])
+    activation = found.activation
+    if activation.ndim == 2:  # the same for all robots
+        activation = activation.unsqueeze(1)
+    parts = []
+    for k in range(0, len(time), size):
+        now = slice(k, k + size)
+        estimate = Estimate(found.joints[now], found.covariance[now], activation[now])
+        state = regression.kinematics.state(joints[now])
+        at = time[now].unsqueeze(-1)
+        parts.append(regression.candidates(at, state, _at(frames, now), estimate))
+    return [
+        tuple(torch.cat(fields) for fields in zip(*map(_fields, over_time), strict=True))
+        for over_time in zip(*parts, strict=True)
+    ]
+
+
+def _at(frames: Mapping[str, Frame], now: int | slice) -> dict[str, Frame]:
+    """Frames of shape (B,) or, if they move, (T, B) at some instants."""
+    return {name: f[now] if f.position.ndim == 3 else f for name, f in frames.items()}
 
 
 def _groups(situations: Sequence[Situation]) -> list[list[int]]:
