@@ -8,7 +8,7 @@ from tpgmm_datasets.bottle_shaking import BottleShaking
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 
-__all__ = ["COMPONENTS", "learned", "skill"]
+__all__ = ["COMPONENTS", "aligned", "learned", "skill"]
 
 COMPONENTS = 10
 
@@ -20,7 +20,8 @@ def skill(settings: Settings) -> BottleShaking:
 
 
 @cache
-def _aligned(settings: Settings) -> list[Demonstration]:
+def aligned(settings: Settings) -> list[Demonstration]:
+    """Its demonstrations, on one time grid."""
     demonstrations = skill(settings).demonstrations(settings.size(10, 3), settings.seed)
     return DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
 
@@ -32,5 +33,5 @@ def learned(
     """The model; not to be changed."""
     operators, robot = bottle_operators(), skill(settings).robot
     return TaskParameterizedGMM(n_components, operators, robot, dtype=dtype).fit(
-        _aligned(settings)
+        aligned(settings)
     )

@@ -36,6 +36,7 @@ LAYERS = (
         "given_start",
         "initialization",
         "checkpoints",
+        "learning",
         "mixture_density",
         "mixture",
     ),
@@ -54,8 +55,8 @@ LAYERS = (
         "reproduction",
     ),
     ("persistence", "situations"),
-    ("likelihood", "demonstration_batches", "estimator"),
-    ("metrics", "plotting", "viewing"),
+    ("likelihood", "preparation", "demonstration_batches", "estimator"),
+    ("metrics", "cross_validation", "plotting", "viewing"),
     ("cli",),
 )
 ORDER = [module for layer in LAYERS for module in layer]

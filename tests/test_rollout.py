@@ -12,7 +12,7 @@ from tests.mixtures import CASES, Case, Problem, assert_close, times
 from tests.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
 from tpgmm_torch.regression import Regression
-from tpgmm_torch.rollout import Synthesis, minimum_jerk, rollout
+from tpgmm_torch.rollout import Synthesis, minimum_jerk, rollout, stacked
 
 NAMES = ["the paper's", "poses in two frames"]
 EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
@@ -152,6 +152,28 @@ def test_candidates_are_kept_if_wanted(wanted):
         for candidate in trajectory.candidates:
             assert candidate.mean.shape == candidate.share.shape == (12, 17)
             assert candidate.covariance.shape == (12, 17, 17)
+
+
+@EVERY_WORLD
+@pytest.mark.parametrize("moves", [False, True], ids=["still", "moving"])
+@pytest.mark.parametrize("activation", ["time", "product"])
+@pytest.mark.parametrize("part", [1, 7, 512])
+def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, monkeypatch):
+    monkeypatch.setattr("tpgmm_torch.rollout.PART", part)
+    problem = Problem.of(case, 3, 2)
+    regression, time = problem.regression(activation=activation), grid()
+    given = situations(problem, time, time, moves=moves)
+    trajectories = run(regression, given)
+    together = {OBJECT: stacked([item.frames[OBJECT] for item in given])}
+    loop = Synthesis(regression, problem.state.joints, 0.5, False)
+    for k, now in enumerate(time):
+        here = {name: pose[k] if moves else pose for name, pose in together.items()}
+        estimate = loop.step(now, here, candidates=True)
+        for row, trajectory in enumerate(trajectories):
+            for one, other in zip(trajectory.candidates, estimate.candidates, strict=True):
+                assert_close(one.mean[k], other.mean[row])
+                assert_close(one.covariance[k], other.covariance[row])
+                assert_close(one.share[k], other.share[row])
 
 
 @EVERY_WORLD

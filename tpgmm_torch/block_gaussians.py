@@ -299,6 +299,13 @@ class Family:
         smallest = SMALLEST_SHARE[dtype]
         return cls(covariance_type, tuple(share.clamp(min=smallest) for share in shares))
 
+    def rescaled(self, old: Standardization, new: Standardization) -> "Family":
+        """The same in other units."""
+        shares = zip(self.diagonals, old.scales, new.scales, strict=True)
+        return Family(
+            self.covariance_type, tuple(share * (a / b) ** 2 for share, a, b in shares)
+        )
+
     def restrict(self, covariance: Tensor, weights: Tensor) -> Tensor:
         """The member of the family that the M step wants instead of ``covariance``."""
         match self.covariance_type:

@@ -32,7 +32,9 @@ __all__ = [
     "check_like",
     "gather_rows",
     "rows_in_memory",
+    "share_one_grid",
     "split_batches",
+    "typical_time",
 ]
 
 
@@ -177,15 +179,34 @@ def rows_in_memory(
         If ``responsibilities="instant"`` and the demonstrations have different time grids.
     """
     rows = local_data(demonstrations, operators, kinematics)
-    first = demonstrations[0].time
-    aligned = all(torch.equal(item.time, first) for item in demonstrations)
+    aligned = share_one_grid(demonstrations)
     if responsibilities == "instant":
         _check_aligned(aligned)
     group_size = len(rows) if aligned and responsibilities != "point" else 1
     together = torch.cat(rows) if group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
-    middle = sorted(demonstrations, key=lambda d: d.duration)[len(rows) // 2]
     points = StoredRows(together.cpu().numpy())
-    return LearningRows(points, group_size, middle.time.to(rows[0]), ALONE)
+    return LearningRows(points, group_size, typical_time(demonstrations).to(rows[0]), ALONE)
+
+
+def share_one_grid(demonstrations: Sequence[Demonstration]) -> bool:
+    """Whether all have the time grid of the first.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    """
+    first = demonstrations[0].time
+    return all(torch.equal(item.time, first) for item in demonstrations)
+
+
+def typical_time(demonstrations: Sequence[Demonstration]) -> Tensor:
+    """The time grid of the demonstration of median duration.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    """
+    return sorted(demonstrations, key=lambda d: d.duration)[len(demonstrations) // 2].time
 
 
 def gather_rows(

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 
@@ -26,25 +24,16 @@ from tpgmm_torch.demonstration_batches import (
 )
 from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.distributed import ALONE, Processes
-from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.joint_space import JointSpace
 from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.likelihood import Likelihood
-from tpgmm_torch.mixture import BlockGaussianMixture
-from tpgmm_torch.operators import Canonical, Operator
-from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.persistence import load_estimator, save_estimator
+from tpgmm_torch.preparation import Preparation
 from tpgmm_torch.spool import SpooledRows
 
 __all__ = ["TaskParameterizedGMM"]
 
-MIXTURE_PARAMETERS = (
-    "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
-    "random_state", "warm_start", "verbose", "dtype", "device",
-)  # fmt: skip
 
-
-class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
+class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
     """Task-parameterised Gaussian mixture over joint space and task space.
 
     One sample is one demonstration: ``X`` is a list of :class:`Demonstration`, so that
@@ -143,8 +132,6 @@ class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
     >>> bool(abs(trajectory.joints[:, 0].numpy() - np.sin(3 * time)).max() < 0.05)
     True
     """
-
-    mixture_: BlockGaussianMixture
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "n_components": [Interval(Integral, 1, None, closed="left")],
@@ -258,12 +245,7 @@ class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
             If another of the processes died.
         """
         self._validate_params()
-        operators = (Canonical(),) if self.operators is None else tuple(self.operators)
-        if not operators:
-            raise DataError("operators is empty: give at least one, for example [Canonical()]")
-        for operator in operators:
-            if not isinstance(operator, Operator):
-                raise DataError(f"operators holds Operator objects, got {operator!r}")
+        operators = self._checked_operators()
         demonstrations, batches = split_batches(X)
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
@@ -293,28 +275,14 @@ class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
     ) -> Self:
         """Fit the mixture to rows, and take over what it learned."""
         moments = ColumnMoments.of_batches(learning.rows, learning.processes)
-        settings = self._mixture_parameters(operators, kinematics)
-        settings |= {
-            "group_size": learning.group_size,
-            "reg_covar": self._regularization(moments, operators, kinematics),
-        }
-        mixture = BlockGaussianMixture(**settings)
-        if self.warm_start and hasattr(self, "mixture_"):
-            mixture = self.mixture_.set_params(**settings)
+        mixture = self._mixture(moments, learning.group_size, operators, kinematics)
         mixture.fit_rows(
             learning.rows,
             moments=moments,
             checkpoint=checkpoint,
             processes=learning.processes,
         )
-        self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
-        self.frame_names_ = frame_names(operators, kinematics)
-        self.time_ = learning.time
-        self.weights_, self.means_ = mixture.weights_, mixture.means_
-        self.covariances_ = mixture.covariances_
-        self.n_iter_, self.converged_ = mixture.n_iter_, mixture.converged_
-        self.lower_bound_ = mixture.lower_bound_
-        return self
+        return self._take(mixture, operators, kinematics, learning.time)
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
@@ -349,50 +317,6 @@ class TaskParameterizedGMM(Likelihood, BaseEstimator):  # type: ignore[misc]
         """
         model: Self = load_estimator(cls, path, custom, device)
         return model
-
-    def _kinematics_for(
-        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
-    ) -> Kinematics:
-        """What the operators act on, once it is known to have what they need."""
-        kinematics = self._kinematics(demonstrations, operators)
-        for operator in operators:
-            operator.check(kinematics, demonstrations[0].frames)
-        return kinematics
-
-    def _kinematics(
-        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
-    ) -> Kinematics:
-        dtype = getattr(torch, self.dtype)
-        if self.robot is not None:
-            return self.robot.to(dtype, self.device)
-        needed = sorted({link for operator in operators for link in operator.links()})
-        if needed:
-            raise DataError(
-                f"the operators need the pose of {needed}: pass robot=Robot.from_urdf(...), or "
-                "robot=Poses(...) for recorded poses without a robot"
-            )
-        default = tuple(f"joint_{index}" for index in range(demonstrations[0].n_joints))
-        names = next((d.joint_names for d in demonstrations if d.joint_names), default)
-        return JointSpace(names, dtype, self.device)
-
-    def _regularization(
-        self,
-        moments: ColumnMoments,
-        operators: Sequence[Operator],
-        kinematics: Kinematics,
-    ) -> NDArray[np.float64]:
-        """``reg_covar`` and the operators' tolerances, as shares of each column's variance."""
-        widths = [1 + operator.dimension(kinematics) for operator in operators]
-        isotropic = self.covariance_type == "spherical"
-        scales = torch.cat(moments.standardization(widths, isotropic=isotropic).scales)
-        tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
-        return self.reg_covar + (np.concatenate(tolerances) / scales.numpy()) ** 2
-
-    def _mixture_parameters(
-        self, operators: Sequence[Operator], kinematics: Kinematics
-    ) -> dict[str, Any]:
-        blocks = tuple(1 + operator.dimension(kinematics) for operator in operators)
-        return {"blocks": blocks} | {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

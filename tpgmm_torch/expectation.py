@@ -5,9 +5,11 @@ The components share their responsibilities across the blocks (section II-B of t
     gamma_k(x) ∝ pi_k prod_j N(x_j | mu_kj, Sigma_kj)
 
 A pass gathers the moments that the M step needs. Mixtures that are learned together, such as
-restarts, share it: points are read, and expanded, once for all of them.
+restarts or the folds of a cross-validation, share it: points are read, and expanded, once for
+all of them. What a fold leaves out has responsibilities, but none that count.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import repeat
@@ -17,7 +19,7 @@ from torch import Tensor
 
 from tpgmm_torch.block_gaussians import Chunk, Parameters, Whitener
 from tpgmm_torch.gate import Gate, Selection
-from tpgmm_torch.points import Points
+from tpgmm_torch.points import Points, Subset
 from tpgmm_torch.sufficient_statistics import (
     Features,
     PackedStatistics,
@@ -82,6 +84,7 @@ def expect(
     group_size: int = 1,
     workspace: Workspace | None = None,
     previous: Sequence[Expectation] = (),
+    subsets: Sequence[Subset] = (),
 ) -> list[Expectation]:
     """E step: one pass over the points.
 
@@ -98,6 +101,8 @@ def expect(
     previous : sequence of Expectation, optional
         One per mixture, from a pass with nearby mixtures and with this workspace, which tells
         the gate what to expect.
+    subsets : sequence of Subset, optional
+        One per mixture: the points that it is learned from, where these are not all.
 
     Returns
     -------
@@ -106,7 +111,7 @@ def expect(
     """
     gated = workspace is not None
     workspace = workspace or Workspace(points)
-    parties = _parties(mixtures, points, workspace, previous, gated=gated)
+    parties = _parties(mixtures, points, workspace, previous, subsets, gated=gated)
     for index, chunk in enumerate(points):
         if gated:
             workspace.gate.record(index, chunk)
@@ -135,7 +140,7 @@ def log_densities(parameters: Parameters, chunk: Chunk, group_size: int = 1) -> 
     Tensor of shape (n,)
     """
     joint = Whitener(parameters, chunk[0].dtype)(chunk)[0]
-    _share(joint, group_size)
+    _share(joint, group_size, None)
     return torch.logsumexp(joint, 0)
 
 
@@ -144,6 +149,7 @@ def _parties(
     points: Points,
     workspace: Workspace,
     previous: Sequence[Expectation],
+    subsets: Sequence[Subset],
     *,
     gated: bool,
 ) -> "list[_Party]":
@@ -170,7 +176,8 @@ def _parties(
             peaks = whitener.peaks.unflatten(0, (len(numbers), -1))
             selections = workspace.gate.selections(joined, peaks, guess)
         chosen = [mixtures[number] for number in numbers]
-        parties.append(_Party(numbers, chosen, statistics, selections))
+        own = [subsets[number] for number in numbers] if subsets else []
+        parties.append(_Party(numbers, chosen, statistics, selections, own))
     return parties
 
 
@@ -183,8 +190,12 @@ class _Party:
         mixtures: Sequence[Parameters],
         statistics: Statistics,
         selections: Iterator[Selection | None],
+        subsets: Sequence[Subset],
     ) -> None:
-        self.numbers, self.mixtures = numbers, mixtures
+        self.numbers, self.mixtures, self._subsets = numbers, mixtures, subsets
+        #: Which points count, (S, n_points), and how many have been taken.
+        self._members = torch.stack([s.chosen for s in subsets]) if subsets else None
+        self._taken = 0
         self._statistics, self._selections = statistics, selections
         self._total = torch.zeros_like(mixtures[0].weights[:1]).repeat(len(mixtures))
         self._least: list[list[float]] = []
@@ -197,36 +208,49 @@ class _Party:
     def take(self, index: int, chunk: Chunk, group_size: int) -> None:
         """Add the chunk with this number."""
         self._statistics.load(index, chunk)
-        selection = next(self._selections)
+        selection, n = next(self._selections), chunk[0].shape[1]
+        members = None
+        if self._members is not None:
+            members = self._members.narrow(1, self._taken, n)
+        self._taken += n
         components = None if selection is None else selection.components
-        responsibilities, densities, least = self._evaluate(components, group_size)
+        responsibilities, densities, least = self._evaluate(components, group_size, members)
         if selection is not None and not selection.confirmed(least):
             components = Selection.above(selection.ceilings, least).components
-            responsibilities, densities, least = self._evaluate(components, group_size)
+            responsibilities, densities, least = self._evaluate(components, group_size, members)
         self._statistics.gather(responsibilities, components)
         self._total += densities.sum(1, dtype=torch.float64)
         self._least.append(least)
 
     def _evaluate(
-        self, components: Tensor | None, group_size: int
+        self, components: Tensor | None, group_size: int, members: Tensor | None
     ) -> tuple[Tensor, Tensor, list[float]]:
-        """Responsibilities (S * A, n), log-densities (S, n), and the least of them (S)."""
+        """Responsibilities (S * A, n), log-densities (S, n), and the least of them (S).
+
+        Both are zero for points that do not count.
+        """
         joint = self._statistics.joint(components)
         joint = joint.view(len(self.numbers), -1, joint.shape[1])
-        _share(joint, group_size)
+        _share(joint, group_size, members)
         largest = joint.amax(1, keepdim=True)
         # exp of less is a denormal number, with which processors compute very slowly
         relative = joint.sub_(largest).clamp_(min=SMALLEST[joint.dtype]).exp_()
         norm = relative.sum(1, keepdim=True)
         densities = largest.add_(norm.log())[:, 0]
-        responsibilities = relative.div_(norm).view(-1, joint.shape[2])
-        return responsibilities, densities, densities.amin(1).tolist()
+        responsibilities = relative.div_(norm)
+        least = densities
+        if members is not None:
+            least = densities.masked_fill(~members, math.inf)
+            densities.mul_(members)
+            responsibilities.mul_(members.unsqueeze(1))
+        return responsibilities.view(-1, joint.shape[2]), densities, least.amin(1).tolist()
 
     def expectations(self, sums: Sequence[Tensor], n_points: int) -> Iterator[Expectation]:
         """One per mixture, from the sums over all processes and the number of their points."""
         *gathered, total = sums
         moments = self._statistics.moments(*gathered)
-        bounds = (total / n_points).tolist()
+        counts = [subset.total for subset in self._subsets] or [n_points]
+        bounds = (total / total.new_tensor(counts)).tolist()
         least = total.new_tensor(self._least).view(-1, len(total))
         n_components = len(self.mixtures[0].weights)
         for place, parameters in enumerate(self.mixtures):
@@ -240,8 +264,17 @@ class _Party:
             )
 
 
-def _share(joint: Tensor, group_size: int) -> None:
-    """Give the points (..., n) of a group the mean of their logarithms, in place."""
+def _share(joint: Tensor, group_size: int, members: Tensor | None) -> None:
+    """Give the points (..., n) of a group the mean of their logarithms, in place.
+
+    With ``members`` (S, n), the mean of those that count, of joint (S, A, n).
+    """
     if group_size > 1:
         grouped = joint.unflatten(-1, (-1, group_size))
-        grouped.copy_(grouped.mean(-1, keepdim=True))
+        if members is None:
+            mean = grouped.mean(-1, keepdim=True)
+        else:
+            counted = members.unsqueeze(1).unflatten(-1, (-1, group_size)).to(joint)
+            mean = (grouped * counted).sum(-1, keepdim=True)
+            mean = mean / counted.sum(-1, keepdim=True).clamp_(min=1)
+        grouped.copy_(mean)

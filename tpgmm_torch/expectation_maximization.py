@@ -1,6 +1,6 @@
 """Expectation-maximisation for Gaussian mixtures with block-diagonal covariance.
 
-Several ascents, from several starts, share their passes over the points.
+Several ascents, from several starts or of several folds, share their passes over the points.
 """
 
 import math
@@ -15,7 +15,7 @@ from tpgmm_torch.block_gaussians import Family, Parameters
 from tpgmm_torch.degenerate import degenerate, obituary, place_anew
 from tpgmm_torch.exceptions import ConvergenceWarning, DegenerateComponentWarning
 from tpgmm_torch.expectation import Expectation, Workspace, expect
-from tpgmm_torch.points import Points
+from tpgmm_torch.points import Points, Subset
 
 __all__ = ["Run", "ascend", "maximize"]
 
@@ -119,13 +119,14 @@ Ascent = Generator[Parameters, Expectation, None]
 def ascend(
     runs: Sequence[Run],
     points: Points,
-    family: Family,
+    family: Family | Sequence[Family],
     *,
     tol: float,
     max_iter: int,
     group_size: int = 1,
     verbose: int = 0,
     after: Callable[[Sequence[Run]], None] | None = None,
+    subsets: Sequence[Subset] = (),
 ) -> None:
     """Iterate each run until its bound rises by less than ``tol``.
 
@@ -142,7 +143,8 @@ def ascend(
     runs : sequence of Run
         Starts, or runs that were interrupted; they are changed.
     points : Points
-    family : Family
+    family : Family, or sequence of Family
+        Of all runs, or one per run.
     tol : float
     max_iter : int
         Most M steps of a run, at least 1.
@@ -153,25 +155,31 @@ def ascend(
     after : callable, optional
         Called with all runs after each pass over the points in which one of them completed
         an iteration.
+    subsets : sequence of Subset, optional
+        One per run: the points that it learns from, where these are not all.
     """
     workspace = Workspace(points)
-    ascents: list[tuple[Ascent, Parameters, list[Expectation]]] = []
-    for run in runs:
+    families = [family] * len(runs) if isinstance(family, Family) else family
+    ascents: list[tuple[Ascent, Sequence[Subset], Parameters, list[Expectation]]] = []
+    for number, (run, restricted) in enumerate(zip(runs, families, strict=True)):
         if run.converged or run.n_iter >= max_iter:
             continue
-        ascent = _ascent(run, points, family, tol, max_iter, group_size, verbose)
-        ascents.append((ascent, next(ascent), []))
+        own = subsets[number : number + 1]
+        seen, size = (own[0], own[0].group_size) if own else (points, group_size)
+        ascent = _ascent(run, seen, restricted, tol, max_iter, size, verbose)
+        ascents.append((ascent, own, next(ascent), []))
     while ascents:
-        wanted = [parameters for _, parameters, _ in ascents]
+        wanted = [parameters for *_, parameters, _ in ascents]
         previous = [expectation for *_, last in ascents for expectation in last]
         completed = sum(run.n_iter for run in runs)
         expectations = expect(
-            wanted, points, group_size=group_size, workspace=workspace, previous=previous
-        )
+            wanted, points, group_size=group_size, workspace=workspace, previous=previous,
+            subsets=[subset for _, own, *_ in ascents for subset in own],
+        )  # fmt: skip
         going = []
-        for (ascent, *_), expectation in zip(ascents, expectations, strict=True):
+        for (ascent, own, *_), expectation in zip(ascents, expectations, strict=True):
             with suppress(StopIteration):
-                going.append((ascent, ascent.send(expectation), [expectation]))
+                going.append((ascent, own, ascent.send(expectation), [expectation]))
         ascents = going
         if after is not None and sum(run.n_iter for run in runs) > completed:
             after(runs)

@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.random import RandomState
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import validate_data
 from torch import Tensor
 
-from tpgmm_torch.block_gaussians import (
-    Family,
-    Parameters,
-    Standardization,
-    check_blocks,
-)
-from tpgmm_torch.checkpoints import Checkpoint, Purpose
+from tpgmm_torch.block_gaussians import Parameters, Standardization, check_blocks
+from tpgmm_torch.checkpoints import Checkpoint
 from tpgmm_torch.column_moments import ColumnMoments
-from tpgmm_torch.distributed import ALONE, Processes, common_random_state
-from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.expectation_maximization import Run, ascend
+from tpgmm_torch.distributed import ALONE, Processes
+from tpgmm_torch.expectation_maximization import Run
 from tpgmm_torch.given_start import GivenStart
-from tpgmm_torch.initialization import StartDrawer, check_distinct
+from tpgmm_torch.learning import Learning, learn_subsets
 from tpgmm_torch.mixture_density import MixtureDensity, on_cpu
-from tpgmm_torch.points import Points
-from tpgmm_torch.row_points import RowPoints
 from tpgmm_torch.rows import BatchedRows, Rows, StoredRows, are_batches
 
-__all__ = ["BlockGaussianMixture"]
+__all__ = ["BlockGaussianMixture", "fit_subsets"]
 
 
 class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
@@ -306,77 +298,28 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
             As :meth:`fit`.
         """
         moments = moments or ColumnMoments.of_batches(rows, processes)
-        if moments.count < 2:
-            raise DataError("the data hold 1 sample; a mixture is learned from at least 2")
-        widths = check_blocks(self.blocks, len(moments.mean))
-        if rows.n_rows % self.group_size:
-            raise ShapeError(f"{rows.n_rows} rows are no multiple of {self.group_size=}")
-        isotropic = self.covariance_type == "spherical"
-        units = moments.standardization(widths, isotropic=isotropic)
-        units = units.to(torch.device(self.device))
-        family = Family.regularized(
-            self.covariance_type, units, self.reg_covar, dtype=getattr(torch, self.dtype),
-            relative=self.regularization == "relative",
-        )  # fmt: skip
-        points = self._points(rows, units, processes)
+        learning = self._learning(rows, moments, processes)
+        self._take(learning.runs(checkpoint), learning.units)
+        return self
+
+    def _learning(
+        self, rows: Rows, moments: ColumnMoments, processes: Processes = ALONE
+    ) -> Learning:
         known = (self.weights_init, self.means_init, self.covariances_init)
         if self.warm_start and hasattr(self, "weights_"):
             known = (self.weights_, self.means_, self.covariances_)
-        given = GivenStart.checked(*known, self.n_components, widths).standardize(units)
-        drawer = StartDrawer(
-            self.init_params, self.time_feature, self.n_components, rows, moments.count,
-            units, self.group_size, processes,
-        )  # fmt: skip
-        check_distinct(rows, moments.count, self.n_components, processes)
-        rng = common_random_state(self.random_state, processes)
-        names = ("tol", "max_iter", "group_size", "verbose")
-        settings = {name: getattr(self, name) for name in names}
-        runs, after = None, None
-        if checkpoint is not None:
-            purpose = Purpose.of(self._shaping(widths, known), self.reg_covar, moments)
-            runs = checkpoint.resume(purpose, processes)
-            after = checkpoint.keeper(purpose, self.max_iter, processes)
-        if runs is None:
-            drawn = (
-                [Parameters.standard(self.n_components, widths, units.shifts[0].device)]
-                if given.complete
-                else drawer.draw(self.n_init, family, rng)
-            )
-            runs = [
-                Run(family.admit(given.over(start)), RandomState(rng.randint(2**31 - 1)))
-                for start in drawn
-            ]
-        ascend(runs, points, family, after=after, **settings)
+        return Learning(self.get_params(deep=False), known, rows, moments, processes)
+
+    def _take(self, runs: Sequence[Run], units: Standardization) -> None:
+        """Take over the best of the runs."""
         best = max(runs, key=lambda run: run.bound)
-        self.n_features_in_ = sum(widths)
+        self.n_features_in_ = sum(len(shift) for shift in units.shifts)
         self._set(units.restore(best.parameters))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
         self.lower_bound_ = best.bound - units.log_volume
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
         for category, message in best.complaints():
-            warnings.warn(message, category, stacklevel=3)
-        return self
-
-    def _shaping(self, widths: tuple[int, ...], known: tuple[Any, ...]) -> dict[str, Any]:
-        """The settings that a checkpoint has to share, but the regularisation."""
-        names = (
-            "n_components", "covariance_type", "tol", "regularization", "n_init", "init_params",
-            "time_feature", "group_size", "random_state", "dtype",
-        )  # fmt: skip
-        return {name: getattr(self, name) for name in names} | {
-            "blocks": widths,
-            "start": [None if part is None else list(part) for part in known],
-        }
-
-    def _points(self, rows: Rows, units: Standardization, processes: Processes) -> Points:
-        """The rows standardised: kept in memory, if they are in memory anyway."""
-        in_first_block = self.time_feature < len(units.shifts[0])
-        points = RowPoints(
-            rows, rows.n_rows, units, self.n_components, getattr(torch, self.dtype),
-            group_size=self.group_size, processes=processes,
-            time_feature=self.time_feature if in_first_block else None,
-        )  # fmt: skip
-        return points.stored() if rows.in_memory else points
+            warnings.warn(message, category, stacklevel=4)
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
         """Fit, and return :meth:`predict` of the same points."""
@@ -388,3 +331,41 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         self.weights_ = parameters.weights.to(**target)
         self.means_ = [mean.to(**target) for mean in parameters.means]
         self.covariances_ = [covariance.to(**target) for covariance in parameters.covariances]
+
+
+def fit_subsets(
+    mixtures: Sequence[BlockGaussianMixture],
+    X: NDArray[np.floating],
+    members: NDArray[np.bool_],
+    group_size: int = 1,
+) -> None:
+    """Fit several mixtures, each to some of the rows, in passes that they share.
+
+    The result is that of fitting each to its rows alone, to rounding, in less time: points are
+    expanded once for all, as for restarts. That is what cross-validation asks for.
+
+    Parameters
+    ----------
+    mixtures : sequence of BlockGaussianMixture
+        Of equal settings, but for ``reg_covar``, ``group_size`` and what the start is.
+    X : array of shape (n_samples, n_features)
+        All rows.
+    members : array of bool, of shape (S, n_samples)
+        The rows of each mixture: ``group_size`` of its own from each group of all.
+    group_size : int, default=1
+        So many consecutive rows of ``X`` share one responsibility.
+
+    Raises
+    ------
+    ShapeError, DataError
+        As :meth:`BlockGaussianMixture.fit_rows`.
+    """
+    rows = StoredRows(X)
+    whole = mixtures[0]._learning(rows, ColumnMoments.of_batches(rows))
+    whole = replace(whole, settings={**whole.settings, "group_size": group_size})
+    parts = []
+    for mixture, chosen in zip(mixtures, members, strict=True):
+        own = StoredRows(X[chosen])
+        parts.append(mixture._learning(own, ColumnMoments.of_batches(own)))
+    for mixture, runs in zip(mixtures, learn_subsets(whole, parts, members), strict=True):
+        mixture._take(runs, whole.units)

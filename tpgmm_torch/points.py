@@ -13,7 +13,7 @@ from torch import Tensor
 from tpgmm_torch.block_gaussians import Chunk
 from tpgmm_torch.distributed import ALONE, Processes
 
-__all__ = ["Points", "StoredPoints"]
+__all__ = ["Points", "StoredPoints", "Subset"]
 
 
 class Points(ABC):
@@ -115,3 +115,41 @@ class StoredPoints(Points):
     def __iter__(self) -> Iterator[Chunk]:
         """One pass over the chunks."""
         return iter(self._chunks)
+
+
+class Subset(Points):
+    """Some of the points that are held in memory, as a fold of a cross-validation has.
+
+    A pass over all points serves mixtures that learn from subsets of them, too.
+
+    Parameters
+    ----------
+    points : StoredPoints
+        Of this process alone.
+    chosen : Tensor of bool, of shape (n_points,)
+        Which of them, in their order.
+    group_size : int, default=1
+        How many of each group these are.
+
+    Examples
+    --------
+    >>> chunk = (torch.tensor([[0.0, 1.0], [1.0, 1.0]]),)
+    >>> second = Subset(StoredPoints([chunk]), torch.tensor([False, True]))
+    >>> second.total, [block.tolist() for [block] in second]
+    (1, [[[1.0], [1.0]]])
+    """
+
+    def __init__(self, points: StoredPoints, chosen: Tensor, group_size: int = 1) -> None:
+        self.widths, self.time_feature = points.widths, points.time_feature
+        self.dtype, self.device, self.processes = points.dtype, points.device, ALONE
+        self.chosen, self.group_size = chosen.to(points.device), group_size
+        self._points = points
+        self._count(int(chosen.sum()))
+
+    def __iter__(self) -> Iterator[Chunk]:
+        """One pass over the chosen points; a chunk without any is passed over."""
+        chunks = list(self._points)
+        places = self.chosen.split([chunk[0].shape[1] for chunk in chunks])
+        for chunk, chosen in zip(chunks, places, strict=True):
+            if bool(chosen.any()):
+                yield tuple(block[:, chosen] for block in chunk)

@@ -73,10 +73,9 @@ def rollout(
             references.append(loop.reference)
         joints = torch.stack(references)
         found = Estimate(
-            *(
-                torch.stack([getattr(estimate, name) for estimate in estimates])
-                for name in ("joints", "covariance", "activation")
-            )
+            torch.stack([estimate.joints for estimate in estimates]),
+            torch.stack([estimate.covariance for estimate in estimates]),
+            torch.stack([estimate.activation for estimate in estimates]),
         )
         alone = _alone(regression, time, joints[:-1], frames, found) if candidates else ()
         for row, index in enumerate(members):
@@ -184,7 +183,7 @@ def _alone(
     joints: Tensor,
     frames: Mapping[str, Frame],
     found: Estimate,
-) -> list[tuple[Tensor, Tensor, Tensor]]:
+) -> list[tuple[Tensor, ...]]:
     """Each operator's own estimates, (T, B, ...), of which no instant needs another's."""
     size = max(1, PART // joints.shape[1])
     activation = found.activation

@@ -81,6 +81,15 @@ class RowPoints(Points):
         """The same points kept in memory, standardised once."""
         return StoredPoints(list(self), self.time_feature, self.processes)
 
+    def numbers(self) -> NDArray[np.intp]:
+        """Which row each point is, (n_points,), in the order of a pass."""
+        found, start = [], 0
+        for batch in self._rows.batches():
+            order = self._order(batch)
+            found.append(start + (np.arange(len(batch)) if order is None else order))
+            start += len(batch)
+        return np.concatenate(found)
+
     def _order(self, batch: NDArray[np.floating]) -> NDArray[np.intp] | None:
         """Row numbers by time, groups staying together; None if they are in order already."""
         if self.time_feature is None:
