@@ -17,15 +17,13 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.gaussians import FEW
 
 __all__ = ["UNIT_NORM_TOLERANCE", "Frame", "as_tensor"]
 
 #: Quaternions whose norm is off by more than this are refused; below, they are rounded data
 #: (float32 recordings, a few printed digits) and brought to unit norm.
 UNIT_NORM_TOLERANCE = 1e-3
-
-#: So many numbers are added sooner by Python than by torch.
-FEW = 64
 
 
 def as_tensor(values: Any, name: str) -> Tensor:

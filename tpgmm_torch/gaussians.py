@@ -27,6 +27,10 @@ __all__ = [
 ]
 
 
+#: So many numbers are sooner looked at by Python than by an operation of the library.
+FEW = 64
+
+
 def common_shape(*shapes: torch.Size) -> torch.Size:
     """:func:`torch.broadcast_shapes`, which is slow, but not where the shapes are equal."""
     return shapes[0] if len(set(shapes)) == 1 else torch.broadcast_shapes(*shapes)
@@ -52,7 +56,8 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
         If a matrix is not positive definite.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if info.any():
+    # of a few matrices, Python asks sooner than an operation does
+    if any(info.tolist()) if info.ndim == 1 and len(info) <= FEW else info.any():
         raise DataError(
             f"{name} is not positive definite ({int((info != 0).sum())} of {info.numel()} "
             f"matrices of size {matrix.shape[-1]}): a direction has no variance; a larger "

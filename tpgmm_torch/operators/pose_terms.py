@@ -117,8 +117,11 @@ class PoseTerms:
         numbers = [positions.flatten(-2), *(pose.position for pose in poses)]
         numbers += [orientations.flatten(-2), *(pose.orientation for pose in poses)]
         numbers.append(self._identity.expand(*batch, 4) if batch else self._identity)
-        left, right = torch.cat(numbers, -1).index_select(-1, self._pairs).chunk(2, -1)
-        both = _product(left * right, self._terms)
+        factors = torch.cat(numbers, -1).index_select(-1, self._pairs)
+        half = len(self._pairs) // 2
+        both = _product(
+            factors.narrow(-1, 0, half) * factors.narrow(-1, half, half), self._terms
+        )
         matrix, present, shift = both.split(self._sizes, -1)
         jacobian = state.jacobians.flatten(-3, -2)
         if self._rows is not None:
