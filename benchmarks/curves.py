@@ -102,7 +102,7 @@ def _draw(
     import matplotlib as mpl
 
     mpl.use("agg")
-    from matplotlib import pyplot
+    from matplotlib import pyplot, ticker
 
     figure, axes = pyplot.subplots(2, 3, figsize=(13, 7), layout="constrained")
     for axis, curve, by_number in zip(axes.flat, curves, costs, strict=False):
@@ -110,6 +110,8 @@ def _draw(
             values = [cost[name] for cost in by_number.values()]
             axis.loglog(list(by_number), np.maximum(values, 1e-3), "o-", label=name)
         axis.set(title=curve.title, ylabel=curve.ylabel)
+        axis.set_xticks(list(by_number), [f"{number:,}" for number in by_number], minor=False)
+        axis.xaxis.set_minor_locator(ticker.NullLocator())
         axis.title.set_fontsize("small")
         axis.legend(fontsize="small")
         axis.grid(alpha=0.3)
