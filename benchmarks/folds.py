@@ -1,16 +1,18 @@
 """Cross-validation: folds learned in common passes, and one after the other."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import Any
 
+from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.model_selection import LeaveOneOut
 
 from benchmarks.rows import Row
 from benchmarks.settings import Settings
-from benchmarks.skill import COMPONENTS, aligned, skill
+from benchmarks.skill import COMPONENTS, aligned, model
 from benchmarks.timing import in_turns, medians, seconds
-from tpgmm_datasets.bottle_experiment import bottle_operators
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.cross_validation import fit_folds
 
 __all__ = ["measure"]
@@ -21,20 +23,13 @@ def measure(settings: Settings) -> Iterator[Row]:
     shown, rounds = aligned(settings), settings.rounds(3)
     folds = [train for train, _ in LeaveOneOut().split(shown)]
     for responsibilities in ("instant", "point"):
-        model = TaskParameterizedGMM(
-            COMPONENTS, bottle_operators(), skill(settings).robot,
-            responsibilities=responsibilities, random_state=settings.seed,
-        )  # fmt: skip
-
-        def together(model: TaskParameterizedGMM = model) -> float:
-            return seconds(lambda: fit_folds(model, shown, folds))
-
-        def alone(model: TaskParameterizedGMM = model) -> float:
-            return seconds(
-                lambda: [clone(model).fit([shown[k] for k in fold]) for fold in folds]
-            )
-
-        taken = medians(in_turns({"together": together, "alone": alone}, rounds))
+        options = {"responsibilities": responsibilities, "random_state": settings.seed}
+        work = {"together": fit_folds, "alone": _one_by_one}
+        measurements = {
+            name: partial(seconds, partial(fit, model(settings, **options), shown, folds))
+            for name, fit in work.items()
+        }
+        taken = medians(in_turns(measurements, rounds))
         yield Row(
             f"fit, {len(folds)} folds that leave one out, K = {COMPONENTS}, "
             f"one responsibility per {responsibilities}",
@@ -44,3 +39,11 @@ def measure(settings: Settings) -> Iterator[Row]:
             taken["alone"],
             rounds=rounds,
         )
+
+
+def _one_by_one(
+    estimator: TaskParameterizedGMM,
+    shown: Sequence[Demonstration],
+    folds: Sequence[NDArray[Any]],
+) -> list[TaskParameterizedGMM]:
+    return [clone(estimator).fit([shown[k] for k in fold]) for fold in folds]

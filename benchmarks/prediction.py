@@ -1,8 +1,8 @@
 """Whole reproductions of many situations at once."""
 
 import copy
-import functools
 from collections.abc import Iterator
+from functools import partial
 
 import torch
 
@@ -26,22 +26,19 @@ def measure(settings: Settings) -> Iterator[Row]:
     compiled = copy.copy(model).compile(
         "inductor" if settings.full else "aot_eager", n_robots=len(situations)
     )
-    work = {
-        "eager": lambda: model.predict(situations, candidates=False),
-        "with candidates": lambda: model.predict(situations),
-        "compiled": lambda: compiled.predict(situations, candidates=False),
-        "one situation": lambda: model.predict(situations[:1], candidates=False),
-        "one situation, with candidates": lambda: model.predict(situations[:1]),
-    }
-    measurements = {name: functools.partial(seconds, call) for name, call in work.items()}
+    one = situations[:1]
+    work = [
+        ("eager", model, situations, {"candidates": False}, settings.asked("most", 5)),
+        ("with candidates", model, situations, {}, None),
+        ("compiled", compiled, situations, {"candidates": False}, None),
+        ("eager", model, one, {"candidates": False}, None),
+        ("with candidates", model, one, {}, None),
+    ]
+    measurements, limits = {}, {}
+    for how, which, given, options, most in work:
+        name = f"predict, {len(given)} situation(s) x {len(time)} steps, float64, {how}"
+        measurements[name] = partial(seconds, partial(which.predict, given, **options))
+        limits[name] = most
     taken = medians(in_turns(measurements, rounds, warm_up=settings.full))
     for name, figure in taken.items():
-        count = 1 if name.startswith("one") else len(situations)
-        how = name.removeprefix("one situation").removeprefix(", ") or "eager"
-        yield Row(
-            f"predict, {count} situation(s) x {len(time)} steps, float64, {how}",
-            "s",
-            figure,
-            asked=settings.asked("most", 5) if name == "eager" else None,
-            rounds=rounds,
-        )
+        yield Row(name, "s", figure, asked=limits[name], rounds=rounds)

@@ -8,7 +8,7 @@ from tpgmm_datasets.bottle_shaking import BottleShaking
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 
-__all__ = ["COMPONENTS", "aligned", "learned", "skill"]
+__all__ = ["COMPONENTS", "aligned", "learned", "model", "skill"]
 
 COMPONENTS = 10
 
@@ -26,12 +26,17 @@ def aligned(settings: Settings) -> list[Demonstration]:
     return DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
 
 
+def model(
+    settings: Settings, n_components: int = COMPONENTS, **options: object
+) -> TaskParameterizedGMM:
+    """What learns it."""
+    operators, robot = bottle_operators(), skill(settings).robot
+    return TaskParameterizedGMM(n_components, operators, robot, **options)
+
+
 @cache
 def learned(
     settings: Settings, n_components: int = COMPONENTS, dtype: str = "float64"
 ) -> TaskParameterizedGMM:
     """The model; not to be changed."""
-    operators, robot = bottle_operators(), skill(settings).robot
-    return TaskParameterizedGMM(n_components, operators, robot, dtype=dtype).fit(
-        aligned(settings)
-    )
+    return model(settings, n_components, dtype=dtype).fit(aligned(settings))

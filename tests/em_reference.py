@@ -6,6 +6,7 @@ Written with whitening by triangular solution, one component and one block after
 import numpy as np
 import torch
 
+from tpgmm_torch import expectation_maximization
 from tpgmm_torch.block_gaussians import Family, Parameters
 from tpgmm_torch.column_moments import ColumnMoments
 from tpgmm_torch.points import StoredPoints
@@ -93,3 +94,16 @@ def assert_same_mixture(actual, expected, tolerance=1e-9):
         torch.testing.assert_close(own, other, **close)
     for own, other in zip(actual.covariances, expected.covariances, strict=True):
         torch.testing.assert_close(own, other, **close)
+
+
+def counted_passes(monkeypatch):
+    """A list to which each pass over the points adds how many mixtures it serves."""
+    passes = []
+    expect = expectation_maximization.expect
+
+    def counted(mixtures, *arguments, **settings):
+        passes.append(len(mixtures))
+        return expect(mixtures, *arguments, **settings)
+
+    monkeypatch.setattr(expectation_maximization, "expect", counted)
+    return passes

@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.em_reference import assert_same_mixture, binned, family, movements, standardized
-from tpgmm_torch import expectation_maximization
+from tests.em_reference import (
+    assert_same_mixture,
+    binned,
+    counted_passes,
+    family,
+    movements,
+    standardized,
+)
 from tpgmm_torch.block_gaussians import Parameters
 from tpgmm_torch.expectation_maximization import Run, ascend
 
@@ -74,14 +80,7 @@ def test_together_they_do_what_each_does_alone(n_points, reg_covar):
 
 def test_one_pass_serves_all(monkeypatch):
     points, lambdas, parameters = problem()
-    passes = []
-    expect = expectation_maximization.expect
-
-    def counted(mixtures, *arguments, **settings):
-        passes.append(len(mixtures))
-        return expect(mixtures, *arguments, **settings)
-
-    monkeypatch.setattr(expectation_maximization, "expect", counted)
+    passes = counted_passes(monkeypatch)
     runs = runs_of([parameters, jittered(parameters, 0), jittered(parameters, 1)])
     ascend(runs, points, lambdas, tol=1e-3, max_iter=30)
     assert passes[0] == 3

@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from tests.blocks import COVARIANCE_TYPES
-from tests.em_reference import WIDTHS, movements
-from tpgmm_torch import expectation_maximization
+from tests.em_reference import WIDTHS, counted_passes, movements
 from tpgmm_torch.exceptions import ConvergenceWarning, DataError, DegenerateComponentWarning
 from tpgmm_torch.mixture import BlockGaussianMixture, fit_subsets
 from tpgmm_torch.points import StoredPoints, Subset
@@ -22,6 +21,12 @@ K = 6
 def mixture(**settings):
     defaults = {"blocks": WIDTHS, "random_state": 0, "max_iter": 30}
     return BlockGaussianMixture(K, **{**defaults, **settings})
+
+
+def start_of(model, means):
+    """The settings by which EM starts from a mixture, with other means."""
+    parts = {"weights": model.weights_, "means": means, "covariances": model.covariances_}
+    return {f"{name}_init": part for name, part in parts.items()}
 
 
 def folds(n_rows, n_folds=4):
@@ -77,12 +82,7 @@ def test_starts_are_drawn_from_the_own_rows_in_their_own_units(init_params):
 def test_a_start_that_is_given_serves_all():
     X = movements(2000)
     first = mixture().fit(X)
-    start = {
-        "weights_init": first.weights_,
-        "means_init": [mean + 0.05 for mean in first.means_],
-        "covariances_init": first.covariances_,
-    }
-    members = folds(2000)
+    members, start = folds(2000), start_of(first, [mean + 0.05 for mean in first.means_])
     assert_same(together(X, members, **start), alone(X, members, **start))
 
 
@@ -125,11 +125,7 @@ def test_a_component_without_data_is_placed_among_the_own_rows():
     means = [mean.clone() for mean in far.means_]
     for mean in means:
         mean[0] += 1e3
-    start = {
-        "weights_init": far.weights_,
-        "means_init": means,
-        "covariances_init": far.covariances_,
-    }
+    start = start_of(far, means)
     with warnings.catch_warnings(record=True) as ours:
         warnings.simplefilter("always", DegenerateComponentWarning)
         found = together(X, members, **start)
@@ -161,14 +157,7 @@ def test_regularizations_may_differ():
 
 
 def test_one_pass_serves_all(monkeypatch):
-    passes = []
-    expect = expectation_maximization.expect
-
-    def counted(mixtures, *arguments, **settings):
-        passes.append(len(mixtures))
-        return expect(mixtures, *arguments, **settings)
-
-    monkeypatch.setattr(expectation_maximization, "expect", counted)
+    passes = counted_passes(monkeypatch)
     ours = together(movements(6000), folds(6000))
     assert passes[0] == 4
     assert len(passes) == 1 + max(model.n_iter_ for model in ours)

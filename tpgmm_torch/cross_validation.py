@@ -127,17 +127,19 @@ def fit_folds(
     estimator._validate_params()
     operators = estimator._checked_operators()
     kinematics = estimator._kinematics_for(demonstrations, operators)
+    twice = any(len(set(fold)) < len(fold) for fold in chosen)
+    # some folds would have one responsibility per instant, others not
+    mixed = (
+        estimator.responsibilities == "auto"
+        and not share_one_grid(demonstrations)
+        and any(map(share_one_grid, shown))
+    )
+    if twice or mixed or not chosen:
+        return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     learning = rows_in_memory(
         demonstrations, operators, kinematics, responsibilities=estimator.responsibilities
     )
     size, [rows] = learning.group_size, learning.rows
-    twice = any(len(set(fold)) < len(fold) for fold in chosen)
-    # some folds would have one responsibility per instant, others not
-    mixed = (
-        estimator.responsibilities == "auto" and size == 1 and any(map(share_one_grid, shown))
-    )
-    if twice or mixed or not chosen:
-        return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     belongs = np.zeros((len(chosen), len(demonstrations)), dtype=bool)
     for row, fold in zip(belongs, chosen, strict=True):
         row[fold] = True
@@ -145,13 +147,12 @@ def fit_folds(
         members = np.tile(belongs, len(rows) // size)
     else:
         members = np.repeat(belongs, [len(d) for d in demonstrations], axis=1)
+    moments = [ColumnMoments.of_batches([rows[own]]) for own in members]
     mixtures = [
-        model._mixture(
-            ColumnMoments.of(rows[own]), len(fold) if size > 1 else 1, operators, kinematics
-        )
-        for model, fold, own in zip(models, chosen, members, strict=True)
+        model._mixture(known, len(fold) if size > 1 else 1, operators, kinematics)
+        for model, fold, known in zip(models, chosen, moments, strict=True)
     ]
-    fit_subsets(mixtures, rows, members, size)
+    fit_subsets(mixtures, rows, members, size, moments)
     for model, mixture, own in zip(models, mixtures, shown, strict=True):
         model._take(mixture, operators, kinematics, typical_time(own).to(learning.time))
     return models

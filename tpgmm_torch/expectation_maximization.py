@@ -160,26 +160,28 @@ def ascend(
     """
     workspace = Workspace(points)
     families = [family] * len(runs) if isinstance(family, Family) else family
-    ascents: list[tuple[Ascent, Sequence[Subset], Parameters, list[Expectation]]] = []
-    for number, (run, restricted) in enumerate(zip(runs, families, strict=True)):
+    sources: list[tuple[Points, int]] = [(points, group_size)] * len(runs)
+    if subsets:
+        sources = [(subset, subset.group_size) for subset in subsets]
+    ascents: list[tuple[int, Ascent, Parameters, list[Expectation]]] = []
+    for number, run in enumerate(runs):
         if run.converged or run.n_iter >= max_iter:
             continue
-        own = subsets[number : number + 1]
-        seen, size = (own[0], own[0].group_size) if own else (points, group_size)
-        ascent = _ascent(run, seen, restricted, tol, max_iter, size, verbose)
-        ascents.append((ascent, own, next(ascent), []))
+        source, size = sources[number]
+        ascent = _ascent(run, source, families[number], tol, max_iter, size, verbose)
+        ascents.append((number, ascent, next(ascent), []))
     while ascents:
         wanted = [parameters for *_, parameters, _ in ascents]
         previous = [expectation for *_, last in ascents for expectation in last]
         completed = sum(run.n_iter for run in runs)
         expectations = expect(
             wanted, points, group_size=group_size, workspace=workspace, previous=previous,
-            subsets=[subset for _, own, *_ in ascents for subset in own],
+            subsets=[subsets[number] for number, *_ in ascents] if subsets else (),
         )  # fmt: skip
         going = []
-        for (ascent, own, *_), expectation in zip(ascents, expectations, strict=True):
+        for (number, ascent, *_), expectation in zip(ascents, expectations, strict=True):
             with suppress(StopIteration):
-                going.append((ascent, own, ascent.send(expectation), [expectation]))
+                going.append((number, ascent, ascent.send(expectation), [expectation]))
         ascents = going
         if after is not None and sum(run.n_iter for run in runs) > completed:
             after(runs)

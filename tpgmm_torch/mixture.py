@@ -338,6 +338,7 @@ def fit_subsets(
     X: NDArray[np.floating],
     members: NDArray[np.bool_],
     group_size: int = 1,
+    moments: Sequence[ColumnMoments] | None = None,
 ) -> None:
     """Fit several mixtures, each to some of the rows, in passes that they share.
 
@@ -354,6 +355,8 @@ def fit_subsets(
         The rows of each mixture: ``group_size`` of its own from each group of all.
     group_size : int, default=1
         So many consecutive rows of ``X`` share one responsibility.
+    moments : sequence of ColumnMoments, optional
+        Of the rows of each mixture, where they are known already.
 
     Raises
     ------
@@ -363,9 +366,11 @@ def fit_subsets(
     rows = StoredRows(X)
     whole = mixtures[0]._learning(rows, ColumnMoments.of_batches(rows))
     whole = replace(whole, settings={**whole.settings, "group_size": group_size})
-    parts = []
-    for mixture, chosen in zip(mixtures, members, strict=True):
-        own = StoredRows(X[chosen])
-        parts.append(mixture._learning(own, ColumnMoments.of_batches(own)))
+    own = [StoredRows(X[chosen]) for chosen in members]
+    moments = moments or [ColumnMoments.of_batches(part) for part in own]
+    parts = [
+        mixture._learning(part, known)
+        for mixture, part, known in zip(mixtures, own, moments, strict=True)
+    ]
     for mixture, runs in zip(mixtures, learn_subsets(whole, parts, members), strict=True):
         mixture._take(runs, whole.units)
