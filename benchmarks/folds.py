@@ -13,7 +13,7 @@ from benchmarks.settings import Settings
 from benchmarks.skill import COMPONENTS, aligned, model
 from benchmarks.timing import in_turns, medians, seconds
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
-from tpgmm_torch.cross_validation import fit_folds
+from tpgmm_torch.model_selection import fit_folds
 
 __all__ = ["measure"]
 

@@ -7,7 +7,7 @@ import torch
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
 from benchmarks.timing import in_turns, medians, per_call
-from tpgmm_datasets.bottle_shaking import HANDS, upper_body
+from tpgmm_datasets.bottle.skill import HANDS, upper_body
 from tpgmm_datasets.robots import upper_body_urdf
 
 __all__ = ["measure"]

@@ -16,7 +16,7 @@ from benchmarks.points import Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
 from tpgmm_torch import BlockGaussianMixture
-from tpgmm_torch.distributed import ALONE, Processes, joined_processes
+from tpgmm_torch.large_data.processes import ALONE, Processes, joined_processes
 
 __all__ = ["measure"]
 

@@ -3,8 +3,8 @@
 from functools import cache
 
 from benchmarks.settings import Settings
-from tpgmm_datasets.bottle_experiment import bottle_operators
-from tpgmm_datasets.bottle_shaking import BottleShaking
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 

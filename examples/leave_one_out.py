@@ -65,7 +65,7 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
-from tpgmm_torch.retiming import Alignment
+from tpgmm_torch.alignment.base import Alignment
 
 G1_URDF = (
     "cmeel.prefix/share/example-robot-data/robots/g1_description/urdf/g1_29dof_rev_1_0.urdf"

@@ -12,7 +12,7 @@ figure 6 of the paper in small: five demonstrations at 20 steps per second.
 import matplotlib.pyplot as plt
 import torch
 
-from tpgmm_datasets.bottle_shaking import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import (
     Canonical,
     RelativeOrientation,

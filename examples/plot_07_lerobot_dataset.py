@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from tpgmm_datasets import describe_lerobot, load_lerobot, save_lerobot
-from tpgmm_datasets.bottle_shaking import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import joint_rmse

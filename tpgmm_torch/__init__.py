@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.demonstrations import Demonstration, Situation
+    from tpgmm_torch.data.demonstrations import Demonstration, Situation
+    from tpgmm_torch.data.frames import Frame
+    from tpgmm_torch.data.trajectories import Candidate, Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.frames import Frame
-    from tpgmm_torch.kinematics import Kinematics, RobotState
-    from tpgmm_torch.mixture import BlockGaussianMixture
+    from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
         RelativePosition,
         Stack,
     )
-    from tpgmm_torch.poses import Poses
-    from tpgmm_torch.regression import Estimate
-    from tpgmm_torch.robots import Robot
-    from tpgmm_torch.trajectories import Candidate, Trajectory
+    from tpgmm_torch.regression.regression import Estimate
+    from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+    from tpgmm_torch.robots.robot import Robot
+    from tpgmm_torch.robots.tracked_poses import Poses
 
     __version__: str
 
@@ -53,11 +53,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    "demonstrations": ("Demonstration", "Situation"),
+    "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
-    "frames": ("Frame",),
-    "kinematics": ("Kinematics", "RobotState"),
-    "mixture": ("BlockGaussianMixture",),
+    "data.frames": ("Frame",),
+    "robots.kinematics": ("Kinematics", "RobotState"),
+    "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
     "operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",
@@ -68,10 +68,10 @@ _HOMES = {
         "RelativePosition",
         "Stack",
     ),
-    "poses": ("Poses",),
-    "regression": ("Estimate",),
-    "robots": ("Robot",),
-    "trajectories": ("Candidate", "Trajectory"),
+    "robots.tracked_poses": ("Poses",),
+    "regression.regression": ("Estimate",),
+    "robots.robot": ("Robot",),
+    "data.trajectories": ("Candidate", "Trajectory"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -12,9 +12,16 @@ import numpy as np
 from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from tpgmm_torch.checkpoints import Checkpoint
-from tpgmm_torch.column_moments import ColumnMoments
-from tpgmm_torch.demonstration_batches import (
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.em.column_moments import ColumnMoments
+from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.large_data.row_file import SpooledRows
+from tpgmm_torch.mixture.checkpoints import Checkpoint
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.persistence import load_estimator, save_estimator
+from tpgmm_torch.preparation import Preparation
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.training_rows import (
     DemonstrationBatches,
     LearningRows,
     check_like,
@@ -22,13 +29,6 @@ from tpgmm_torch.demonstration_batches import (
     rows_in_memory,
     split_batches,
 )
-from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.distributed import ALONE, Processes
-from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.operators import Operator
-from tpgmm_torch.persistence import load_estimator, save_estimator
-from tpgmm_torch.preparation import Preparation
-from tpgmm_torch.spool import SpooledRows
 
 __all__ = ["TaskParameterizedGMM"]
 
@@ -228,7 +228,8 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
         checkpoint : Checkpoint, optional
             Where to keep the state of EM, and to go on from if there is one.
         processes : Processes, optional
-            Those that learn together, see :func:`~tpgmm_torch.distributed.joined_processes`;
+            Those that learn together: what
+            :func:`~tpgmm_torch.large_data.processes.joined_processes` gives;
             X is then the share of this one, and each has the whole model.
 
         Returns

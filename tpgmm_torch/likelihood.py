@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.local_data import local_data
-from tpgmm_torch.mixture import BlockGaussianMixture
-from tpgmm_torch.reproduction import Reproduction
+from tpgmm_torch.control.reproduction import Reproduction
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.training.local_data import local_data
 
 __all__ = ["Likelihood"]
 

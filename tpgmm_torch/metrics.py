@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import ShapeError
-from tpgmm_torch.trajectories import Trajectory
 
 __all__ = [
     "Sinusoid",

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
 from tpgmm_torch.exceptions import ModelFileError
-from tpgmm_torch.joint_space import JointSpace
-from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import frame_names
-from tpgmm_torch.poses import Poses
-from tpgmm_torch.robots import Robot
+from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.storage import CONFIG, Folder
 
 __all__ = [

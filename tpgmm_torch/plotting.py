@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.frames import Frame
-from tpgmm_torch.local_data import local_data
-from tpgmm_torch.trajectories import Trajectory
+from tpgmm_torch.training.local_data import local_data
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,15 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.column_moments import ColumnMoments
-from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.joint_space import JointSpace
-from tpgmm_torch.kinematics import Kinematics
 from tpgmm_torch.likelihood import Likelihood
-from tpgmm_torch.mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Preparation"]
 

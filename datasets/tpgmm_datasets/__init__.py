@@ -13,13 +13,13 @@ except ModuleNotFoundError as error:
         f"data sets need {error.name}: pip install 'tpgmm-torch[data]'"
     ) from None
 
-from tpgmm_datasets.batches import EpisodeBatches
+from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.description import DatasetInfo, describe_lerobot
+from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
-from tpgmm_datasets.poses import FramePose, LinkPose
 from tpgmm_datasets.reader import iter_lerobot, load_lerobot
 from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
-from tpgmm_datasets.timing import resample, trim
 from tpgmm_datasets.units import Scale
 from tpgmm_datasets.writer import save_lerobot
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_datasets.columns import ENVIRONMENT, EVENT
-from tpgmm_datasets.episodes import read_episodes
+from tpgmm_datasets.conversion.joints import joint_feature
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.hub import local_folder
-from tpgmm_datasets.joints import joint_feature
-from tpgmm_datasets.layout import BOOKKEEPING, Feature, open_layout
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
+from tpgmm_datasets.lerobot.episodes import read_episodes
+from tpgmm_datasets.lerobot.hub import local_folder
+from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, open_layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.units import guess_unit, with_pose_units
 

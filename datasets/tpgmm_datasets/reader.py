@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tpgmm_datasets.assembly import Assembly, EventSource, FrameSource, frame_sources
-from tpgmm_datasets.episodes import Policy, read_episodes, strict_policy
+from tpgmm_datasets.conversion.assembly import Assembly, EventSource, FrameSource, frame_sources
+from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.hub import local_folder
-from tpgmm_datasets.joints import JointColumns, joint_feature
-from tpgmm_datasets.layout import Episode, Layout, open_layout
+from tpgmm_datasets.lerobot.episodes import Policy, read_episodes, strict_policy
+from tpgmm_datasets.lerobot.hub import local_folder
+from tpgmm_datasets.lerobot.layout import Episode, Layout, open_layout
 from tpgmm_datasets.units import Units
-from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 

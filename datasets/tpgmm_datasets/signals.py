@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from tpgmm_datasets.assembly import FrameSource, frame_sources
+from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources
+from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
+from tpgmm_datasets.conversion.poses import FramePose
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.hub import local_folder
-from tpgmm_datasets.joints import JointColumns, joint_feature
-from tpgmm_datasets.layout import Feature, open_layout
+from tpgmm_datasets.lerobot.hub import local_folder
+from tpgmm_datasets.lerobot.layout import Feature, open_layout
 from tpgmm_datasets.names import match_names
-from tpgmm_datasets.poses import FramePose
 from tpgmm_datasets.units import Scale, Units, as_scale
 
 __all__ = ["Signals"]

@@ -11,8 +11,8 @@ import torch
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import POSE_PARTS
-from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.frames import Frame
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.frames import Frame
 
 __all__ = ["demonstrations_from_frame", "demonstrations_to_frame"]
 

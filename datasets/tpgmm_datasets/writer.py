@@ -16,22 +16,22 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
-from tpgmm_datasets.columns import (
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.columns import (
     action_column,
     demonstration_columns,
     feature_table,
     features_of,
 )
-from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.files import FileSeries
-from tpgmm_datasets.layout import Layout, open_layout
-from tpgmm_datasets.statistics import (
+from tpgmm_datasets.lerobot.files import FileSeries
+from tpgmm_datasets.lerobot.layout import Layout, open_layout
+from tpgmm_datasets.lerobot.statistics import (
     QUANTILES,
     Statistics,
     episode_statistics,
     merge_statistics,
 )
-from tpgmm_torch.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
 __all__ = ["save_lerobot"]
 

@@ -16,7 +16,12 @@ from sphinx.util import logging
 __all__ = ["draw_all", "setup"]
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ("docs/pictures", "tpgmm_torch", "datasets/tpgmm_datasets", "tests/test_layers.py")
+SOURCES = (
+    "docs/pictures",
+    "tpgmm_torch",
+    "datasets/tpgmm_datasets",
+    "tests/project/test_layers.py",
+)
 
 
 def draw_all(out: Path) -> list[str]:

@@ -2,7 +2,7 @@
 
     ```{ties}
     :code: tpgmm_torch.gaussians.information
-    :tests: test_gaussians.py::test_information_takes_dependent_rows
+    :tests: tpgmm_torch/test_gaussians.py::test_information_takes_dependent_rows
     ```
 
 Code is linked to the API reference; a test that does not exist is a warning.

@@ -1,4 +1,4 @@
-"""Picture of the page "Architecture": the table of layers in tests/test_layers.py."""
+"""Picture of the page "Architecture": the table of layers in tests/project/test_layers.py."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.patches import FancyBboxPatch
 
 __all__ = ["draw", "layers"]
 
-TABLE = Path(__file__).parents[2] / "tests" / "test_layers.py"
+TABLE = Path(__file__).parents[2] / "tests" / "project/test_layers.py"
 #: What a layer is about, in the order of the table.
 TITLES = (
     "errors and storage",

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from tpgmm_datasets.bottle_experiment import bottle_operators
-from tpgmm_datasets.bottle_shaking import BottleShaking
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.control.rollout import stacked
 from tpgmm_torch.metrics import largest_acceleration
-from tpgmm_torch.rollout import stacked
 
 __all__ = ["draw"]
 

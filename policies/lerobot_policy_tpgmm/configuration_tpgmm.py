@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from tpgmm_datasets.bottle_shaking import HANDS
+from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Kinematics, Operator, Robot, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError

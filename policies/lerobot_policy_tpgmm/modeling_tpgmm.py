@@ -16,11 +16,11 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import HYPERPARAMETERS, TPGMMConfig
 from lerobot_policy_tpgmm.control import ControlLoop
 from lerobot_policy_tpgmm.control_rate import check_rate
-from lerobot_policy_tpgmm.features import FrameFeatures, JointFeatures
-from lerobot_policy_tpgmm.learning import Learner
-from lerobot_policy_tpgmm.parameters import MixtureParameters
-from lerobot_policy_tpgmm.recorded import adopt, check_dataset
-from lerobot_policy_tpgmm.storage import read_tensors, write_files
+from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
+from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
+from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
+from lerobot_policy_tpgmm.policy_files import read_tensors, write_files
+from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
@@ -267,7 +267,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.joints.joints(batch[OBS_STATE])
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, None]:
-        """The loss of a batch of a data set; see :mod:`lerobot_policy_tpgmm.learning`.
+        """The loss of a batch of a data set; see :mod:`lerobot_policy_tpgmm.training.learner`.
 
         Parameters
         ----------

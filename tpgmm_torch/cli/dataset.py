@@ -13,8 +13,8 @@ from tpgmm_torch.cli import options
 if TYPE_CHECKING:
     from tpgmm_datasets import DatasetInfo
     from tpgmm_datasets.description import ColumnInfo
-    from tpgmm_datasets.layout import Layout
-    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_datasets.lerobot.layout import Layout
+    from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
 
@@ -117,7 +117,7 @@ def generate(
 ) -> None:
     """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'."""
     from tpgmm_datasets import DatasetError
-    from tpgmm_datasets.bottle_shaking import TASK, BottleShaking
+    from tpgmm_datasets.bottle.skill import TASK, BottleShaking
 
     if path.exists() and not append:  # the writer would say so too, ten seconds later
         raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
@@ -150,8 +150,8 @@ def convert(
     events are kept, as float32; the action becomes the next joint state, and
     pictures stay behind.
     """
-    from tpgmm_datasets.hub import local_folder
-    from tpgmm_datasets.layout import open_layout
+    from tpgmm_datasets.lerobot.hub import local_folder
+    from tpgmm_datasets.lerobot.layout import open_layout
 
     layout = open_layout(local_folder(source))
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
@@ -174,7 +174,7 @@ def _units(
     layout: Layout, texts: Sequence[str] | None, joints: str | None, names: Sequence[str] | None
 ) -> dict[str, str]:
     """Units of the joints that are no angles once they are read: told here, or by the set."""
-    from tpgmm_datasets.joints import joint_feature
+    from tpgmm_datasets.conversion.joints import joint_feature
 
     feature = layout.features[joints or joint_feature(layout)]
     told = options.parse_units(texts or [])

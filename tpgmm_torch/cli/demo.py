@@ -61,8 +61,8 @@ def demo(
     import torch
     from rich.console import Console
 
-    from tpgmm_datasets.bottle_experiment import BottleExperiment
-    from tpgmm_datasets.bottle_shaking import BottleShaking
+    from tpgmm_datasets.bottle.experiment import BottleExperiment
+    from tpgmm_datasets.bottle.skill import BottleShaking
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)

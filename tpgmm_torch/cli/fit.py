@@ -12,7 +12,7 @@ from tpgmm_torch.cli import options
 from tpgmm_torch.cli.formats import OWN, writer
 
 if TYPE_CHECKING:
-    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.estimator import TaskParameterizedGMM
 
 __all__ = ["app"]
@@ -174,10 +174,10 @@ def fit(
     under torchrun.
     """
     from tpgmm_datasets.signals import Signals
-    from tpgmm_torch.checkpoints import Checkpoint
     from tpgmm_torch.cli.training_data import read_training_data
-    from tpgmm_torch.distributed import joined_processes
     from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.large_data.processes import joined_processes
+    from tpgmm_torch.mixture.checkpoints import Checkpoint
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = writer(output_format)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 if TYPE_CHECKING:
-    from tpgmm_torch.demonstrations import Demonstration
-    from tpgmm_torch.kinematics import Kinematics
-    from tpgmm_torch.retiming import Alignment
+    from tpgmm_torch.alignment.base import Alignment
+    from tpgmm_torch.data.demonstrations import Demonstration
+    from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
     "align",
@@ -276,15 +276,15 @@ def read_robot(
     if poses:
         if robot or links or joints or coordinates:
             raise DataError("--poses are instead of --robot and its links and joints")
-        from tpgmm_torch.poses import Poses
+        from tpgmm_torch.robots.tracked_poses import Poses
 
         return Poses(poses)
     if robot is None:
         if links or joints or coordinates:
             raise DataError("--link, --robot-joint and --coordinate need --robot URDF")
         return None
-    from tpgmm_torch.robots import Robot
-    from tpgmm_torch.urdf import read_urdf
+    from tpgmm_torch.robots.robot import Robot
+    from tpgmm_torch.robots.urdf import read_urdf
 
     if robot == "upper_body":
         from tpgmm_datasets.robots import upper_body_urdf

@@ -13,8 +13,8 @@ from tpgmm_torch.cli import options
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tpgmm_torch.kinematics import Kinematics
     from tpgmm_torch.operators import Operator
+    from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["app"]
 
@@ -47,7 +47,7 @@ def plot(
     For every operator a picture of its coordinates over time: the demonstrations (black), the
     components (green), and the reproduction in the situation of the first episode (red).
     """
-    from tpgmm_torch.demonstrations import Situation
+    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.operators.text import format_operator

@@ -12,9 +12,9 @@ import typer
 from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_torch.demonstrations import Demonstration, Situation
-    from tpgmm_torch.kinematics import Kinematics
-    from tpgmm_torch.trajectories import Trajectory
+    from tpgmm_torch.data.demonstrations import Demonstration, Situation
+    from tpgmm_torch.data.trajectories import Trajectory
+    from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["app"]
 
@@ -57,9 +57,9 @@ def reproduce(
     tpgmm_datasets.demonstrations_to_frame makes it, .csv with plain column names), or arrays
     (.npz). Prints a line per situation.
     """
+    from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.situations import read_situations
 
     if out.suffix not in FORMATS:
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
@@ -90,7 +90,7 @@ def situation_of(demonstration: Demonstration) -> Situation:
     ----------
     demonstration : Demonstration
     """
-    from tpgmm_torch.demonstrations import Situation
+    from tpgmm_torch.data.demonstrations import Situation
 
     if any(frame.batch_shape for frame in demonstration.frames.values()):
         return Situation.of(demonstration)
@@ -130,7 +130,7 @@ def _write(
     import numpy as np
 
     from tpgmm_datasets import demonstrations_to_frame
-    from tpgmm_torch.demonstrations import Demonstration
+    from tpgmm_torch.data.demonstrations import Demonstration
 
     table = demonstrations_to_frame(
         [

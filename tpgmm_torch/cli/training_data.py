@@ -11,9 +11,9 @@ import torch
 from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_torch.demonstrations import Demonstration
-    from tpgmm_torch.distributed import Processes
-    from tpgmm_torch.retiming import Alignment
+    from tpgmm_torch.alignment.base import Alignment
+    from tpgmm_torch.data.demonstrations import Demonstration
+    from tpgmm_torch.large_data.processes import Processes
 
 __all__ = ["AlignedBatches", "TrainingData", "read_training_data"]
 

@@ -90,9 +90,9 @@ def view(
     """
     import torch
 
+    from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.situations import read_situations
     from tpgmm_torch.viewing import LiveView, write_motion
 
     # the matrices are small: a second thread on a busy machine only spins

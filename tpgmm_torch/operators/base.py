@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
-from tpgmm_torch.frames import Frame
-from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Linearization", "Operator", "Reference", "frame_names"]
 

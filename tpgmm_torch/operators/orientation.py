@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.frames import Frame
-from tpgmm_torch.kinematics import Kinematics, RobotState
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators.base import Linearization, Operator, Reference
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["AbsoluteOrientation", "RelativeOrientation"]
 

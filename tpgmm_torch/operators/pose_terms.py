@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.frames import Frame
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.gaussians import common_shape
-from tpgmm_torch.kinematics import RobotState
 from tpgmm_torch.operators.base import Linearization, Operator, Reference
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
+from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["PoseTerms", "pose_terms"]
 

@@ -9,12 +9,12 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.frames import Frame
 from tpgmm_torch.gaussians import common_shape
-from tpgmm_torch.kinematics import Kinematics, RobotState
 from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.operators.pose_terms import pose_terms
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Stack"]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
-from tpgmm_torch.kinematics import Kinematics
-from tpgmm_torch.robots import Robot
-from tpgmm_torch.urdf import MULTIPLE_TYPES, UrdfModel, read_urdf
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfModel, read_urdf
 from tpgmm_torch.viewing.visuals import Shape, link_shapes
 
 __all__ = ["whole_body"]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["STANDARD_DEVIATIONS", "ellipsoids"]
 

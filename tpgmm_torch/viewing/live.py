@@ -13,9 +13,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.frames import Frame
 from tpgmm_torch.viewing.recording import viser_server
 from tpgmm_torch.viewing.scene import MotionScene
 

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.trajectories import Trajectory
 from tpgmm_torch.viewing.ellipsoids import STANDARD_DEVIATIONS
 from tpgmm_torch.viewing.scene import COLORS, MotionScene
 

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.frames import Frame
-from tpgmm_torch.trajectories import Trajectory
 from tpgmm_torch.viewing.body import whole_body
 from tpgmm_torch.viewing.ellipsoids import ellipsoids
 from tpgmm_torch.viewing.solids import add_solid, unit_sphere

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.urdf import UrdfModel, placement
+from tpgmm_torch.robots.urdf import UrdfModel, placement
 
 __all__ = ["Color", "Shape", "link_shapes"]
 

@@ -12,7 +12,7 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.control_rate import rate_processors
-from lerobot_policy_tpgmm.environments.aloha_robot import JOINTS, OBJECTS
+from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["AlohaStateConfig", "BottleShakingConfig"]
@@ -21,11 +21,11 @@ _PACKAGE = "lerobot_policy_tpgmm"
 
 gym.register(
     id=f"{_PACKAGE}/BottleShaking-v0",
-    entry_point=f"{_PACKAGE}.environments.bottle_shaking:BottleShakingEnv",
+    entry_point=f"{_PACKAGE}.environments.bottle.shaking:BottleShakingEnv",
 )
 gym.register(
     id=f"{_PACKAGE}/AlohaState-v0",
-    entry_point=f"{_PACKAGE}.environments.aloha_state:AlohaStateEnv",
+    entry_point=f"{_PACKAGE}.environments.aloha.state:AlohaStateEnv",
 )
 
 
@@ -85,7 +85,7 @@ class BottleShakingConfig(_StateEnvConfig):
         As in every configuration of LeRobot.
     fps, mode, episode_length, pushes, noise, track, frequency, amplitude
         Options of
-        :class:`~lerobot_policy_tpgmm.environments.bottle_shaking.BottleShakingEnv`; its own
+        :class:`~lerobot_policy_tpgmm.environments.bottle.shaking.BottleShakingEnv`; its own
         defaults where None.
     render_mode, render_width, render_height
         Of the videos.
@@ -115,7 +115,7 @@ class AlohaStateConfig(_StateEnvConfig):
         As in every configuration of LeRobot; the features follow from the task.
     fps, episode_length, yaw_range, track, stop_at_success
         Options of
-        :class:`~lerobot_policy_tpgmm.environments.aloha_state.AlohaStateEnv`; its own
+        :class:`~lerobot_policy_tpgmm.environments.aloha.state.AlohaStateEnv`; its own
         defaults where None.
     render_mode, render_width, render_height
         Of the videos.

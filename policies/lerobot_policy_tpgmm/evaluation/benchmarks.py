@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 import lerobot_policy_tpgmm.environments  # noqa: F401  registers what gym.make finds
-from lerobot_policy_tpgmm.environments.aloha_demonstrations import record_aloha
-from lerobot_policy_tpgmm.environments.aloha_robot import aloha_operators, aloha_robot
-from lerobot_policy_tpgmm.environments.bottle_measures import LIMITS
+from lerobot_policy_tpgmm.environments.aloha.demonstrations import record_aloha
+from lerobot_policy_tpgmm.environments.aloha.robot import aloha_operators, aloha_robot
+from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS
 from tpgmm_datasets import save_lerobot
-from tpgmm_datasets.bottle_experiment import bottle_operators
-from tpgmm_datasets.bottle_shaking import TASK, BottleShaking
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import TASK, BottleShaking
 from tpgmm_torch import Demonstration, Kinematics, Operator
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 

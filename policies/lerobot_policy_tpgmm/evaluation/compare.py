@@ -11,7 +11,7 @@ from pathlib import Path
 from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, Cell, Results
 from lerobot_policy_tpgmm.evaluation.jobs import POLICIES, record, run
 from lerobot_policy_tpgmm.evaluation.processes import run_jobs
-from lerobot_policy_tpgmm.evaluation.report import write_report
+from lerobot_policy_tpgmm.evaluation.report.report import write_report
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 

@@ -17,13 +17,13 @@ import torch
 from lerobot.envs.factory import make_env_config
 from lerobot.processor import make_default_pre_post_processors
 
-from lerobot_policy_tpgmm.evaluation.baselines import RECIPES, Training, train
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results, write_json
-from lerobot_policy_tpgmm.evaluation.episodes import Episodes
-from lerobot_policy_tpgmm.evaluation.replay import NearestPolicy
+from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES, Training, train
+from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
+from lerobot_policy_tpgmm.evaluation.policies.replay import NearestPolicy
+from lerobot_policy_tpgmm.evaluation.policies.tpgmm import fit_tpgmm
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from lerobot_policy_tpgmm.evaluation.tpgmm import fit_tpgmm
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
 from tpgmm_torch.exceptions import UnknownNameError
 

@@ -20,7 +20,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
-from lerobot_policy_tpgmm.evaluation.replay import NearestConfig, NearestPolicy
+from lerobot_policy_tpgmm.evaluation.policies.replay import NearestConfig, NearestPolicy
 
 __all__ = ["Runner", "evaluate", "latency"]
 

@@ -1,0 +1,1 @@
+"""The paper's experiment: a bottle is grasped and shaken."""

@@ -1,0 +1,349 @@
+"""The paper's experiment (section IV) from end to end: what ``tpgmm demo`` runs.
+
+Generate demonstrations, store them as a LeRobot data set and read them back, align them, learn
+them, reproduce the skill for bottle poses and start postures never seen, measure, and draw the
+paper's figures.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_datasets.bottle.figures import draw_figures
+from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, TASK, BottleShaking
+from tpgmm_datasets.reader import load_lerobot
+from tpgmm_datasets.writer import save_lerobot
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Situation,
+    Stack,
+    TaskParameterizedGMM,
+    Trajectory,
+)
+from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.control.rollout import stacked
+from tpgmm_torch.metrics import largest_acceleration, largest_velocity, sinusoid
+
+__all__ = ["BottleExperiment", "bottle_operators"]
+
+#: Regularisers of the covariance form that are compared with the information form [rad^2].
+EPSILONS = (1e-6, 1e-4, 1e-2)
+
+
+def bottle_operators(orientation: bool = True) -> list[Operator]:
+    """The two operators of eqs (16), (17): both hands seen from the bottle, and the joints.
+
+    Parameters
+    ----------
+    orientation : bool, default=True
+        False leaves the hands' orientations out, as the dashed lines of figure 4 do.
+
+    Examples
+    --------
+    >>> hands, joints = bottle_operators(orientation=False)
+    >>> hands
+    Stack(RelativePosition(link='l_hand', frame='bottle'), RelativePosition(link='r_hand', ...
+    """
+    rows: list[Operator] = []
+    for hand in HANDS:
+        rows.append(RelativePosition(hand, "bottle"))
+        if orientation:
+            rows.append(RelativeOrientation(hand, "bottle"))
+    return [Stack(*rows), Canonical()]
+
+
+@dataclass
+class BottleExperiment:
+    """One run of the experiment.
+
+    Parameters
+    ----------
+    out : Path
+        Directory for the data set, the model, the figures and ``metrics.json``.
+    n_components : int, default=30
+        K of the model.
+    n_demonstrations : int, default=10
+    n_situations : int, default=50
+        Unseen bottle poses and start postures.
+    seed : int, default=0
+        Of the demonstrations; the situations take ``seed + 1000``.
+    report : callable
+        ``report(text)`` is called at the beginning of every stage.
+    skill : BottleShaking
+        The generator.
+    """
+
+    #: How many times :meth:`run` reports.
+    STAGES = 13
+
+    out: Path
+    n_components: int = 30
+    n_demonstrations: int = 10
+    n_situations: int = 50
+    seed: int = 0
+    report: Callable[[str], None] = lambda _text: None
+    skill: BottleShaking = field(default_factory=BottleShaking)
+
+    def run(self) -> dict[str, Any]:
+        """Run everything.
+
+        Returns
+        -------
+        dict
+            What ``metrics.json`` holds.
+        """
+        began = time.perf_counter()
+        self.out.mkdir(parents=True, exist_ok=True)
+        self.report("generating demonstrations")
+        generated = self.skill.demonstrations(self.n_demonstrations, self.seed)
+        self.report("writing and reading the LeRobot data set")
+        demonstrations = self._through_files(generated)
+        self.report("aligning")
+        # how the joints move tells the phase of this skill, not where: postures differ
+        warping = DynamicTimeWarping(features=["directions"]).fit(demonstrations)
+        aligned = warping.transform(demonstrations)
+        measure = _Measure(self.skill, aligned)
+        situations = self.skill.situations(self.n_situations, self.seed + 1000)
+
+        self.report(f"learning, K = {self.n_components}")
+        model = self._model(self.n_components).fit(aligned)
+        model.save(self.out / "model")
+        self.report(f"reproducing, K = {self.n_components}")
+        reproductions = model.predict(situations)
+        rows = {
+            f"information form, K = {self.n_components}": measure(reproductions, situations)
+        }
+        self.report("learning and reproducing, K = 10")
+        rows["information form, K = 10"] = measure(
+            self._model(10).fit(aligned).predict(situations, candidates=False), situations
+        )
+        learned = model.get_params(deep=False)
+        for epsilon in EPSILONS:
+            name = f"covariance form, epsilon = {epsilon:g}"
+            self.report(f"reproducing, {name}")
+            model.set_params(fusion="covariance", epsilon=epsilon)
+            rows[name] = measure(model.predict(situations, candidates=False), situations)
+        model.set_params(fusion=learned["fusion"], epsilon=learned["epsilon"])
+        self.report("learning and reproducing without orientation")
+        position_only = self._model(self.n_components, orientation=False).fit(aligned)
+        ablated = position_only.predict(situations, candidates=False)
+        rows["position only"] = measure(ablated, situations)
+
+        self.report("learning and reproducing without time warping")
+        alignment = self._alignment(demonstrations, measure, warping, reproductions, situations)
+
+        self.report("drawing")
+        draw_figures(
+            self.out, model, aligned, reproductions[0], ablated[0], situations[0], measure.spans
+        )
+        self.report("writing metrics.json")
+        metrics = {
+            "settings": self._settings(),
+            "rows": rows,
+            "share of information on the shoulders": measure.shares(reproductions),
+            "alignment": alignment,
+            "demonstrations": measure.demonstrations(demonstrations),
+            "seconds": time.perf_counter() - began,
+        }
+        (self.out / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n")
+        return metrics
+
+    def _through_files(self, demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
+        path = self.out / "dataset"
+        if (path / "meta" / "info.json").is_file():
+            shutil.rmtree(path)
+        rate = round(self.skill.rate)
+        save_lerobot(demonstrations, path, fps=rate, task=TASK, robot_type="upper_body")
+        return load_lerobot(
+            path, robot=self.skill.robot, frames={"bottle": "observation.environment_state"}
+        )
+
+    def _alignment(
+        self,
+        demonstrations: Sequence[Demonstration],
+        measure: _Measure,
+        warping: DynamicTimeWarping,
+        reproductions: Sequence[Trajectory],
+        situations: Sequence[Situation],
+    ) -> dict[str, Any]:
+        """Dynamic time warping against linear time normalisation."""
+        linear = LinearTimeNormalization().fit(demonstrations)
+        aligned = linear.transform(demonstrations)
+        model = self._model(self.n_components).fit(aligned)
+        others = model.predict(situations, candidates=False)
+        normalised = _Measure(self.skill, aligned)
+        return {
+            "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
+            "linear": normalised.alignment(demonstrations, linear.paths_, others),
+        }
+
+    def _model(self, n_components: int, orientation: bool = True) -> TaskParameterizedGMM:
+        operators = bottle_operators(orientation)
+        return TaskParameterizedGMM(n_components, operators, self.skill.robot)
+
+    def _settings(self) -> dict[str, Any]:
+        packages = ("tpgmm-torch", "torch", "numpy", "scikit-learn")
+        return {
+            "n_components": self.n_components,
+            "n_demonstrations": self.n_demonstrations,
+            "n_situations": self.n_situations,
+            "seed": self.seed,
+            "threads": torch.get_num_threads(),
+            "machine": platform.machine(),
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in packages},
+        }
+
+
+class _Measure:
+    """The figures of merit, against aligned demonstrations."""
+
+    def __init__(self, skill: BottleShaking, aligned: Sequence[Demonstration]) -> None:
+        self.skill, self.aligned = skill, aligned
+        self.time = aligned[0].time
+        events = {
+            name: float(np.mean([d.events[name] for d in aligned]))
+            for name in ("grasp", "shake", "rest")
+        }
+        self.contact = int(torch.searchsorted(self.time, events["grasp"]))
+        self.spans = {
+            "reach": (0.0, events["grasp"]),
+            "shake": (events["shake"], events["rest"]),
+        }
+        length = events["rest"] - events["shake"]
+        self.shaking = self._window(events["shake"], events["rest"])
+        # the first and the last eighth of the shaking grow and fade
+        self.steady = self._window(events["shake"] + length / 8, events["rest"] - length / 8)
+        self.grasping = self._window(events["grasp"] - 2.0, events["grasp"])
+        self.shoulders = torch.stack([skill.shoulders(d) for d in aligned]).mean(0)
+
+    def _window(self, start: float, end: float) -> Tensor:
+        return (self.time >= start) & (self.time <= end)
+
+    def __call__(
+        self, trajectories: Sequence[Trajectory], situations: Sequence[Situation]
+    ) -> dict[str, Any]:
+        """Median and 95th percentile over the situations; the worst where limits count."""
+        joints = torch.stack([trajectory.joints for trajectory in trajectories])
+        starts = torch.stack([situation.joints for situation in situations])
+        position, orientation = self.skill.grasp_error(
+            joints[:, self.contact],
+            stacked([situation.frames["bottle"] for situation in situations]),
+        )
+        shoulders = torch.stack(
+            [self.skill.shoulders(trajectory) for trajectory in trajectories]
+        )
+        apart = (shoulders - self.shoulders)[:, self.shaking]
+        wanted = self._rhythm(self.shoulders)
+        rhythms = np.array([self._rhythm(motion) for motion in shoulders]) / wanted - 1
+        robot = self.skill.robot
+        beyond = torch.maximum(robot.lower - joints, joints - robot.upper).clamp(min=0)
+        return {
+            "grasp position error [mm]": _spread(1e3 * position),
+            "grasp orientation error [deg]": _spread(torch.rad2deg(orientation)),
+            "shoulder RMSE [rad]": _spread(apart.square().mean((1, 2)).sqrt()),
+            "frequency error [%]": _spread(100 * np.abs(rhythms[:, 0])),
+            "amplitude error [%]": _spread(100 * np.abs(rhythms[:, 1])),
+            "first step [rad]": float((joints[:, 0] - starts).abs().max()),
+            "beyond joint limits [rad]": float(beyond.max()),
+            "joint speed [rad/s]": _spread([largest_velocity(t) for t in trajectories]),
+            "joint acceleration [rad/s^2]": _spread(
+                [largest_acceleration(t) for t in trajectories]
+            ),
+        }
+
+    def _rhythm(self, shoulders: Tensor) -> NDArray[np.float64]:
+        """Frequency and amplitude, the mean of both shoulders."""
+        fits = [sinusoid(self.time[self.steady], side[self.steady]) for side in shoulders.T]
+        return np.mean([(fit.frequency, fit.amplitude) for fit in fits], axis=0)
+
+    def shares(self, trajectories: Sequence[Trajectory]) -> dict[str, float]:
+        """Figure 6 in two numbers: who determines the shoulders, and when."""
+        columns = [self.skill.robot.joint_names.index(name) for name in SHOULDERS]
+        task, canonical = (
+            torch.stack(
+                [t.candidates[j].share[:, columns].mean(-1) for t in trajectories]
+            ).mean(0)
+            for j in (0, 1)
+        )
+        return {
+            "task operator, two seconds before the grasp": float(task[self.grasping].mean()),
+            "canonical operator, while shaking": float(canonical[self.steady].mean()),
+        }
+
+    def alignment(
+        self,
+        demonstrations: Sequence[Demonstration],
+        paths: Sequence[Tensor],
+        trajectories: Sequence[Trajectory],
+    ) -> dict[str, float]:
+        """How far apart the demonstrations shake, and the reproductions from each of them.
+
+        The true phase of a demonstration is known from its events, and ``paths`` say which
+        of its time steps stands at each instant of the common clock.
+        """
+        phases = []
+        for demonstration, path in zip(demonstrations, paths, strict=True):
+            shake, rest = (demonstration.events[name] for name in ("shake", "rest"))
+            source = path / self.skill.rate
+            done = ((source - shake) / (rest - shake)).clamp(0, 1)
+            phases.append(2 * math.pi * self.skill.cycles * done)
+        spread = torch.stack(phases)[:, self.steady].std(0)
+        shoulders = torch.stack([self.skill.shoulders(t) for t in trajectories])
+        apart = [(shoulders - self.skill.shoulders(d))[:, self.shaking] for d in self.aligned]
+        return {
+            "spread of the shaking's phase [rad]": float(spread.square().mean().sqrt()),
+            "shoulder RMSE against each demonstration [rad]": float(
+                torch.stack(apart).square().mean().sqrt()
+            ),
+        }
+
+    def demonstrations(self, demonstrations: Sequence[Demonstration]) -> dict[str, Any]:
+        """What the demonstrations themselves reach, before alignment."""
+        errors = [
+            self.skill.grasp_error(
+                d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))], d.frames["bottle"]
+            )
+            for d in demonstrations
+        ]
+        return {
+            "duration [s]": [
+                min(d.duration for d in demonstrations),
+                max(d.duration for d in demonstrations),
+            ],
+            "grasp position error [mm]": _spread([1e3 * float(p) for p, _ in errors]),
+            "grasp orientation error [deg]": _spread(
+                [float(torch.rad2deg(o)) for _, o in errors]
+            ),
+            "joint speed [rad/s]": _spread([largest_velocity(d) for d in demonstrations]),
+            "joint acceleration [rad/s^2]": _spread(
+                [largest_acceleration(d) for d in demonstrations]
+            ),
+        }
+
+
+def _spread(values: Any) -> dict[str, float]:
+    values = np.asarray(values, dtype=np.float64)
+    return {
+        "median": float(np.median(values)),
+        "p95": float(np.percentile(values, 95)),
+        "max": float(values.max()),
+    }

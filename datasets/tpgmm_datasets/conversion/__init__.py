@@ -1,0 +1,1 @@
+"""From recorded columns to joints, poses and time."""

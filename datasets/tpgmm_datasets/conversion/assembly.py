@@ -1,0 +1,165 @@
+"""From the rows of an episode to a demonstration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from tpgmm_datasets.conversion.joints import JointColumns
+from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.conversion.timing import resample, trim
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.episodes import EpisodeRows
+from tpgmm_datasets.lerobot.layout import Feature, Layout
+from tpgmm_datasets.names import pose_groups
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+
+__all__ = ["Assembly", "EventSource", "FrameSource", "frame_sources"]
+
+FrameSource = str | FramePose | LinkPose | Frame
+EventSource = Callable[[Demonstration], float]
+
+
+def frame_sources(
+    layout: Layout, frames: Mapping[str, FrameSource] | None
+) -> dict[str, FramePose | LinkPose | Frame]:
+    """Where each frame is; None stands for those that the data set itself names."""
+    if frames is not None:
+        return {
+            name: FramePose(source) if isinstance(source, str) else source
+            for name, source in frames.items()
+        }
+    feature = layout.features.get("observation.environment_state")
+    groups = pose_groups(feature.names) if feature else {}
+    return {
+        name: FramePose("observation.environment_state", columns, constant=None)
+        for name, columns in groups.items()
+    }
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """What a demonstration is made of.
+
+    Parameters
+    ----------
+    layout : Layout
+        The data set.
+    joints : JointColumns
+        Where the joints are.
+    frames : mapping of str to FramePose, LinkPose or Frame
+        Where the pose of each frame is.
+    events : mapping of str to callable
+        Functions from the demonstration, with all values of the joint feature, to a time.
+    robot : object with ``joint_names`` and ``state(joints)``, or None
+        Gives the order of the joints, and the poses of links.
+    rate : float or None
+        Steps per second, if it is to be resampled.
+    trim : float or None
+        Speed below which starts and ends are idle, if they are to be cut off.
+
+    Raises
+    ------
+    DatasetError
+        If a frame is at a link and there is no robot.
+    """
+
+    layout: Layout
+    joints: JointColumns
+    frames: Mapping[str, FramePose | LinkPose | Frame]
+    events: Mapping[str, EventSource]
+    robot: Any
+    rate: float | None
+    trim: float | None
+
+    def __post_init__(self) -> None:
+        for name, source in self.frames.items():
+            if isinstance(source, LinkPose) and self.robot is None:
+                raise DatasetError(f"frame {name!r} is at a link: pass robot=")
+            if not isinstance(source, (FramePose, LinkPose, Frame)):
+                raise DatasetError(
+                    f"frame {name!r} is a feature's name, FramePose, LinkPose or Frame, "
+                    f"got {type(source).__name__}"
+                )
+
+    @property
+    def features(self) -> list[Feature]:
+        """What has to be read."""
+        sources = self.frames.values()
+        keys = [source.feature for source in sources if isinstance(source, FramePose)]
+        poses = map(self.layout.feature, dict.fromkeys(keys))
+        return [self.joints.feature, *poses, *self._flags]
+
+    @property
+    def _flags(self) -> list[Feature]:
+        features = self.layout.features.values()
+        return [f for f in features if f.key.startswith(EVENT) and f.dtype == "bool"]
+
+    def demonstration(self, rows: EpisodeRows) -> Demonstration:
+        """Convert, find frames and events, cut, resample, and bring into the robot's order."""
+        joints = self.joints.values(rows.values[self.joints.feature.key], **rows.where)
+        demonstration = Demonstration(
+            torch.from_numpy(rows.time),
+            torch.from_numpy(joints),
+            self._stored_frames(rows),
+            self.joints.names,
+            self._flagged(rows),
+        )
+        demonstration = self._with_events(demonstration, rows)
+        demonstration = self._with_links(demonstration, rows)
+        if self.trim is not None:
+            demonstration = trim(demonstration, self.trim, **rows.where)
+        if self.rate is not None:
+            demonstration = resample(demonstration, self.rate)
+        if self.robot is not None:
+            demonstration = demonstration.reordered(self.robot.joint_names)
+        return demonstration
+
+    def _stored_frames(self, rows: EpisodeRows) -> dict[str, Frame]:
+        frames = {}
+        for name, source in self.frames.items():
+            if isinstance(source, FramePose):
+                feature = self.layout.feature(source.feature)
+                places = source.select(name, feature)
+                frames[name] = source.frame(rows.values[feature.key], places, **rows.where)
+            elif isinstance(source, Frame):
+                frames[name] = source
+        return frames
+
+    def _flagged(self, rows: EpisodeRows) -> dict[str, float]:
+        events = {}
+        for feature in self._flags:
+            (steps,) = np.nonzero(rows.values[feature.key][:, 0])
+            if len(steps):
+                events[feature.key.removeprefix(EVENT)] = float(rows.time[steps[0]])
+        return events
+
+    def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
+        found = dict(demonstration.events)
+        for name, function in self.events.items():
+            at = float(function(demonstration))
+            if not 0 <= at <= demonstration.duration:
+                raise DatasetError(
+                    f"event {name!r} was found at {at:.6g} s, outside the episode of "
+                    f"{demonstration.duration:.6g} s",
+                    **rows.where,
+                )
+            found[name] = at
+        return replace(demonstration, events=found) if self.events else demonstration
+
+    def _with_links(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
+        frames = dict(demonstration.frames)
+        for name, source in self.frames.items():
+            if isinstance(source, LinkPose):
+                time = source.time(demonstration, **rows.where)
+                frames[name] = source.frame(demonstration, self.robot, time)
+        if len(frames) == len(demonstration.frames):
+            return demonstration
+        ordered = {name: frames[name] for name in self.frames}
+        return replace(demonstration, frames=ordered)

@@ -1,0 +1,145 @@
+"""Which values of a data set are the joints, what they are called, and in which unit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.layout import Feature, Layout
+from tpgmm_datasets.names import match_names
+from tpgmm_datasets.units import Unit, Units, convert
+
+__all__ = ["JointColumns", "joint_feature"]
+
+Names = Mapping[str, str] | Sequence[str]
+
+#: Where the joints are, in order of preference.
+JOINT_FEATURES = (
+    "observation.state",
+    "observation.states",
+    "state",
+    "observation.qpos",
+    "action",
+    "actions",
+)
+
+
+@dataclass(frozen=True)
+class JointColumns:
+    """The joints of a data set.
+
+    Parameters
+    ----------
+    feature : Feature
+        The column that holds them.
+    names : tuple of str or None
+        Name of each value: the robot's where it is a joint of it, else the data set's.
+    units : tuple of str or Scale
+        Unit of each value.
+    """
+
+    feature: Feature
+    names: tuple[str, ...] | None
+    units: tuple[Unit, ...]
+
+    @classmethod
+    def choose(
+        cls, feature: Feature, names: Names | None, units: Units, robot: Any
+    ) -> JointColumns:
+        """Match the values of a feature with what the caller says and with the robot.
+
+        Raises
+        ------
+        DatasetError
+            If a name or unit does not fit.
+        """
+        final = _names(feature, names, robot)
+        return cls(feature, final, _units(feature, final, units, robot))
+
+    def values(self, stored: np.ndarray[Any, Any], **where: Any) -> np.ndarray[Any, Any]:
+        """Stored values (T, width) in radians and metres."""
+        called = self.feature.names or self.names or _numbered(self.feature)
+        return convert(stored, called, self.units, self.feature.key, **where)
+
+
+def joint_feature(layout: Layout) -> str:
+    """The feature that most likely holds the joints.
+
+    Raises
+    ------
+    DatasetError
+        If there is no usual one.
+    """
+    for key in JOINT_FEATURES:
+        if key in layout.features and not layout.features[key].is_camera:
+            return key
+    raise DatasetError(
+        f"none of {list(JOINT_FEATURES)} is a column; say which holds the joints, joints=..., "
+        f"of {sorted(layout.features)}",
+        file="meta/info.json",
+    )
+
+
+def _names(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ...] | None:
+    """Name of each value: the robot's where it is a joint of it, else the data set's."""
+    names = feature.names
+    if isinstance(given, Mapping):
+        for name in given:
+            if name not in (names or ()):
+                raise DatasetError(
+                    f"joint_names has {name!r}; the values are called {names}",
+                    column=feature.key,
+                )
+        names = tuple(given.get(name, name) for name in names or ())
+    elif given is not None:
+        names = (given,) if isinstance(given, str) else tuple(given)
+    if names is not None and (len(names) != feature.width or len(set(names)) < len(names)):
+        raise DatasetError(
+            f"joint_names must give {feature.width} different names, got {names}",
+            column=feature.key,
+        )
+    if robot is None:
+        return names
+    if names is None:
+        if len(robot.joint_names) != feature.width:
+            raise DatasetError(
+                f"the metadata do not name its {feature.width} values, and the robot has "
+                f"{len(robot.joint_names)} joints: name all values, joint_names=[...]",
+                column=feature.key,
+            )
+        return tuple(robot.joint_names)
+    matched = match_names(robot.joint_names, names, feature.key)
+    return tuple(matched.get(name, name) for name in names)
+
+
+def _numbered(feature: Feature) -> tuple[str, ...]:
+    return tuple(f"value {i}" for i in range(feature.width))
+
+
+def _units(
+    feature: Feature, final: Sequence[str] | None, units: Units, robot: Any
+) -> tuple[Unit, ...]:
+    """A unit may be given by the data set's name or by the robot's."""
+    final = final or _numbered(feature)
+    own = feature.names or final
+    declared = feature.units or ("auto",) * feature.width
+    given = units if isinstance(units, Mapping) else dict.fromkeys(final, units)
+    unknown = sorted(set(given) - {*own, *final})
+    if unknown:
+        raise DatasetError(
+            f"units names {unknown}; the values are called {list(own)}", column=feature.key
+        )
+    chosen = [given.get(f, given.get(o, "auto")) for o, f in zip(own, final, strict=True)]
+    chosen = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
+    if robot is not None:
+        # other values are only seen by functions that find events
+        mine = set(robot.joint_names)
+        chosen = [
+            "raw" if c == "auto" and f not in mine else c
+            for c, f in zip(chosen, final, strict=True)
+        ]
+    return tuple(chosen)

@@ -1,0 +1,183 @@
+"""Time of the rows of an episode; another rate; idle starts and ends cut off."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.names import quaternion_groups
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+
+__all__ = ["resample", "row_times", "time_problems", "trim"]
+
+Array = np.ndarray[Any, Any]
+
+#: Fractions of a period: how far a row may be off its place on the grid, and how long a step
+#: may be.
+OFF_GRID, LONGEST_STEP = 0.01, 1.5
+
+
+def time_problems(timestamps: Array, fps: float, **where: Any) -> Iterator[DatasetError]:
+    """What is wrong with the timestamps of an episode, shape (T,)."""
+    where = {**where, "column": "timestamp"}
+    finite = np.isfinite(timestamps)
+    if not finite.all():
+        at = int(np.flatnonzero(~finite)[0])
+        yield DatasetError(f"row {at} is {timestamps[at]}", check="nan", **where)
+        return
+    steps = np.diff(timestamps.astype(np.float64))
+    if (np.abs(steps * fps - 1) < 0.1).all():
+        return
+    if (steps <= 0).any():
+        at = int(np.flatnonzero(steps <= 0)[0])
+        yield DatasetError(
+            f"time does not increase from {timestamps[at]:.6g} to {timestamps[at + 1]:.6g} s "
+            f"at row {at + 1}",
+            check="time",
+            **where,
+        )
+        return
+    usual = float(np.median(steps))
+    if abs(usual * fps - 1) > 0.1:
+        yield DatasetError(
+            f"rows are {usual:.6g} s apart, but info.json says fps = {fps:g}",
+            check="metadata",
+            **where,
+        )
+        return
+    if steps.max() * fps > LONGEST_STEP:
+        at = int(steps.argmax())
+        missing = round(float(steps[at]) * fps) - 1
+        yield DatasetError(
+            f"about {missing} rows are missing between {timestamps[at]:.6g} and "
+            f"{timestamps[at + 1]:.6g} s (row {at + 1})",
+            check="gaps",
+            **where,
+        )
+
+
+def row_times(timestamps: Array | None, rows: int, fps: float) -> Array:
+    """Time of each row from the start of the episode [s], float64.
+
+    Timestamps that lie on the grid of ``fps``, as nearly all do, are replaced by it: they are
+    stored with the seven digits of float32.
+    """
+    grid = np.arange(rows) / fps
+    if timestamps is None:
+        return grid
+    since = timestamps.astype(np.float64) - float(timestamps[0])
+    rounding = 4 * float(np.finfo(np.float32).eps) * float(np.abs(timestamps).max())
+    off = np.abs(since - grid).max()
+    return grid if off <= OFF_GRID / fps + rounding else since
+
+
+def resample(demonstration: Demonstration, rate: float) -> Demonstration:
+    """The demonstration at another rate; it starts at 0 then.
+
+    Joints and positions are interpolated linearly, quaternions (those among the joints too,
+    known by their names ``*.qw`` ... ``*.qz``) along the great arc. Nothing is smoothed.
+
+    Parameters
+    ----------
+    demonstration : Demonstration
+        Any.
+    rate : float
+        Steps per second.
+
+    Raises
+    ------
+    DatasetError
+        If ``rate`` is not a positive number.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 0.5, 1.0], [[0.0], [1.0], [2.0]])
+    >>> resample(shown, rate=4).joints[:, 0].tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0]
+    """
+    if not 0 < rate < float("inf"):
+        raise DatasetError(f"the rate is a number > 0, got {rate!r}")
+    source = demonstration.time - demonstration.time[0]
+    # the last step counts if it is on the new grid up to rounding
+    steps = int(float(source[-1]) * rate + 1e-6) + 1
+    target = torch.arange(steps, dtype=source.dtype) / rate
+    if len(source) == 1:
+        return replace(
+            demonstration, time=target, events=dict.fromkeys(demonstration.events, 0.0)
+        )
+    right = torch.searchsorted(source, target).clamp(1, len(source) - 1)
+    width = source[right] - source[right - 1]
+    fraction = ((target - source[right - 1]) / width).clamp(0, 1)
+
+    def linear(values: Tensor) -> Tensor:
+        return torch.lerp(values[right - 1], values[right], fraction[:, None])
+
+    def arc(values: Tensor) -> Tensor:
+        return quaternions.slerp(values[right - 1], values[right], fraction)
+
+    joints = linear(demonstration.joints)
+    for group in map(list, quaternion_groups(demonstration.joint_names)):
+        unit = quaternions.normalize(quaternions.continuous(demonstration.joints[:, group]))
+        joints[:, group] = quaternions.continuous(arc(unit))
+    frames = {
+        name: Frame(linear(frame.position), arc(frame.orientation))
+        if frame.batch_shape
+        else frame
+        for name, frame in demonstration.frames.items()
+    }
+    first, last = float(demonstration.time[0]), float(target[-1])
+    events = {name: min(at - first, last) for name, at in demonstration.events.items()}
+    return replace(demonstration, time=target, joints=joints, frames=frames, events=events)
+
+
+def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstration:
+    """Cut off the start and end in which nothing moves; time starts at 0 then.
+
+    Parameters
+    ----------
+    demonstration : Demonstration
+        Any.
+    speed : float
+        Idle is where every joint is slower than this [rad/s or m/s]. Events are kept in.
+    **where
+        File and episode, for errors.
+
+    Raises
+    ------
+    DatasetError
+        If it is idle throughout.
+
+    Examples
+    --------
+    >>> shown = Demonstration([0.0, 1.0, 2.0, 3.0], [[0.0], [0.0], [1.0], [2.0]])
+    >>> trim(shown, speed=0.1).time.tolist()
+    [0.0, 1.0, 2.0]
+    """
+    time = demonstration.time
+    speeds = (demonstration.joints.diff(dim=0) / time.diff()[:, None]).abs().amax(dim=1)
+    moving = torch.nonzero(speeds > speed).flatten()
+    if not len(moving):
+        fastest = float(speeds.max()) if len(speeds) else 0.0
+        raise DatasetError(
+            f"nothing moves faster than trim = {speed:g}; the fastest is {fastest:.3g}", **where
+        )
+    events = [int((time - at).abs().argmin()) for at in demonstration.events.values()]
+    start = min([int(moving[0]), *events])
+    stop = max([int(moving[-1]) + 1, *events]) + 1
+    kept = slice(start, stop)
+    first, last = float(time[start]), float(time[stop - 1])
+    return replace(
+        demonstration,
+        time=time[kept] - first,
+        joints=demonstration.joints[kept],
+        frames={n: f[kept] if f.batch_shape else f for n, f in demonstration.frames.items()},
+        events={n: min(max(at, first), last) - first for n, at in demonstration.events.items()},
+    )

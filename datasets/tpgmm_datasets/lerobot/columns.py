@@ -1,0 +1,206 @@
+"""Which columns a demonstration becomes: the schema of the sets that this project writes.
+
+``observation.state``
+    The joints q_t.
+``observation.environment_state``
+    The frames, seven values each: x y z [m], then the unit quaternion w x y z; named
+    ``bottle.x`` ... ``bottle.qz``.
+``event.<name>``
+    True at the one step nearest to the event.
+``action``
+    The joint reference: as given, else the next joints q_{t+1}, the last repeated.
+``timestamp``, ``frame_index``, ``episode_index``, ``index``, ``task_index``
+    As in every LeRobot set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.names import POSE_PARTS
+from tpgmm_datasets.units import POSE_UNITS, with_pose_units
+from tpgmm_torch.data.demonstrations import Demonstration
+
+__all__ = ["action_column", "demonstration_columns", "feature_table", "features_of"]
+
+Array = np.ndarray[Any, Any]
+Features = dict[str, dict[str, Any]]
+
+STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+EVENT = "event."
+#: What joints of demonstrations are in: the last is a coordinate's own scale.
+JOINT_UNITS = ("rad", "m", "raw")
+#: Fraction of a period by which the time of a step may be off the grid of ``fps``.
+TIME_TOLERANCE = 0.01
+
+
+def features_of(
+    demonstrations: Sequence[Demonstration], dtype: str, units: Mapping[str, str] | None = None
+) -> Features:
+    """What ``info.json`` declares for these demonstrations.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    dtype : {"float32", "float64"}
+    units : mapping of str to str, optional
+        ``"m"`` or ``"raw"`` by name, for joints that are not in radians.
+
+    Raises
+    ------
+    DatasetError
+        If they have no joints, a name cannot be stored, or ``units`` name something else.
+    """
+    first = demonstrations[0]
+    if first.n_joints == 0:
+        raise DatasetError("demonstrations without joints cannot be stored: LeRobot needs them")
+    names = None if first.joint_names is None else list(first.joint_names)
+    given = dict(units or {})
+    for name, unit in given.items():
+        if name not in (names or ()) or unit not in JOINT_UNITS:
+            raise DatasetError(
+                f"units gives {name!r} the unit {unit!r}; the joints are {names}, "
+                f"their units in demonstrations {list(JOINT_UNITS)}"
+            )
+    listed = [given.get(name, "rad") for name in names or [""] * first.n_joints]
+    joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
+    features = {STATE: joints}
+    if first.frames:
+        parts = [f"{frame}.{part}" for frame in first.frames for part in POSE_PARTS]
+        features[ENVIRONMENT] = _vector(
+            dtype, len(parts), parts, POSE_UNITS * len(first.frames)
+        )
+    for event in sorted({event for item in demonstrations for event in item.events}):
+        if "/" in event or not event:
+            raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")
+        features[EVENT + event] = {"dtype": "bool", "shape": [1], "names": None}
+    features[ACTION] = joints
+    for key in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
+        kind = "float32" if key == "timestamp" else "int64"
+        features[key] = {"dtype": kind, "shape": [1], "names": None}
+    return features
+
+
+def _vector(
+    dtype: str, width: int, names: list[str] | None, units: tuple[str, ...]
+) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": [width], "names": names, "info": {"units": list(units)}}
+
+
+def demonstration_columns(
+    demonstration: Demonstration, number: int, features: Mapping[str, Any], fps: float
+) -> dict[str, Array]:
+    """The values of one episode by column, each of shape (T, width).
+
+    ``number`` is how errors call the demonstration. Time starts at 0 in the set.
+
+    Raises
+    ------
+    DatasetError
+        If time does not follow ``fps``, or a value does not fit into the column's type.
+    """
+    steps = len(demonstration)
+    grid = np.arange(steps) / fps
+    time = _array(demonstration.time - demonstration.time[0])
+    off = np.abs(time - grid)
+    if off.max() > TIME_TOLERANCE / fps:
+        at = int(off.argmax())
+        raise DatasetError(
+            f"demonstration {number} is not sampled at {fps:g} Hz: step {at} is at "
+            f"{time[at]:.6g} s instead of {grid[at]:.6g} s. Resample it, "
+            "tpgmm_datasets.resample(demonstration, fps)"
+        )
+    joints = _array(demonstration.joints)
+    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
+    if demonstration.frames:
+        columns[ENVIRONMENT] = np.concatenate(
+            [_pose(demonstration, name) for name in _frame_order(features)], axis=1
+        )
+    for key in features:
+        if key.startswith(EVENT):
+            columns[key] = _flag(demonstration, key.removeprefix(EVENT), fps)
+    columns["timestamp"] = grid[:, None]
+    columns["frame_index"] = np.arange(steps)[:, None]
+    return {
+        key: _cast(columns[key], features[key]["dtype"], key, number)
+        for key in features
+        if key in columns
+    }
+
+
+def action_column(
+    commanded: Demonstration, number: int, features: Mapping[str, Any]
+) -> dict[str, Array]:
+    """The column ``action`` where the references are known, as the joints of ``commanded``.
+
+    Raises
+    ------
+    DatasetError
+        If there are not as many as joints.
+    """
+    feature = features[ACTION]
+    if commanded.n_joints != feature["shape"][0]:
+        raise DatasetError(
+            f"demonstration {number} has {feature['shape'][0]} joints and actions of "
+            f"{commanded.n_joints} values"
+        )
+    return {ACTION: _cast(_array(commanded.joints), feature["dtype"], ACTION, number)}
+
+
+def _array(values: Any) -> Array:
+    array: Array = values.detach().cpu().double().numpy()
+    return array
+
+
+def _frame_order(features: Mapping[str, Any]) -> list[str]:
+    names = features[ENVIRONMENT]["names"]
+    return [name.removesuffix(".x") for name in names[:: len(POSE_PARTS)]]
+
+
+def _pose(demonstration: Demonstration, name: str) -> Array:
+    frame = demonstration.frame(name)
+    pose = np.concatenate((_array(frame.position), _array(frame.orientation)), axis=-1)
+    return np.broadcast_to(pose, (len(demonstration), len(POSE_PARTS)))
+
+
+def _flag(demonstration: Demonstration, event: str, fps: float) -> Array:
+    flag = np.zeros((len(demonstration), 1), dtype=bool)
+    if event in demonstration.events:
+        since = demonstration.events[event] - float(demonstration.time[0])
+        flag[min(round(since * fps), len(flag) - 1)] = True
+    return flag
+
+
+def _cast(values: Array, dtype: str, key: str, number: int) -> Array:
+    with np.errstate(over="ignore"):
+        cast: Array = values.astype(dtype)
+    if not np.isfinite(cast).all():
+        raise DatasetError(
+            f"demonstration {number} has values beyond the range of {dtype}", column=key
+        )
+    return cast
+
+
+def feature_table(columns: Mapping[str, Array], features: Mapping[str, Any]) -> pa.Table:
+    """The rows of one episode, in the arrow types that LeRobot uses."""
+    arrays = {}
+    for key, feature in features.items():
+        values = np.ascontiguousarray(columns[key]).reshape(-1)
+        width = feature["shape"][0]
+        flat = pa.array(values, type=_arrow_type(feature["dtype"]))
+        arrays[key] = flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+    return pa.table(arrays)
+
+
+def _arrow_type(dtype: str) -> pa.DataType:
+    return {
+        "float32": pa.float32(),
+        "float64": pa.float64(),
+        "int64": pa.int64(),
+        "bool": pa.bool_(),
+    }[dtype]

@@ -1,0 +1,259 @@
+"""Rows of episodes: read file by file, checked, as arrays."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tpgmm_datasets.conversion.timing import row_times, time_problems
+from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
+from tpgmm_datasets.lerobot.files import METADATA_KEY
+from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
+from tpgmm_datasets.lerobot.parquet import episode_tables, open_parquet
+
+__all__ = ["EpisodeRows", "Policy", "read_episodes", "strict_policy"]
+
+Array = np.ndarray[Any, Any]
+#: What is done with a problem: raise it, or let it pass.
+Policy = Callable[[DatasetError], None]
+#: How arrow calls the types that it names differently.
+ARROW_NAMES = {"float32": "float", "float64": "double", "float16": "halffloat"}
+
+
+@dataclass(frozen=True)
+class EpisodeRows:
+    """The checked rows of one episode.
+
+    Parameters
+    ----------
+    episode : Episode
+        What the metadata say of it.
+    time : ndarray of shape (T,)
+        Seconds from its start.
+    values : mapping of str to ndarray of shape (T, width)
+        By feature, as stored.
+    """
+
+    episode: Episode
+    time: Array
+    values: Mapping[str, Array]
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """File and episode, for errors."""
+        return {"file": self.episode.file, "episode": self.episode.index}
+
+
+def strict_policy(relax: Collection[str]) -> Policy:
+    """What to do with a problem: raise it, or warn if its check is among ``relax``.
+
+    Raises
+    ------
+    DatasetError
+        If ``relax`` names a check that does not exist.
+    """
+    names = {relax} if isinstance(relax, str) else set(relax)
+    if not names <= set(CHECKS):
+        raise DatasetError(
+            f"relax names {sorted(names - set(CHECKS))}; the checks are {sorted(CHECKS)}"
+        )
+
+    def policy(problem: DatasetError) -> None:
+        if problem.check not in names:
+            raise problem
+        # the caller is some levels up, how many depends on the way
+        warnings.warn(f"left out or not checked: {problem}", DatasetWarning, stacklevel=2)
+
+    return policy
+
+
+def read_episodes(
+    layout: Layout, wanted: Sequence[Episode], features: Sequence[Feature], policy: Policy
+) -> Iterator[EpisodeRows]:
+    """Yield the wanted episodes in order of their index, file by file at bounded memory.
+
+    An episode with a problem that ``policy`` does not raise is left out.
+    """
+    groups: dict[Path, list[Episode]] = {}
+    for episode in wanted:
+        groups.setdefault(episode.file, []).append(episode)
+    for file, episodes in groups.items():
+        try:
+            yield from _read_file(layout, file, episodes, features, policy)
+        except DatasetError as problem:
+            policy(problem)
+
+
+def _read_file(
+    layout: Layout,
+    file: Path,
+    episodes: Sequence[Episode],
+    features: Sequence[Feature],
+    policy: Policy,
+) -> Iterator[EpisodeRows]:
+    keys = [feature.key for feature in features]
+    expected = {episode.index: episode for episode in episodes}
+    listed = {episode.index for episode in layout.episodes if episode.file == file}
+    seen: set[int] = set()
+    with open_parquet(layout.root / file, layout.root, ["episode_index", *keys]) as parquet:
+        schema = parquet.schema_arrow
+        for problem in _declaration_problems(layout, file, schema.metadata or {}):
+            policy(problem)
+        own = [name for name in BOOKKEEPING[:4] if name in schema.names]
+        columns = list(dict.fromkeys([*own, *keys]))
+        for index, table in episode_tables(parquet, file, columns, set(expected)):
+            if index in seen:
+                message = "its rows are there twice, or are not together"
+                policy(DatasetError(message, check="duplicates", file=file, episode=index))
+            elif index in expected:
+                rows = _rows(layout, expected[index], table, features, policy)
+                if rows is not None:
+                    yield rows
+            elif index not in listed:
+                message = "the metadata do not list it in this file"
+                policy(DatasetError(message, check="metadata", file=file, episode=index))
+            seen.add(index)
+    for index in sorted(set(expected) - seen):
+        message = f"the metadata list it with {expected[index].length} rows, the file has none"
+        policy(DatasetError(message, check="metadata", file=file, episode=index))
+
+
+def _declaration_problems(
+    layout: Layout, file: Path, metadata: Mapping[bytes, bytes]
+) -> Iterator[DatasetError]:
+    """Differences between ``info.json`` and what our writer left in the data file."""
+    if METADATA_KEY not in metadata:
+        return
+    try:
+        declared = json.loads(metadata[METADATA_KEY])
+        pairs = [("fps", declared["fps"], layout.info.get("fps"))]
+        present = layout.info["features"]
+        pairs += [
+            (key, declared["features"][key], present.get(key)) for key in declared["features"]
+        ]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DatasetError(
+            f"the description in the file is corrupted: {error!r}", check="missing", file=file
+        ) from error
+    for name, there, here in pairs:
+        if there != here:
+            yield DatasetError(
+                f"the file was written with {there!r}, but info.json says {here!r}",
+                check="metadata",
+                file=file,
+                column=name,
+            )
+
+
+def _rows(
+    layout: Layout,
+    episode: Episode,
+    table: pa.Table,
+    features: Sequence[Feature],
+    policy: Policy,
+) -> EpisodeRows | None:
+    """The checked arrays of an episode; None if it has a problem that the policy lets pass."""
+    problems = list(_row_problems(layout, episode, table))
+    values = {}
+    for feature in features:
+        try:
+            values[feature.key] = _column_values(table, feature, episode)
+        except DatasetError as error:
+            problems.append(error)
+    for problem in problems:
+        policy(problem)
+    if problems:
+        return None
+    stamps = table["timestamp"].to_numpy() if "timestamp" in table.column_names else None
+    return EpisodeRows(episode, row_times(stamps, len(table), layout.fps), values)
+
+
+def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
+    """All contradictions between the rows of an episode and the metadata, and in time."""
+    where: dict[str, Any] = {"file": episode.file, "episode": episode.index}
+    rows = len(table)
+    if rows != episode.length:
+        yield DatasetError(
+            f"the metadata give {episode.length} rows, the file has {rows}",
+            check="metadata",
+            **where,
+        )
+    starts = {"frame_index": 0, "index": episode.start}
+    for name, start in starts.items():
+        if name not in table.column_names or (name == "index" and start is None):
+            continue
+        column = table[name]
+        if not pa.types.is_integer(column.type) or column.null_count:
+            yield DatasetError("not all are whole numbers", column=name, **where)
+        elif (column.to_numpy() != np.arange(start, start + rows)).any():  # type: ignore[operator]
+            yield DatasetError(
+                f"it does not count from {start} in steps of one",
+                check="metadata",
+                column=name,
+                **where,
+            )
+    if "timestamp" in table.column_names:
+        column = table["timestamp"]
+        if not pa.types.is_floating(column.type) or column.null_count:
+            yield DatasetError("not all are numbers", check="nan", column="timestamp", **where)
+        else:
+            yield from time_problems(column.to_numpy(), layout.fps, **where)
+
+
+def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
+    """The values of a feature, shape (T, width), without a copy where arrow allows."""
+    where: dict[str, Any] = {"file": episode.file, "episode": episode.index}
+    where["column"] = feature.key
+    rows = len(table)
+    flat = _flat(table[feature.key].combine_chunks(), where)
+    if str(flat.type) != ARROW_NAMES.get(feature.dtype, feature.dtype):
+        raise DatasetError(
+            f"it holds {flat.type}, info.json declares {feature.dtype}",
+            check="metadata",
+            **where,
+        )
+    if len(flat) != rows * feature.width:
+        raise DatasetError(
+            f"it has {len(flat) / rows:g} values per row, info.json declares "
+            f"{list(feature.shape)}",
+            check="metadata",
+            **where,
+        )
+    values: Array = flat.to_numpy(zero_copy_only=False).reshape(rows, feature.width)
+    if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
+        row, place = np.argwhere(~finite)[0].tolist()
+        name = feature.names[place] if feature.names else f"value {place}"
+        raise DatasetError(
+            f"{int((~finite).sum())} values are NaN or infinite, the first: row {row}, {name}",
+            check="nan",
+            **where,
+        )
+    return values
+
+
+def _flat(column: Any, where: Mapping[str, Any]) -> Any:
+    """All values of an arrow column of numbers, or of equally long lists of them."""
+    if isinstance(column.type, pa.ExtensionType):
+        column = column.storage
+    nulls = column.null_count
+    lists = pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list
+    while any(is_list(column.type) for is_list in lists):
+        if not pa.types.is_fixed_size_list(column.type) and not nulls:
+            lengths = column.value_lengths().unique().to_pylist()
+            if len(lengths) > 1:
+                raise DatasetError(f"its rows have {sorted(lengths)} values", **where)
+        column = column.flatten()
+        nulls += column.null_count
+    numeric = pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean
+    if not any(is_kind(column.type) for is_kind in numeric):
+        raise DatasetError(f"it holds {column.type}, not numbers", **where)
+    if nulls:
+        raise DatasetError(f"{nulls} values are missing (null)", check="nan", **where)
+    return column

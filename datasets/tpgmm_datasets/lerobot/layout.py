@@ -1,0 +1,381 @@
+"""The folder of a LeRobot data set: what ``meta/`` says, in both layouts.
+
+v3.0 keeps many episodes in each parquet file and lists them in ``meta/episodes``; v2.1 has
+one parquet file per episode and ``meta/episodes.jsonl``. Both become one :class:`Layout`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.parquet import read_columns
+from tpgmm_datasets.names import value_names
+
+__all__ = ["Episode", "Feature", "Layout", "open_layout"]
+
+#: Columns that LeRobot keeps for itself.
+BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+EPISODE_COLUMNS = (
+    "episode_index",
+    "length",
+    "tasks",
+    "dataset_from_index",
+    "dataset_to_index",
+    "data/chunk_index",
+    "data/file_index",
+)
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column as ``info.json`` declares it.
+
+    Parameters
+    ----------
+    key : str
+        Name of the column.
+    dtype : str
+        ``"float32"``, ``"int64"``, ``"bool"``, ``"video"``, ...
+    shape : tuple of int
+        Shape of one row's value.
+    names : tuple of str or None
+        One name per value; None where the metadata name none or another number of them.
+    units : tuple of str or None
+        One unit per value, where the metadata tell (those of this project's writer do).
+    """
+
+    key: str
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] | None = None
+    units: tuple[str, ...] | None = None
+
+    @property
+    def width(self) -> int:
+        """Number of values per row."""
+        return math.prod(self.shape)
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether it is a video or image, which this project does not read."""
+        return self.dtype in ("video", "image")
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Where an episode lies, according to the metadata.
+
+    Parameters
+    ----------
+    index : int
+        Its ``episode_index``.
+    length : int
+        Number of rows.
+    tasks : tuple of str
+        What was to be done.
+    file : Path
+        The parquet file, relative to the root.
+    start : int or None
+        ``index`` of its first row in the whole set; None where the metadata do not tell.
+    """
+
+    index: int
+    length: int
+    tasks: tuple[str, ...]
+    file: Path
+    start: int | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All that the metadata of a data set say.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    version : str
+        ``"v2.0"``, ``"v2.1"`` or ``"v3.0"``.
+    fps : float
+        Rows per second.
+    robot_type : str or None
+        As declared.
+    features : mapping of str to Feature
+        The declared columns.
+    episodes : tuple of Episode
+        In order of their index.
+    tasks : tuple of str
+        All tasks.
+    info : mapping
+        ``info.json`` as it is.
+    problems : tuple of DatasetError
+        Contradictions found in the metadata themselves.
+    """
+
+    root: Path
+    version: str
+    fps: float
+    robot_type: str | None
+    features: Mapping[str, Feature]
+    episodes: tuple[Episode, ...]
+    tasks: tuple[str, ...]
+    info: Mapping[str, Any]
+    problems: tuple[DatasetError, ...] = ()
+
+    def feature(self, key: str) -> Feature:
+        """The declared feature of that name.
+
+        Raises
+        ------
+        DatasetError
+            If there is none, or it is a video.
+        """
+        readable = sorted(k for k, f in self.features.items() if not f.is_camera)
+        if key not in readable:
+            raise DatasetError(
+                f"there is no numeric column of that name; the set has {readable}",
+                file="meta/info.json",
+                column=key,
+            )
+        return self.features[key]
+
+    @property
+    def files(self) -> dict[Path, list[Episode]]:
+        """The episodes by the file that holds them, in order."""
+        files: dict[Path, list[Episode]] = {}
+        for episode in self.episodes:
+            files.setdefault(episode.file, []).append(episode)
+        return files
+
+
+def open_layout(root: Path) -> Layout:
+    """Read the metadata of the data set in folder ``root``.
+
+    Raises
+    ------
+    DatasetError
+        If there is no data set, its version is unknown, or its metadata cannot be read.
+    """
+    info = _read_info(root)
+    version = info.get("codebase_version")
+    if not isinstance(version, str) or version not in ("v2.0", "v2.1", "v3.0"):
+        raise DatasetError(
+            f"codebase_version is {version!r}; v2.0, v2.1 and v3.0 are read. "
+            "LeRobot's own converters bring older sets to v3.0",
+            file="meta/info.json",
+        )
+    fps = info.get("fps")
+    if not isinstance(fps, (int, float)) or isinstance(fps, bool) or not 0 < fps < math.inf:
+        raise DatasetError(f"fps is {fps!r}, not a positive number", file="meta/info.json")
+    features = _features(info)
+    modern = version == "v3.0"
+    rows = list(_episodes_v3(root) if modern else _episodes_v2(root))
+    episodes = [_episode(info, row, modern) for row in rows]
+    tasks = _tasks(root, modern)
+    robot_type = info.get("robot_type")
+    return Layout(
+        root,
+        version,
+        float(fps),
+        None if robot_type is None else str(robot_type),
+        features,
+        tuple(sorted(episodes, key=lambda episode: episode.index)),
+        tasks,
+        info,
+        tuple(_contradictions(root, info, episodes, tasks)),
+    )
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / "meta" / "info.json"
+    if not path.is_file():
+        raise DatasetError(
+            f"{root} is not a LeRobot data set: it has no meta/info.json", check="missing"
+        )
+    info = _json(path.read_bytes(), "meta/info.json")
+    if not isinstance(info, dict):
+        raise DatasetError("the file does not hold a JSON object", file="meta/info.json")
+    return info
+
+
+def _json(text: bytes, file: str, line: int | None = None) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        place = "" if line is None else f"line {line}: "
+        raise DatasetError(f"{place}this is not JSON: {error}", file=file) from error
+
+
+def _features(info: Mapping[str, Any]) -> dict[str, Feature]:
+    declared = info.get("features")
+    if not isinstance(declared, dict) or not declared:
+        raise DatasetError("'features' declares no columns", file="meta/info.json")
+    return {key: _feature(key, entry) for key, entry in declared.items()}
+
+
+def _feature(key: str, entry: Any) -> Feature:
+    entry = entry if isinstance(entry, dict) else {}
+    dtype, shape = entry.get("dtype"), entry.get("shape")
+    sizes: list[Any] = shape if isinstance(shape, list) else [None]
+    if not isinstance(dtype, str) or not all(type(n) is int and n > 0 for n in sizes):
+        raise DatasetError(
+            f"a feature needs a dtype and a shape, got {dtype!r} and {shape!r}",
+            file="meta/info.json",
+            column=key,
+        )
+    extra = entry.get("info")
+    units = extra.get("units") if isinstance(extra, dict) else None
+    width = math.prod(sizes)
+    return Feature(
+        key,
+        dtype,
+        tuple(sizes),
+        value_names(entry.get("names"), width),
+        value_names(units, width, distinct=False),
+    )
+
+
+def _episodes_v3(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
+    if not files:
+        raise DatasetError(
+            "there is no list of episodes: the set was never finalised "
+            "(LeRobotDataset.finalize) or was copied in part",
+            check="missing",
+            file="meta/episodes",
+        )
+    for path in files:
+        table = read_columns(path, root, EPISODE_COLUMNS)
+        file = str(path.relative_to(root))
+        for row in table.to_pylist():
+            yield file, row
+
+
+def _episodes_v2(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    for line, row in _json_lines(root, "meta/episodes.jsonl"):
+        yield f"meta/episodes.jsonl, line {line}", row
+
+
+def _json_lines(root: Path, file: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    path = root / file
+    if not path.is_file():
+        raise DatasetError("the file is missing", check="missing", file=file)
+    for number, text in enumerate(path.read_bytes().splitlines(), start=1):
+        if text.strip():
+            row = _json(text, file, number)
+            if not isinstance(row, dict):
+                raise DatasetError(f"line {number} is not a JSON object", file=file)
+            yield number, row
+
+
+def _episode(
+    info: Mapping[str, Any], place_row: tuple[str, dict[str, Any]], modern: bool
+) -> Episode:
+    place, row = place_row
+    whole = ["episode_index", "length"]
+    if modern:
+        whole += [name for name in EPISODE_COLUMNS if name not in ("tasks", *whole)]
+    for name in whole:
+        if type(row.get(name)) is not int or row[name] < 0:
+            raise DatasetError(
+                f"{row.get(name)!r} is not a whole number >= 0", file=place, column=name
+            )
+    index, length = row["episode_index"], row["length"]
+    tasks = row.get("tasks") or ()
+    if not all(isinstance(task, str) for task in tasks):
+        raise DatasetError(f"tasks are no text: {tasks!r}", file=place, column="tasks")
+    file = _data_file(info, row, modern)
+    if not modern:
+        return Episode(index, length, tuple(tasks), file)
+    start, stop = row["dataset_from_index"], row["dataset_to_index"]
+    if stop - start != length:
+        raise DatasetError(
+            f"the length is {length} but the rows go from {start} to {stop}",
+            file=place,
+            episode=index,
+        )
+    return Episode(index, length, tuple(tasks), file, start)
+
+
+def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) -> Path:
+    template = info.get("data_path")
+    size = info.get("chunks_size", 1000)
+    if type(size) is not int or size < 1:
+        raise DatasetError(f"chunks_size is {size!r}", file="meta/info.json")
+    index = row["episode_index"]
+    chunk = row["data/chunk_index"] if modern else index // size
+    numbers = {
+        "episode_index": index,
+        "episode_chunk": chunk,
+        "chunk_index": chunk,
+        "file_index": row["data/file_index"] if modern else index,
+    }
+    try:
+        file = Path(template.format(**numbers))  # type: ignore[union-attr]
+    except (AttributeError, KeyError, IndexError, ValueError) as error:
+        raise DatasetError(
+            f"data_path {template!r} cannot be filled in: {error!r}", file="meta/info.json"
+        ) from error
+    if file.is_absolute() or ".." in file.parts or "\0" in str(file):
+        raise DatasetError(f"data_path {template!r} leaves the set", file="meta/info.json")
+    return file
+
+
+def _tasks(root: Path, modern: bool) -> tuple[str, ...]:
+    if not modern:
+        return tuple(str(row.get("task")) for _, row in _json_lines(root, "meta/tasks.jsonl"))
+    path = root / "meta" / "tasks.parquet"
+    # pandas writes an index without a name under one of its own
+    for name in ("task", "__index_level_0__"):
+        try:
+            return tuple(map(str, read_columns(path, root, (name,)).column(0).to_pylist()))
+        except DatasetError as error:
+            if error.column != "task":
+                raise
+    return ()
+
+
+def _contradictions(
+    root: Path, info: Mapping[str, Any], episodes: list[Episode], tasks: tuple[str, ...]
+) -> Iterator[DatasetError]:
+    counts = {
+        "total_episodes": len(episodes),
+        "total_frames": sum(episode.length for episode in episodes),
+        "total_tasks": len(tasks),
+    }
+    for name, found in counts.items():
+        if name in info and info[name] != found:
+            yield DatasetError(
+                f"{name} is {info[name]!r}, but the set lists {found}",
+                check="metadata",
+                file="meta/info.json",
+            )
+    seen: set[int] = set()
+    for episode in episodes:
+        if episode.index in seen:
+            yield DatasetError(
+                "the metadata list it twice", check="duplicates", episode=episode.index
+            )
+        seen.add(episode.index)
+        for task in episode.tasks:
+            if task not in tasks:
+                yield DatasetError(
+                    f"its task {task!r} is not among the tasks of the set, {list(tasks)}",
+                    check="metadata",
+                    episode=episode.index,
+                )
+    listed = {episode.file for episode in episodes}
+    for path in sorted((root / "data").glob("*/*.parquet")):
+        if path.relative_to(root) not in listed:
+            yield DatasetError(
+                "no episode of the metadata lies in this file: it is a left-over of another "
+                "set or of an interrupted recording",
+                check="metadata",
+                file=path.relative_to(root),
+            )

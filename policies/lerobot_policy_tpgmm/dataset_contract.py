@@ -1,0 +1,133 @@
+"""What a data set tells a policy about itself: names, units, rate."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from tpgmm_datasets.names import pose_groups, value_names
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators.text import default_operators
+from tpgmm_torch.robots.joint_space import JointSpace
+
+__all__ = ["adopt", "check_dataset"]
+
+NAMES = {
+    OBS_STATE: "state_names",
+    ACTION: "action_names",
+    OBS_ENV_STATE: "environment_names",
+}
+
+
+def adopt(config: TPGMMConfig, dataset: Any) -> None:
+    """Complete the configuration of a policy that is to be trained, from its data set.
+
+    What is given stays; robot and operators become descriptions that need no file.
+
+    Parameters
+    ----------
+    config : TPGMMConfig
+    dataset : LeRobotDatasetMetadata
+
+    Raises
+    ------
+    DataError, ModelFileError, UnknownNameError
+        If something does not fit.
+    """
+    for key, field in NAMES.items():
+        if getattr(config, field) is None:
+            setattr(config, field, _names(dataset.features, key))
+    _check_rate(config, dataset)
+    config.fps = float(dataset.fps)
+    if config.units is None:
+        config.units = _units(dataset.features)
+    config.validate_features()
+    config.input_features = {
+        key: feature
+        for key, feature in (config.input_features or {}).items()
+        if key in (OBS_STATE, OBS_ENV_STATE)
+    }
+    kinematics = config.kinematics()
+    if kinematics is None:
+        size = dataset.features[OBS_STATE]["shape"][0]
+        kinematics = JointSpace(config.state_names or [f"joint_{i}" for i in range(size)])
+        if OBS_ENV_STATE in dataset.features:
+            logging.getLogger(__name__).warning(
+                "without a robot the policy learns the joints alone, wherever the objects of "
+                f"{OBS_ENV_STATE} are: --policy.robot=URDF --policy.links='[...]' tells of one"
+            )
+    operators = config.decoded_operators()
+    if operators is None:
+        frames = _frames(config) if kinematics.links else []
+        operators = default_operators(kinematics.links, frames)
+    config.describe(kinematics, operators)
+
+
+def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
+    """Whether a fitted policy and a data set are about the same signals.
+
+    Parameters
+    ----------
+    config : TPGMMConfig
+    dataset : LeRobotDatasetMetadata
+
+    Raises
+    ------
+    DataError
+        If names, order or rate differ.
+    """
+    for key, field in NAMES.items():
+        own, found = getattr(config, field), _names(dataset.features, key)
+        if own and found and list(own) != found:
+            raise DataError(
+                f"{key} of the data set has the entries {found}, the policy was made for "
+                f"{list(own)}. If they are the same joints in another order or spelling, "
+                f"--policy.{field}='[...]' says so; else fit a policy to this data set"
+            )
+    _check_rate(config, dataset)
+
+
+def _check_rate(config: TPGMMConfig, dataset: Any) -> None:
+    if config.fps is not None and abs(dataset.fps - config.fps) > 1e-3 * config.fps:
+        raise DataError(
+            f"the data set has {dataset.fps:g} steps per second, the policy was made for "
+            f"{config.fps:g}: resample it, tpgmm dataset convert SOURCE TARGET --rate "
+            f"{config.fps:g}"
+        )
+
+
+def _names(features: Mapping[str, Any], key: str) -> list[str] | None:
+    feature = features.get(key)
+    if feature is None:
+        return None
+    shape = feature["shape"]
+    names = value_names(feature.get("names"), shape[0]) if len(shape) == 1 else None
+    return None if names is None else list(names)
+
+
+def _units(features: Mapping[str, Any]) -> dict[str, list[float] | str]:
+    """Units by name, where the data set declares them (this project's writer does)."""
+    units: dict[str, list[float] | str] = {}
+    for key in (OBS_STATE, ACTION):
+        declared = (features.get(key, {}).get("info") or {}).get("units")
+        names = _names(features, key)
+        if names and isinstance(declared, list) and len(declared) == len(names):
+            units |= dict(zip(names, declared, strict=True))
+    return units
+
+
+def _frames(config: TPGMMConfig) -> list[str]:
+    """The frames that there are, for operators that nobody named."""
+    if config.frames:
+        return list(config.frames)
+    groups = pose_groups(config.environment_names) if config.environment_names else {}
+    if not groups and config.env_state_feature is not None:
+        raise DataError(
+            f"the names of {OBS_ENV_STATE} tell of no pose: name the frames, "
+            """--policy.frames='{"bottle": [0, 1, 2, 3, 4, 5, 6]}'"""
+        )
+    return list(groups)

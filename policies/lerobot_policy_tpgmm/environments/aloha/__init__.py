@@ -1,0 +1,1 @@
+"""Two ALOHA arms on state observations."""

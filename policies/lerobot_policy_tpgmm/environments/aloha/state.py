@@ -1,0 +1,319 @@
+"""gym-aloha's bimanual tasks, observed through joints and object poses instead of pixels.
+
+Physics, rewards and where the objects lie are gym-aloha's. New are the observation, the
+objects' yaw, and that no rendering is needed.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import warnings
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_policy_tpgmm.environments.aloha.robot import ARM_JOINTS, JOINTS, OBJECTS, SIDES
+from lerobot_policy_tpgmm.environments.rendering import Renderer
+from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+
+__all__ = ["AlohaStateEnv"]
+
+Array = NDArray[np.float64]
+
+DESCRIPTIONS = {
+    "transfer_cube": "pick up the cube with the right arm and hand it over to the left arm",
+    "insertion": "pick up the peg and the socket and insert the peg into the socket",
+}
+#: How long an episode takes [s].
+DURATION = 8
+#: The reward of a solved task, in both tasks.
+SOLVED = 4
+#: The one of gym-aloha's cameras that sees both arms from the front.
+CAMERA = "angle"
+#: gym-aloha hands the initial poses over in a global of its module.
+POSE_LOCK = threading.Lock()
+
+
+class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
+    """Transfer a cube, or insert a peg, with two ViperX arms.
+
+    Observations are ``agent_pos``, the 14 joints in the order of ``joint_names`` (arms
+    [rad], grippers 0 closed to 1 open), and ``environment_state``, for each object x y z [m]
+    and a unit quaternion w x y z. An action is a reference for each joint, in the same scale.
+    The reward is gym-aloha's stage, 0 to 4; an episode ends when it reaches 4.
+
+    Parameters
+    ----------
+    task : {"transfer_cube", "insertion"}, default="transfer_cube"
+    fps : int, default=50
+        Control rate [Hz]; gym-aloha's is 50. It must divide the 500 steps of the physics.
+    episode_length : int, optional
+        Steps after which an episode is cut off; as many as 8 s take by default.
+    yaw_range : float, default=pi / 4
+        Objects are turned about the vertical by up to this, either way [rad]; pi / 4 covers
+        every orientation of a cube, 0 is gym-aloha's.
+    track : bool, default=False
+        Whether ``environment_state`` is where the objects are now; by default it is where
+        they were at the start, from where they drop 3 to 4 cm onto the table.
+    stop_at_success : bool, default=True
+        Whether an episode ends when the reward reaches 4, as gym-aloha's do.
+    render_mode : {"rgb_array"}, optional
+    render_width, render_height : int
+        Of the picture.
+
+    Attributes
+    ----------
+    joint_names : tuple of str
+        The order of actions and of ``agent_pos``.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If an option is not one of the above.
+    DependencyError
+        Without gym-aloha.
+
+    Notes
+    -----
+    The same seed gives the same start at every ``fps``; where the objects lie is what
+    gym-aloha draws for that seed. ``reset(options={"environment_state": ...})`` places the
+    objects exactly, ``{"joints": ...}`` the arms.
+
+    ``info`` has ``is_success`` (the reward was 4), ``max_reward``, ``lift_mm`` (how high the
+    cube or the peg was lifted above where it came to rest), ``elapsed_s`` and ``diverged``:
+    references that jump can make gym-aloha's stiff servos unstable, which ends the episode.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
+    joint_names = JOINTS
+
+    def __init__(
+        self,
+        task: str = "transfer_cube",
+        *,
+        fps: int = 50,
+        episode_length: int | None = None,
+        yaw_range: float = math.pi / 4,
+        track: bool = False,
+        stop_at_success: bool = True,
+        render_mode: str | None = None,
+        render_width: int = 320,
+        render_height: int = 240,
+    ) -> None:
+        if task not in OBJECTS:
+            raise UnknownNameError("task", task, "aloha_state", OBJECTS)
+        self.task, self.task_description = task, DESCRIPTIONS[task]
+        self._library = library = _gym_aloha()
+        model = library.constants.ASSETS_DIR / f"bimanual_viperx_{task}.xml"
+        self._physics = library.mujoco.Physics.from_xml_path(str(model))
+        self._rules, self._draw = {
+            "transfer_cube": (library.sim.TransferCubeTask(), library.utils.sample_box_pose),
+            "insertion": (library.sim.InsertionTask(), library.utils.sample_insertion_pose),
+        }[task]
+        rate = round(1 / self._physics.timestep())
+        if fps not in range(1, rate + 1) or rate % fps:
+            rates = [n for n in range(1, rate + 1) if rate % n == 0]
+            raise DataError(
+                f"fps={fps!r} does not divide {rate}, the steps of the physics: {rates}"
+            )
+        fps = int(fps)
+        steps = DURATION * fps if episode_length is None else episode_length
+        if not (steps >= 1 and 0 <= yaw_range <= math.pi):
+            raise DataError(
+                "episode_length has to be at least 1 and yaw_range between 0 and pi, got "
+                f"{steps!r} and {yaw_range!r}"
+            )
+        if render_mode not in (None, "rgb_array"):
+            raise DataError(f"render_mode is None or 'rgb_array', got {render_mode!r}")
+        self.fps, self.episode_length, self.yaw_range = fps, steps, yaw_range
+        self.track, self.stop_at_success, self.render_mode = track, stop_at_success, render_mode
+        self.metadata = {**type(self).metadata, "render_fps": fps}
+        self._render_size = render_width, render_height
+        self._renderer: Renderer | None = None
+        self._picture: NDArray[np.uint8] | None = None
+        self._max_episode_steps = steps  # the name that LeRobot looks for
+        self._substeps = rate // fps
+        self.action_space = _actions(self._physics.model)
+        self.observation_space = gym.spaces.Dict(
+            {
+                "agent_pos": gym.spaces.Box(-1000, 1000, (len(JOINTS),), np.float64),
+                "environment_state": gym.spaces.Box(
+                    -1000, 1000, (7 * len(OBJECTS[task]),), np.float64
+                ),
+            }
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, Array], dict[str, Any]]:
+        """Place arms and objects.
+
+        Parameters
+        ----------
+        seed : int, optional
+        options : mapping, optional
+            ``environment_state``, the objects' poses, and ``joints``, the arms' posture.
+            Others are ignored: LeRobot gives one of its own.
+
+        Returns
+        -------
+        observation, info : dict
+
+        Raises
+        ------
+        DataError
+            If a pose or posture has another shape, is not finite or no unit quaternion.
+        """
+        super().reset(seed=seed)
+        given = options or {}
+        joints = _checked("joints", given["joints"], len(JOINTS)) if "joints" in given else None
+        poses = self._sample(seed)  # also where poses are given: further draws stay the same
+        if "environment_state" in given:
+            poses = _checked("environment_state", given["environment_state"], len(poses))
+            norms = np.linalg.norm(poses.reshape(-1, 7)[:, 3:], axis=1)
+            if np.abs(norms - 1).max() > 1e-4:
+                raise DataError(
+                    "environment_state holds x y z and a unit quaternion w x y z for each of "
+                    f"{OBJECTS[self.task]}; the norms are {norms}"
+                )
+        with POSE_LOCK:
+            box_pose = self._library.sim.BOX_POSE
+            box_pose[0], previous = poses, box_pose[0]
+            try:
+                self._rules.initialize_episode(self._physics)
+            finally:
+                box_pose[0] = previous
+        if joints is not None:
+            self._rules.before_step(joints, self._physics)
+            self._physics.data.qpos[: len(self._physics.data.ctrl)] = self._physics.data.ctrl
+            self._physics.forward()
+        self._initial, self._steps, self._picture = poses, 0, None
+        self._highest_reward, self._lift, self._diverged = 0, 0.0, False
+        self._lowest = self._height()
+        return self._observation(), self._info()
+
+    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+        """Drive the joints to references for one control period.
+
+        Parameters
+        ----------
+        action : array of shape (14,)
+            In the order of ``joint_names``; what is out of reach is clipped.
+
+        Returns
+        -------
+        observation, reward, terminated, truncated, info
+
+        Raises
+        ------
+        DataError
+            If it has another shape or is not finite.
+        """
+        self._rules.before_step(_checked("action", action, len(JOINTS)), self._physics)
+        self._steps += 1
+        try:
+            self._physics.step(self._substeps)
+        except self._library.control.PhysicsError:
+            self._diverged = True
+            return self._last, 0.0, True, False, self._info()
+        reward = int(self._rules.get_reward(self._physics))
+        self._highest_reward = max(self._highest_reward, reward)
+        self._lowest = min(self._lowest, self._height())
+        self._lift = max(self._lift, self._height() - self._lowest)
+        solved = reward == SOLVED and self.stop_at_success
+        truncated = self._steps >= self.episode_length
+        return self._observation(), float(reward), solved, truncated, self._info()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """A picture, at most 25 new ones per simulated second.
+
+        Returns
+        -------
+        ndarray of shape (height, width, 3)
+            None without a render mode; small and black where nothing can be drawn.
+        """
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer(self._physics.model.ptr, *self._render_size, CAMERA)
+        if self._picture is None or self._steps % max(1, round(self.fps / 25)) == 0:
+            self._picture = self._renderer(self._physics.data.ptr)
+        return self._picture
+
+    def close(self) -> None:
+        """Free what drawing needs."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _sample(self, seed: int | None) -> Array:
+        """gym-aloha's poses for a seed, turned about the vertical."""
+        drawn = int(self.np_random.integers(2**32)) if seed is None else seed % 2**32
+        poses = np.ravel(self._draw(drawn))
+        yaw = self.np_random.uniform(-self.yaw_range, self.yaw_range, len(poses) // 7)
+        quaternions = poses.reshape(-1, 7)[:, 3:]
+        quaternions[:] = 0
+        quaternions[:, 0], quaternions[:, 3] = np.cos(yaw / 2), np.sin(yaw / 2)
+        return poses
+
+    def _height(self) -> float:
+        """Of the cube or the peg [m]."""
+        return float(self._rules.get_env_state(self._physics)[2])
+
+    def _observation(self) -> dict[str, Array]:
+        poses = self._initial
+        if self.track:
+            poses = self._rules.get_env_state(self._physics)
+        joints = self._rules.get_qpos(self._physics)
+        self._last = {"agent_pos": joints, "environment_state": poses.copy()}
+        return self._last
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "is_success": self._highest_reward == SOLVED,
+            "max_reward": float(self._highest_reward),
+            "lift_mm": 1000 * self._lift,
+            "elapsed_s": self._steps / self.fps,
+            "diverged": self._diverged,
+        }
+
+
+def _gym_aloha() -> SimpleNamespace:
+    """gym-aloha's modules, and those of dm-control that it stands on."""
+    try:
+        with warnings.catch_warnings():
+            # dm-control looks for a display when it is imported, and warns that there is none
+            warnings.filterwarnings("ignore", message=".*DISPLAY environment variable")
+            from dm_control import mujoco
+            from dm_control.rl import control
+            from gym_aloha import constants, utils
+            from gym_aloha.tasks import sim
+    except ImportError as error:
+        raise DependencyError(
+            "aloha_state needs gym-aloha: pip install 'lerobot_policy_tpgmm[environments]'"
+        ) from error
+    return SimpleNamespace(
+        mujoco=mujoco, control=control, constants=constants, utils=utils, sim=sim
+    )
+
+
+def _actions(model: Any) -> gym.spaces.Box:
+    """Limits of the references: those of the actuators, grippers from 0 to 1."""
+    limits = model.actuator_ctrlrange.reshape(len(SIDES), -1, 2)[:, : len(ARM_JOINTS)]
+    gripper = np.broadcast_to((0.0, 1.0), (len(SIDES), 1, 2))
+    low, high = np.concatenate((limits, gripper), axis=1).reshape(-1, 2).astype(np.float32).T
+    return gym.spaces.Box(low, high, dtype=np.float32)
+
+
+def _checked(name: str, values: Any, width: int) -> Array:
+    array = np.array(values, dtype=np.float64)
+    if array.shape != (width,):
+        raise ShapeError(f"{name} has shape ({width},), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise DataError(f"{name} holds values that are NaN or infinite: {array}")
+    return array

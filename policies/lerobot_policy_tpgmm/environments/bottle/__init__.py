@@ -1,0 +1,1 @@
+"""A humanoid that grasps and shakes a bottle."""

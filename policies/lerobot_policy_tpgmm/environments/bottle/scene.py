@@ -1,0 +1,306 @@
+"""The simulated upper body, its lifting table and the bottle, in MuJoCo.
+
+Palms and bottle are so dimensioned that the palms just touch the bottle at the grasp poses of
+:mod:`tpgmm_datasets.bottle.skill`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tpgmm_datasets.bottle.skill import GRASP_POINT, HANDS
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch.exceptions import DataError, DependencyError
+
+try:
+    import mujoco
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        "bottle_shaking needs MuJoCo: pip install 'lerobot_policy_tpgmm[environments]'"
+    ) from error
+
+__all__ = ["CAMERA", "FOOT", "TABLE_LOW", "BottleScene", "bottle_model", "displaced"]
+
+#: Of the simulation and of the position control of the joints [s].
+TIMESTEP = 1e-3
+#: Gains of the position control [N m / rad, N m s / rad].
+STIFFNESS, DAMPING = 1000.0, 30.0
+#: Height of the bottle's centre above its foot [m].
+FOOT = 0.11
+#: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
+#: the bottle is brought, is lower than some of the places where it stood.
+TABLE_LOW, TABLE_SPEED = -0.08, 0.2
+#: Name of the model's camera.
+CAMERA = "front"
+
+_DIVERGED = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC")
+]
+_TABLE, _PALM = 1, 2  # what collides with the bottle, as bits; nothing else collides
+
+
+def bottle_model() -> mujoco.MjModel:
+    """Compile the model.
+
+    Returns
+    -------
+    mujoco.MjModel
+        The robot's joints in the URDF's order with a position actuator each, then the bottle's
+        free joint; bodies ``bottle`` and ``table``; geoms ``bottle``, ``l_palm`` and
+        ``r_palm``; a weld between each hand and the bottle, not active.
+    """
+    spec = mujoco.MjSpec.from_string(upper_body_urdf())
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for joint in spec.joints:
+        motor = spec.add_actuator(name=joint.name, target=joint.name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
+    for body in spec.bodies[1:]:
+        body.gravcomp = 1.0  # as the controllers of such robots do
+    for hand in HANDS:
+        palm = spec.body(hand).geoms[0]
+        palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", _PALM, (0.85, 0.45, 0.2, 1)
+    _add_table(spec)
+    _add_bottle(spec, abs(GRASP_POINT[HANDS[0]][1]) - float(palm.size[1]))
+    for hand in HANDS:
+        weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2="bottle")
+        weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
+    _add_view(spec)
+    return spec.compile()
+
+
+def _add_table(spec: Any) -> None:
+    table = spec.worldbody.add_body(name="table")
+    table.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=_TABLE, conaffinity=0, group=3
+    )
+    table.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(0.2, 0.3, 0.01),
+        pos=(0.34, 0, -0.01),
+        contype=0,
+        conaffinity=0,
+        rgba=(0.6, 0.5, 0.4, 1),
+    )
+
+
+def _add_bottle(spec: Any, radius: float) -> None:
+    bottle = spec.worldbody.add_body(name="bottle")
+    bottle.add_freejoint()
+    shape: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "contype": 0}
+    body = {"name": "bottle", "mass": 1.0, "rgba": (0.3, 0.6, 0.9, 1)}
+    bottle.add_geom(**shape, **body, size=(radius, FOOT, 0))
+    for size, height in (((0.025, 0.02, 0), FOOT + 0.02), ((0.03, 0.012, 0), FOOT + 0.05)):
+        bottle.add_geom(**shape, mass=0, conaffinity=0, size=size, pos=(0, 0, height))
+
+
+def _add_view(spec: Any) -> None:
+    """A camera before the robot, light and a bright sky: cheap to draw by a processor."""
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
+    world, texture = spec.worldbody, mujoco.mjtTexture
+    world.add_camera(
+        name=CAMERA, pos=(1.05, 0.6, 0.55), xyaxes=(-0.54, 0.84, 0, -0.33, -0.21, 0.92), fovy=45
+    )
+    world.add_light(pos=(0.8, 0.6, 1.4), dir=(-0.5, -0.4, -1), diffuse=(0.8, 0.8, 0.8))
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.95, 0.95, 0.95),
+        rgb2=(0.7, 0.75, 0.8),
+        width=64,
+        height=384,
+    )
+
+
+class BottleScene:
+    """The state of the simulated world, and what can happen in it.
+
+    Attributes
+    ----------
+    model : mujoco.MjModel
+    data : mujoco.MjData
+    held : bool
+        Whether the bottle is attached to both hands.
+    """
+
+    def __init__(self) -> None:
+        self.model = model = bottle_model()
+        self.data = mujoco.MjData(model)
+        self.held = False
+        self._n = model.nu
+        self._hands = [model.body(hand).id for hand in HANDS]
+        self._palms = [model.geom(f"{hand[0]}_palm").id for hand in HANDS]
+        self._bottle, self._table = model.body("bottle").id, model.body("table").id
+        self._surface = model.geom("bottle").id
+        self._unit_inertia = model.body_inertia[self._bottle].copy()  # of 1 kg
+        # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
+        # is its damping, the joint's own and the control's: so much it has to be led
+        own = model.dof_damping[: self._n]
+        self._lead = (own - model.actuator_biasprm[:, 2]) / model.actuator_gainprm[:, 0]
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """Joint positions, shape (17,) [rad]."""
+        return self.data.qpos[: self._n].copy()
+
+    @property
+    def bottle(self) -> NDArray[np.float64]:
+        """The bottle's position [m] and orientation, a unit quaternion; shape (7,)."""
+        return self.data.qpos[self._n :].copy()
+
+    def reset(self, bottle: ArrayLike, joints: ArrayLike, mass: float) -> None:
+        """Stand still, the bottle on the table.
+
+        Parameters
+        ----------
+        bottle : array-like of shape (7,)
+            Position [m] and orientation, a unit quaternion.
+        joints : array-like of shape (17,)
+            [rad]
+        mass : float
+            The bottle's [kg].
+        """
+        model, data = self.model, self.data
+        model.body_mass[self._bottle] = mass
+        model.body_inertia[self._bottle] = mass * self._unit_inertia
+        mujoco.mj_setConst(model, data)
+        mujoco.mj_resetData(model, data)
+        model.geom_conaffinity[self._surface] = _TABLE | _PALM
+        self.held = False
+        data.ctrl[:] = data.qpos[: self._n] = joints
+        data.qpos[self._n :] = bottle
+        model.body_pos[self._table, 2] = data.qpos[self._n + 2] - FOOT
+        mujoco.mj_forward(model, data)
+
+    def follow(
+        self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
+    ) -> None:
+        """Simulate position control.
+
+        Parameters
+        ----------
+        references : ndarray of shape (n + 1, 17)
+            Where the joints should be now and at the end of the next ``n`` time steps [rad].
+        torques : ndarray of shape (n, 17), optional
+            From outside, during each time step [N m].
+
+        Raises
+        ------
+        DataError
+            If the simulation diverges.
+        """
+        model, data, n = self.model, self.data, self._n
+        control = references[1:] + self._lead * np.diff(references, axis=0) / TIMESTEP
+        for i in range(len(control)):
+            data.ctrl[:] = control[i]
+            if torques is not None:
+                data.qfrc_applied[:n] = torques[i]
+            mujoco.mj_step(model, data)
+        if data.warning.number[_DIVERGED].any():  # MuJoCo then begins anew by itself
+            raise DataError(f"the simulation diverges at {references[-1].tolist()}")
+        mujoco.mj_kinematics(model, data)
+        if self.held:
+            self._sink(len(control) * TIMESTEP)
+
+    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+        """Put the joints somewhere without dynamics.
+
+        The bottle follows both hands that hold it, half each, or stands on the table.
+
+        Parameters
+        ----------
+        joints : ndarray of shape (17,)
+            [rad]
+        seconds : float
+            Time that passes.
+        """
+        data, n = self.data, self._n
+        data.qpos[:n] = joints
+        mujoco.mj_kinematics(self.model, data)
+        if self.held:
+            (left, turn), (right, other) = (self._carried(e) for e in range(2))
+            data.qpos[n : n + 3] = (left + right) / 2
+            data.qpos[n + 3 :] = turn + math.copysign(1, turn @ other) * other
+            mujoco.mj_normalizeQuat(self.model, data.qpos)
+            mujoco.mj_kinematics(self.model, data)
+            self._sink(seconds)
+        else:  # so it stands
+            data.qpos[n + 2] = self.model.body_pos[self._table, 2] + FOOT
+        data.time += seconds
+
+    def gap(self) -> float:
+        """Distance of the farther palm from the bottle's surface, negative inside it [m]."""
+        model, data, points = self.model, self.data, np.empty(6)
+        return max(
+            mujoco.mj_geomDistance(model, data, palm, self._surface, 1.0, points)
+            for palm in self._palms
+        )
+
+    def hold(self) -> None:
+        """Attach the bottle to both hands as it lies in them; from then on the table sinks."""
+        model, data, bottle = self.model, self.data, self._bottle
+        self.held = True
+        model.geom_conaffinity[self._surface] = _TABLE
+        inverse, turn = np.empty(4), np.empty(4)
+        for weld, hand in enumerate(self._hands):
+            apart = data.xpos[hand] - data.xpos[bottle]
+            mujoco.mju_negQuat(inverse, data.xquat[hand])
+            mujoco.mju_mulQuat(turn, inverse, data.xquat[bottle])
+            point = data.xmat[bottle].reshape(3, 3).T @ apart
+            # a point of the bottle, where it is in the hand, and how the bottle is turned there
+            model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
+            data.eq_active[weld] = True
+
+    def let_go(self) -> None:
+        """Open both hands."""
+        self.held = False
+        self.data.eq_active[:] = False
+
+    def pull(self) -> float:
+        """The larger force between the bottle and a hand that holds it [N]."""
+        # rows of equality constraints come first, six per weld: force, then moment
+        left, _, right, _ = self.data.efc_force[:12].reshape(4, 3)
+        return math.sqrt(max(left @ left, right @ right))
+
+    def slip(self) -> float:
+        """How far the hands are from where they took hold of the bottle [m]."""
+        left, right = (self._carried(weld)[0] for weld in range(2))
+        return float(np.linalg.norm(left - right) / 2)
+
+    def _carried(self, weld: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position and orientation of the bottle, were it rigidly attached to one hand."""
+        point, relative = self.model.eq_data[weld, :3], self.model.eq_data[weld, 6:10]
+        hand, turn, moved = self._hands[weld], np.empty(4), np.empty(3)
+        mujoco.mju_mulQuat(turn, self.data.xquat[hand], relative)
+        mujoco.mju_rotVecQuat(moved, point, turn)
+        return self.data.xpos[hand] - moved, turn
+
+    def _sink(self, seconds: float) -> None:
+        height = self.model.body_pos[self._table, 2] - TABLE_SPEED * seconds
+        self.model.body_pos[self._table, 2] = max(height, TABLE_LOW)
+
+
+def displaced(pose: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A pose that is off by something.
+
+    Parameters
+    ----------
+    pose : ndarray of shape (7,)
+        Position [m] and unit quaternion.
+    error : ndarray of shape (6,)
+        Displacement [m] and, about the axes of the pose, rotation vector [rad].
+
+    Returns
+    -------
+    ndarray of shape (7,)
+    """
+    out = pose.copy()
+    out[:3] += error[:3]
+    mujoco.mju_quatIntegrate(out[3:], error[3:], 1.0)
+    return out

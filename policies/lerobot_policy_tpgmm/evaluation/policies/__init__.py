@@ -1,0 +1,1 @@
+"""What is compared: TP-GMM, learned baselines, and replay."""

@@ -1,0 +1,178 @@
+"""The naive floor: replay the demonstration whose objects stood nearest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import SGDConfig
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_policy_tpgmm.evaluation.policies.episodes import (
+    ACTION,
+    ENVIRONMENT,
+    STATE,
+    Episodes,
+)
+
+__all__ = ["NearestConfig", "NearestPolicy"]
+
+#: Metres that count as much as one radian of difference in orientation.
+METRES_PER_RADIAN = 0.1
+POSE = 7
+
+
+@PreTrainedConfig.register_subclass("nearest_demonstration")
+@dataclass
+class NearestConfig(PreTrainedConfig):  # type: ignore[misc]
+    """Configuration of :class:`NearestPolicy`.
+
+    Parameters
+    ----------
+    n_demonstrations, n_steps : int
+        How many are kept, and how many steps the longest has.
+    """
+
+    n_demonstrations: int = 1
+    n_steps: int = 1
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(
+            ("STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+        )
+    )
+
+    def validate_features(self) -> None:
+        """Nothing to check."""
+
+    def get_optimizer_preset(self) -> SGDConfig:
+        """Nothing is trained by gradient."""
+        return SGDConfig()
+
+    def get_scheduler_preset(self) -> None:
+        """No schedule."""
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the present action."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+
+
+class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """Replay, open loop, the demonstration whose object poses at the start are nearest.
+
+    Parameters
+    ----------
+    config : NearestConfig
+    **unused
+        What else LeRobot passes.
+    """
+
+    config_class = NearestConfig
+    name = "nearest_demonstration"
+
+    def __init__(self, config: NearestConfig, **unused: Any) -> None:
+        super().__init__(config)
+        self.config = config
+        environment, action = config.env_state_feature.shape, config.action_feature.shape
+        self.register_buffer("poses", torch.zeros(config.n_demonstrations, *environment))
+        self.register_buffer(
+            "actions", torch.zeros(config.n_demonstrations, config.n_steps, *action)
+        )
+        self.reset()
+
+    @classmethod
+    def fit(cls, episodes: Episodes) -> NearestPolicy:
+        """Keep the episodes.
+
+        Parameters
+        ----------
+        episodes : Episodes
+        """
+        parts = list(episodes)
+        longest = max(len(action) for _, _, action in parts)
+        config = NearestConfig(
+            n_demonstrations=len(parts),
+            n_steps=longest,
+            input_features={
+                STATE: PolicyFeature(FeatureType.STATE, tuple(episodes.state.shape[1:])),
+                ENVIRONMENT: PolicyFeature(
+                    FeatureType.ENV, tuple(episodes.environment.shape[1:])
+                ),
+            },
+            output_features={
+                ACTION: PolicyFeature(FeatureType.ACTION, tuple(episodes.action.shape[1:]))
+            },
+            device="cpu",
+            push_to_hub=False,
+        )
+        policy = cls(config)
+        for index, (_, environment, action) in enumerate(parts):
+            policy.poses[index] = environment[0]
+            policy.actions[index] = action[-1]
+            policy.actions[index, : len(action)] = action
+        return policy.eval()
+
+    def reset(self) -> None:
+        """Begin a new episode with the next observation."""
+        self._chosen: Tensor | None = None
+        self._step = 0
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
+        """The next action of the demonstrations chosen at the first step; then the last one.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+        """
+        if self._chosen is None:
+            self._chosen = self._distance(batch[ENVIRONMENT]).argmin(dim=1)
+        step = min(self._step, self.config.n_steps - 1)
+        self._step += 1
+        return self.actions[self._chosen, step]
+
+    def _distance(self, poses: Tensor) -> Tensor:
+        """Between each of these poses and each demonstration's, shape (B, n)."""
+        given = poses[:, None].unflatten(-1, (-1, POSE))
+        known = self.poses[None].unflatten(-1, (-1, POSE))
+        apart = (given[..., :3] - known[..., :3]).square().sum(-1)
+        cosine = (given[..., 3:] * known[..., 3:]).sum(-1).abs().clamp(max=1)
+        turn = METRES_PER_RADIAN * 2 * torch.arccos(cosine)
+        return (apart + turn.square()).sum(-1)
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
+        """One action as a chunk.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+        """
+        return self.select_action(batch)[:, None]
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
+        """There is no loss.
+
+        Parameters
+        ----------
+        batch : dict of str to Tensor
+
+        Raises
+        ------
+        NotImplementedError
+            Always.
+        """
+        raise NotImplementedError("the nearest demonstration is kept, not trained")
+
+    def get_optim_params(self) -> Any:
+        """No parameters."""
+        return []

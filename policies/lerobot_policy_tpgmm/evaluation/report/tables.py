@@ -1,0 +1,104 @@
+"""Results as tidy tables: one row for each cell, and one for each episode."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from lerobot_policy_tpgmm.evaluation.report.intervals import wilson
+
+__all__ = ["cell_table", "episode_table", "write_table"]
+
+#: What identifies a cell, in the order of the columns.
+KEYS = ("env", "policy", "demonstrations", "seed", "condition")
+
+
+def cell_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """One row for each cell.
+
+    Parameters
+    ----------
+    results : iterable of mapping
+        What :class:`Results` holds.
+
+    Returns
+    -------
+    DataFrame
+        What identifies the cell; ``success`` with its 95 % interval of Wilson; median and
+        95th percentile of each figure of the environment; latency, training, size, options,
+        seeds, versions and machine.
+    """
+    return pd.DataFrame([_row(result) for result in results])
+
+
+def _row(result: Mapping[str, Any]) -> dict[str, Any]:
+    episodes, training = result["episodes"], result["training"]
+    successes = sum(episode["success"] for episode in episodes)
+    low, high = wilson(successes, len(episodes))
+    row = {key: result["cell"][key] for key in KEYS}
+    row |= {
+        "episodes": len(episodes),
+        "successes": successes,
+        "success": successes / len(episodes),
+        "success_low": low,
+        "success_high": high,
+    }
+    for key in episodes[0].keys() - {"seed", "success"}:
+        values = [episode[key] for episode in episodes]
+        row[f"{key}_median"] = float(np.median(values))
+        # not interpolated: a figure may be infinite
+        row[f"{key}_p95"] = float(np.percentile(values, 95, method="higher"))
+    row |= result["latency"]
+    row |= {f"training_{key}": training[key] for key in ("seconds", "outcome")}
+    row |= {key: training[key] for key in ("fps", "parameters", "bytes")}
+    row["evaluation_seconds"] = result["evaluation_seconds"]
+    row["first_evaluation_seed"] = episodes[0]["seed"]
+    for key in ("options", "demonstration_seed"):
+        row[key] = _text(result["settings"][key])
+    return row | {key: _text(result[key]) for key in ("versions", "machine")}
+
+
+def _text(value: Any) -> Any:
+    return json.dumps(value) if isinstance(value, Mapping | Sequence) else value
+
+
+def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
+    """One row for each evaluation episode.
+
+    Parameters
+    ----------
+    results : iterable of mapping
+        What :class:`Results` holds.
+
+    Returns
+    -------
+    DataFrame
+        What identifies the cell (the seed of its training as ``training_seed``), and what
+        the episode gave.
+    """
+    rows = []
+    for result in results:
+        cell = {key: result["cell"][key] for key in KEYS}
+        cell["training_seed"] = cell.pop("seed")
+        rows += [{**cell, **episode} for episode in result["episodes"]]
+    return pd.DataFrame(rows)
+
+
+def write_table(table: pd.DataFrame, path: Path) -> None:
+    """Write a table as parquet and as CSV, each in one step.
+
+    Parameters
+    ----------
+    table : DataFrame
+    path : Path
+        Without suffix.
+    """
+    for suffix, write in ((".parquet", table.to_parquet), (".csv", table.to_csv)):
+        partial = path.with_name(f".{path.name}{suffix}.partial")
+        write(partial, index=False)
+        partial.replace(path.with_suffix(suffix))

@@ -1,0 +1,1 @@
+"""What ``lerobot-train`` drives: demonstrations gathered, losses reported, the model fitted."""

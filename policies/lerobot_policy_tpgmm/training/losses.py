@@ -1,0 +1,154 @@
+"""What training by gradient minimises: differentiable in the parameters of the mixture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
+from tpgmm_torch import Frame, Kinematics, Operator, RobotState
+from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.regression import Regression
+
+__all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
+
+#: Loss per squared radian: LeRobot's log shows three digits.
+SQUARE_MILLIRADIANS = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """A batch in the model's units.
+
+    Parameters
+    ----------
+    time : Tensor of shape (B,)
+        Of the model, at which the state was reached [s].
+    next_time : Tensor of shape (B,)
+        At which the action shall be [s].
+    state : RobotState
+        Of batch shape (B,).
+    poses : dict of str to Frame
+        Of shape (B,).
+    """
+
+    time: Tensor
+    next_time: Tensor
+    state: RobotState
+    poses: dict[str, Frame]
+
+
+def regression(
+    config: TPGMMConfig,
+    kinematics: Kinematics,
+    operators: Sequence[Operator],
+    mixture: MixtureParameters,
+) -> Regression:
+    """The regression of a policy, with parameters that carry gradients.
+
+    Parameters
+    ----------
+    config : TPGMMConfig
+    kinematics : Kinematics
+    operators : sequence of Operator
+    mixture : MixtureParameters
+    """
+    local = []
+    for mean, triangle in zip(mixture.means, mixture.triangles(), strict=True):
+        # time stands first, so conditioning on it leaves the other rows of the factor
+        first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
+        gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
+        local.append(LocalMixture(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
+    return Regression(
+        kinematics,
+        operators,
+        local,
+        torch.log_softmax(mixture.logits, 0),
+        config.fusion,
+        config.activation,
+        config.epsilon,
+        config.prior_std,
+        config.negligible,
+    )
+
+
+@torch.no_grad()
+def local_points(model: Regression, samples: Samples) -> list[Tensor]:
+    """Time and local coordinates (B, 1 + D_j) of each operator.
+
+    Parameters
+    ----------
+    model : Regression
+        Quaternions are brought to the side that it expects at their time.
+    samples : Samples
+    """
+    points = []
+    for j, operator in enumerate(model.operators):
+        local = operator.coordinates(samples.state, samples.poses).clone()
+        expected = model.expected(j, samples.time)
+        for start in operator.quaternion_starts(model.kinematics):
+            block = slice(start, start + 4)
+            inner = (local[:, block] * expected[:, block]).sum(1, keepdim=True)
+            local[:, block] = torch.where(inner < 0, -local[:, block], local[:, block])
+        points.append(torch.cat((samples.time[:, None], local), dim=1))
+    return points
+
+
+def likelihood_loss(
+    mixture: MixtureParameters,
+    points: Sequence[Tensor],
+    regularization: Sequence[Tensor] | None = None,
+) -> Tensor:
+    """Negative mean log-likelihood per frame, over all local data sets.
+
+    It is what EM maximises with ``responsibilities="point"``. The regularisation ``Lambda``
+    that EM adds to the covariances is kept by the penalty ``tr(Sigma_k^-1 Lambda) / 2`` for
+    each component k, in proportion to what it answers for: EM's solution is stationary, and
+    covariances do not shrink to nothing.
+
+    Parameters
+    ----------
+    mixture : MixtureParameters
+    points : sequence of Tensor of shape (B, 1 + D_j)
+        From :func:`local_points`.
+    regularization : sequence of Tensor of shape (1 + D_j,), optional
+        The diagonals of ``Lambda``, in squared units of the coordinates; none by default.
+    """
+    joint = torch.log_softmax(mixture.logits, 0)[:, None]  # (K, B)
+    penalty = torch.zeros_like(mixture.logits)
+    triangles = mixture.triangles()
+    for j, (mean, triangle, x) in enumerate(zip(mixture.means, triangles, points, strict=True)):
+        white = torch.linalg.solve_triangular(triangle, x.mT - mean[..., None], upper=False)
+        log_volume = triangle.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+        constant = mean.shape[1] * math.log(2 * math.pi) / 2
+        joint = joint - white.square().sum(1) / 2 - log_volume - constant
+        if regularization is not None:
+            root = regularization[j].sqrt().diag().expand_as(triangle)
+            white = torch.linalg.solve_triangular(triangle, root, upper=False)
+            penalty = penalty + white.square().sum((1, 2)) / 2
+    shares = torch.softmax(joint.detach(), 0).mean(1)
+    return (shares * penalty).sum() - torch.logsumexp(joint, 0).mean()
+
+
+def imitation_loss(
+    model: Regression, samples: Samples, wanted: Tensor, asked: Tensor
+) -> Tensor:
+    """Mean squared error of the reference that follows each state [mrad^2].
+
+    Parameters
+    ----------
+    model : Regression
+    samples : Samples
+        Their states are q_{t-1}.
+    wanted : Tensor of shape (B, n)
+        The joints that the action asks for [rad].
+    asked : Tensor of shape (n,)
+        Which of the model's joints these are.
+    """
+    estimate = model.step(samples.next_time, samples.state, samples.poses)
+    return SQUARE_MILLIRADIANS * (estimate.joints[:, asked] - wanted).square().mean()

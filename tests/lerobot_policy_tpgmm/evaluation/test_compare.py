@@ -1,0 +1,142 @@
+"""``tpgmm compare``, small: from the demonstrations to the report, and on after a stop."""
+
+import shutil
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from lerobot_policy_tpgmm.evaluation import compare as module
+from lerobot_policy_tpgmm.evaluation import jobs
+from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
+from lerobot_policy_tpgmm.evaluation.compare import Comparison, compare
+from lerobot_policy_tpgmm.evaluation.report.report import write_report
+from lerobot_policy_tpgmm.evaluation.rollouts import Runner
+from lerobot_policy_tpgmm.evaluation.settings import Settings
+from tests.support.command_line import output, refusal, run
+
+SETTINGS = Settings(
+    options={"mode": "kinematic"},
+    rate=20,
+    episodes=2,
+    budget=0.0,
+    validation=2,
+    n_components=20,
+)
+NEAREST, TPGMM = (Cell("bottle_shaking", policy, 3, 0) for policy in ("nearest", "tpgmm"))
+
+
+def compared(out, **arguments):
+    said = []
+    policies = [NEAREST.policy, TPGMM.policy]
+    comparison = compare(SETTINGS, out, policies, [3], workers=2, say=said.append, **arguments)
+    return comparison, said
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A finished comparison."""
+    out = tmp_path_factory.mktemp("compare") / "out"
+    comparison, said = compared(out, command="tpgmm compare ...")
+    assert comparison == Comparison(2, {}), said
+    return out
+
+
+def test_both_policies_were_rolled_out_on_the_same_seeds(folder):
+    results = Results(folder / "cells")
+    seeds = [SETTINGS.evaluation_seed, SETTINGS.evaluation_seed + 1]
+    for cell in (NEAREST, TPGMM):
+        result = results.read(cell)
+        assert [episode["seed"] for episode in result["episodes"]] == seeds
+        assert result["latency"]["step_median_ms"] > 0
+        assert result["training"]["fps"] == 20
+    grasps = {
+        cell: [episode["grasp_mm"] for episode in results.read(cell)["episodes"]]
+        for cell in (NEAREST, TPGMM)
+    }
+    assert max(grasps[TPGMM]) < min(grasps[NEAREST])
+
+
+def test_tables_and_report_say_what_the_cells_hold(folder):
+    cells = pd.read_parquet(folder / "cells.parquet")
+    assert list(cells.policy) == ["nearest", "tpgmm"]
+    episodes = pd.read_csv(folder / "episodes_evaluated.csv")
+    assert len(episodes) == 4
+    for policy, rows in episodes.groupby("policy"):
+        row = cells.set_index("policy").loc[policy]
+        assert row.success == rows.success.mean()
+        assert row.success_low <= row.success <= row.success_high
+        assert row.grasp_mm_median == pytest.approx(rows.grasp_mm.median())
+    report = (folder / "report.md").read_text()
+    assert "tpgmm compare ..." in report
+    assert "the 3 recorded demonstrations succeed" in report
+    for line in report.splitlines():
+        if line.startswith("!["):
+            assert (folder / line.partition("(")[2].rstrip(")")).is_file()
+
+
+def test_what_is_finished_is_not_run_again(folder, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    results = Results(out / "cells")
+    kept = results.path(NEAREST).stat().st_mtime_ns
+    results.path(TPGMM).write_text("{")
+    trained = (out / "policies" / TPGMM.training / "training.json").stat().st_mtime_ns
+    comparison, said = compared(out)
+    assert comparison == Comparison(2, {})
+    assert said[0].endswith("the cell is run again")
+    assert said[1] == "2 cells, 1 of them finished before"
+    assert results.path(NEAREST).stat().st_mtime_ns == kept
+    again, before = (Results(place / "cells").read(TPGMM) for place in (out, folder))
+    assert again["episodes"] == before["episodes"]
+    # nor is a policy trained again, whose evaluation was stopped
+    assert (out / "policies" / TPGMM.training / "training.json").stat().st_mtime_ns == trained
+    assert compared(out)[1][0] == "2 cells, 2 of them finished before"
+
+
+@pytest.mark.parametrize("policy", ["act", "diffusion-phase"])
+def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatch):
+    shutil.copytree(folder / "episodes", tmp_path / "episodes")
+    recipe = replace(jobs.RECIPES[policy], check_every=5, batch_size=8)
+    monkeypatch.setitem(jobs.RECIPES, policy, recipe)
+    cell = Cell("bottle_shaking", policy, 2, 1)
+    jobs.run(tmp_path, SETTINGS, [cell])
+    result = Results(tmp_path / "cells").read(cell)
+    [point] = result["training"]["curve"]
+    assert point["step"] == 5
+    assert 0 < point["validation_error"] < 3
+    assert "budget" in result["training"]["outcome"]
+    size = recipe.options["n_action_steps"]
+    assert result["latency"]["chunk_size"] == size
+    assert result["latency"]["chunk_median_ms"] > result["latency"]["step_median_ms"]
+    assert not result["episodes"][0]["success"]
+    runner = Runner.load(tmp_path / "policies" / cell.training)
+    width = runner.policy.config.env_state_feature.shape[0]
+    assert width == (40 if "phase" in policy else 7)
+
+
+def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
+    text = output("compare", "--help")
+    for word in ("--budget", "--conditions", "full grid", "lerobot-eval", "diffusion-phase"):
+        assert word in " ".join(text.split())
+    out = ("--out", tmp_path / "out")
+    assert "policy 'bc' is not in the comparison" in refusal(
+        "compare", "--policies", "bc", *out
+    )
+    assert "numbers like 5,10,25" in refusal("compare", "--demonstrations", "5;6", *out)
+    assert "disturbance 'rain'" in refusal("compare", "--conditions", "rain", *out)
+    result = run("compare", "--demonstrations", "101", *out)
+    assert result.exit_code == 2
+    assert "offers 100 demonstrations" in result.stderr
+
+
+def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "compare", lambda *_: Comparison(1, {TPGMM: "bad luck"}))
+    result = run("compare", "--out", tmp_path)
+    assert result.exit_code == 1
+    assert "1 cells failed" in result.stderr
+
+
+def test_a_report_names_the_cells_that_failed(tmp_path):
+    path = write_report(tmp_path, SETTINGS, [], {TPGMM: "bad luck"}, "")
+    assert f"- `{TPGMM.key}`: bad luck" in path.read_text()

@@ -1,0 +1,119 @@
+"""The policy in LeRobot's own commands, from ``tpgmm fit`` on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.command_line import output, refusal
+from tests.support.lerobot_commands import lerobot
+from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
+from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tpgmm_datasets import save_lerobot
+from tpgmm_torch import Demonstration
+
+NAMES = fitted().kinematics.joint_names
+POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    """A policy of the paper's skill, from ten demonstrations of 20 steps per second."""
+    folder = tmp_path_factory.mktemp("fitted")
+    shaking = replace(generator(), steady_rhythm=True)
+    save_lerobot(shaking.demonstrations(10, seed=0), folder / "set", fps=20, task="shake")
+    printed = output(
+        "fit", folder / "set", "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand",
+        "--n-components", 30, "--out", folder / "policy", "--format", "lerobot",
+    )  # fmt: skip
+    assert printed.endswith(f"{folder / 'policy'}\n")
+    return folder / "policy"
+
+
+def test_names_units_and_rate_of_the_data_set_go_along(directory):
+    config = TPGMMPolicy.from_pretrained(directory).config
+    assert tuple(config.state_names) == tuple(config.action_names) == NAMES
+    assert config.environment_names[3] == "bottle.qw"
+    assert config.fps == 20 and config.frames == {"bottle": [*range(7)]}
+    assert config.units is None  # it is in radians
+
+
+def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
+    names = [f"{name}.pos" for name in NAMES[::-1]]
+    degrees = [
+        Demonstration(d.time, d.joints.flip(-1).rad2deg(), d.frames, names)
+        for d in bottle_demonstrations()[:3]
+    ]
+    save_lerobot(
+        degrees, tmp_path / "set", fps=20, task="shake", units=dict.fromkeys(names, "raw")
+    )
+    arguments = (
+        "fit", tmp_path / "set", "--robot", "upper_body", "--link", "l_hand", "--link",
+        "r_hand", "--units", "deg", "--rate", 5, "--alignment", "none", "--tol", 0.1,
+        "--format", "lerobot", "--out",
+    )  # fmt: skip
+    output(*arguments, tmp_path / "policy")
+    policy = TPGMMPolicy.from_pretrained(tmp_path / "policy")
+    assert policy.config.state_names == names and policy.config.fps == 5
+    observed = {**batch(), STATE: batch()[STATE].flip(-1).rad2deg()}
+    first = act(policy, observed, 1)[:, 0]
+    torch.testing.assert_close(first, observed[STATE], rtol=0, atol=1e-3)
+    (tmp_path / "policy" / "config.json").write_text("{}")
+    assert "exists and is not a tpgmm policy" in refusal(*arguments, tmp_path / "policy")
+
+
+def test_an_unknown_format_is_refused(tmp_path):
+    line = refusal("fit", tmp_path, "--out", tmp_path / "out", "--format", "onnx")
+    assert "format 'onnx' is not known here; there are ['lerobot', 'tpgmm']" in line
+    assert "pip install lerobot_policy_tpgmm" in line
+
+
+def test_lerobot_eval_runs_it(directory, tmp_path):
+    done = lerobot(
+        "eval", f"--policy.path={directory}", "--env.type=bottle_shaking", "--env.fps=20",
+        "--env.mode=kinematic", "--eval.n_episodes=2", "--eval.batch_size=2",
+        "--eval.use_async_envs=false", f"--output_dir={tmp_path / 'out'}", home=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    outcome = json.loads((tmp_path / "out" / "eval_info.json").read_text())["overall"]
+    assert outcome["n_episodes"] == 2 and outcome["pc_success"] == 100
+
+
+def rollout(path, start, home, *more):
+    """What was sent to the robot, tick by tick, by name."""
+    (home / "start.json").write_text(json.dumps(start))
+    done = lerobot(
+        "rollout", "--strategy.type=base", f"--policy.path={path}", "--robot.type=bimanual",
+        f"--robot.start={home / 'start.json'}", f"--robot.log={home / 'log.json'}",
+        "--duration=2", "--return_to_initial_position=false", "--task=shake", *more, home=home,
+    )  # fmt: skip
+    return done, home / "log.json"
+
+
+def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
+    observed = {key: value[:1] for key, value in batch().items()}
+    policy = changed(fitted(), control_fps=20.0)
+    policy.save_pretrained(tmp_path / "policy")
+    degrees = observed[STATE][0].double().rad2deg()
+    start = {f"{n}.pos": v for n, v in zip(NAMES[::-1], degrees.tolist()[::-1], strict=True)}
+    start |= dict(
+        zip(POSE_NAMES, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True)
+    )
+    done, log = rollout(
+        tmp_path / "policy", start, tmp_path, "--fps=20", "--policy.units=deg",
+        f"--policy.state_names={json.dumps(list(start))}",
+        f"--policy.action_names={json.dumps(list(start)[:17])}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "'r_wrist_roll.pos'" in done.stderr and "20 per second (--fps)" in done.stderr
+    sent = json.loads(log.read_text())
+    assert len(sent) >= 10 and list(sent[0]) == list(start)[:17]
+    time = torch.arange(len(sent), dtype=torch.float64) / 20
+    [wanted] = small_bottle().predict(situations(observed, time), candidates=False)
+    for index, name in enumerate(NAMES):
+        moved = np.array([action[f"{name}.pos"] for action in sent])
+        np.testing.assert_allclose(moved, wanted.joints[:, index].rad2deg(), atol=1e-3)
+    assert np.ptp([action["l_elbow.pos"] for action in sent]) > 1  # degrees

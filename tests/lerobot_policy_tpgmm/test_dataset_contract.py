@@ -1,0 +1,151 @@
+"""What a data set tells: a policy that is to be trained, and ``tpgmm fit``."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.dataset_contract import adopt
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.lerobot_metadata import dataset
+from tests.support.lerobot_sets import change_info
+from tests.support.policies import ENVIRONMENT, STATE, fitted
+from tpgmm_datasets import FramePose, LinkPose, save_lerobot
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_datasets.signals import Signals
+from tpgmm_torch import Canonical, Demonstration, Frame, Robot
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.joint_space import JointSpace
+
+NAMES = fitted().kinematics.joint_names
+POSE = [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+UPPER_BODY = {"robot": "upper_body", "links": ["l_hand", "r_hand"]}
+
+
+def config(n_environment: int = 7, **options: object) -> TPGMMConfig:
+    """As ``make_policy`` gives it to a policy."""
+    made = TPGMMConfig(device="cpu", **options)
+    made.set_features(17, n_environment, 17)
+    made.input_features["observation.image"] = PolicyFeature(FeatureType.VISUAL, (3, 8, 8))
+    return made
+
+
+def environment(names):
+    return {ENVIRONMENT: {"dtype": "float32", "shape": (7,), "names": names}}
+
+
+def test_a_data_set_completes_a_configuration():
+    made = config(**UPPER_BODY)
+    adopt(made, dataset(20, **environment(POSE)))
+    assert made.fps == made.rate == 20
+    assert made.state_names == made.action_names == list(NAMES)
+    assert made.environment_names == POSE and not made.units
+    assert set(made.input_features) == {STATE, ENVIRONMENT}
+    assert made.kinematics() == fitted().kinematics
+    assert made.decoded_operators() == list(fitted().operators)
+    assert "<robot" in made.robot["config"]["urdf"]
+    policy = TPGMMPolicy(made)
+    assert policy.frames.in_environment == {"bottle": [*range(7)]}
+    assert not bool(policy.mixture.fitted)
+
+
+def test_what_is_given_stays():
+    given = {"operators": ["position:l_hand@cup"], "frames": {"cup": [*range(7)]}}
+    made = config(**UPPER_BODY, **given, units="deg", control_fps=50.0)
+    adopt(made, dataset(20))
+    assert made.operators == given["operators"] and made.units == "deg" and made.rate == 50
+    assert TPGMMPolicy(made).frames.in_environment == given["frames"]
+
+
+def test_units_that_the_data_set_declares_are_taken():
+    units = ["deg"] * 16 + ["mm"]
+    feature = {"shape": (17,), "names": list(NAMES), "info": {"units": units}}
+    made = config(**UPPER_BODY)
+    adopt(made, dataset(20, **{STATE: feature}, **environment(POSE)))
+    joints = TPGMMPolicy(made).joints.joints(torch.full((1, 17), 180.0))
+    np.testing.assert_allclose(joints[0], [np.pi] * 16 + [0.18])
+
+
+def test_joints_alone_need_no_robot():
+    made = config(n_environment=0)
+    adopt(made, dataset(20))
+    assert made.kinematics() == JointSpace(NAMES)
+    assert made.decoded_operators() == [Canonical()]
+
+
+@pytest.mark.parametrize(
+    ("options", "features", "message"),
+    [
+        (UPPER_BODY, environment(None), r"tell of no pose: name the frames, --policy.frames="),
+        ({"fps": 50.0}, {}, "20 steps per second, the policy was made for 50: resample it"),
+        ({"state_names": ["a", "b"]}, {}, r"state_names are \['a', 'b'\], 2 entries"),
+        ({"robot": "no.urdf", "links": ["hand"]}, {}, "no.urdf"),
+    ],
+)
+def test_what_does_not_fit_a_data_set_is_refused(options, features, message):
+    made = config(**options)
+    with pytest.raises((DataError, OSError), match=message):
+        TPGMMPolicy(made, dataset_meta=dataset(20, **features))
+
+
+# Signals
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Two joints in degrees, two objects."""
+    path = tmp_path_factory.mktemp("signals") / "set"
+    time, joints = np.arange(5) / 10, np.linspace([10.0, 100.0], [90.0, 120.0], 5)
+    frames = {name: Frame([0.1, 0.2, 0.3]) for name in ("bowl", "cup")}
+    demonstration = Demonstration(time, joints, frames, ("a.pos", "b.pos"))
+    units = {"a.pos": "raw", "b.pos": "raw"}
+    save_lerobot([demonstration] * 2, path, fps=10, task="stir", units=units)
+    return path
+
+
+class Arm:
+    joint_names = ("b", "a")
+
+
+def test_signals_of_a_data_set(stored):
+    told = Signals.of(stored, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
+    assert told.fps == 5 and told.state_names == told.action_names == ("a.pos", "b.pos")
+    assert told.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
+    assert told.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
+    assert told.environment_names[7] == "cup.x"
+
+
+def test_frames_that_no_policy_could_observe_are_left_out(stored):
+    frames = {
+        "here": FramePose(ENVIRONMENT, slice(3, 10)),
+        "turned": FramePose(ENVIRONMENT, slice(0, 7), "xyzw"),
+        "hand": LinkPose("hand", "grasp"),
+        "table": Frame([0.0, 0.0, 0.0]),
+    }
+    told = Signals.of(stored, units="raw", frames=frames)
+    assert told.frames == {"here": tuple(range(3, 10))}
+    assert told.units == {} and told.fps == 10
+
+
+def test_actions_in_another_unit_than_states_are_refused(tmp_path):
+    demonstration = Demonstration(np.arange(5) / 10, np.zeros((5, 2)), joint_names=("a", "b"))
+    save_lerobot([demonstration], tmp_path / "set", fps=10, task="stir")
+    assert Signals.of(tmp_path / "set").units == {}
+    change_info(
+        tmp_path / "set",
+        lambda info: info["features"]["action"].update(info={"units": ["rad", "deg"]}),
+    )
+    with pytest.raises(DatasetError, match="column 'action': 'b' is in 'deg', but 'b'"):
+        Signals.of(tmp_path / "set")
+    with pytest.raises(DatasetError, match=r"column 'observation.state': 'b' is in 'rad'"):
+        Signals.of(tmp_path / "set", joints="action")
+
+
+def test_a_robot_of_a_file_becomes_a_description(tmp_path):
+    (tmp_path / "robot.urdf").write_text(upper_body_urdf())
+    made = config(robot=str(tmp_path / "robot.urdf"), links=["l_hand"])
+    adopt(made, dataset(20, **environment(POSE)))
+    (tmp_path / "robot.urdf").unlink()
+    assert made.kinematics() == Robot.from_urdf(upper_body_urdf(), ["l_hand"])

@@ -1,0 +1,210 @@
+"""What a policy does is what its model predicts, in every way that LeRobot asks for it."""
+
+import copy
+
+import pytest
+import torch
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.policies import (
+    ENVIRONMENT,
+    STATE,
+    act,
+    batch,
+    changed,
+    fitted,
+    policy,
+    situations,
+)
+from tests.support.skills import (
+    HANDS,
+    canonical,
+    cups,
+    hands,
+    new_handling,
+    small_bottle,
+    waves,
+)
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, ShapeError
+
+STEPS = len(small_bottle().time_)
+
+
+def predicted(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
+    return torch.stack([t.joints for t in model.predict(given, candidates=False)])
+
+
+def assert_close(actions: torch.Tensor, joints: torch.Tensor, tolerance: float = 1e-6) -> None:
+    torch.testing.assert_close(actions.double(), joints, rtol=tolerance, atol=tolerance)
+
+
+def test_open_loop_it_is_what_the_model_predicts():
+    actions = act(fitted(), batch(), STEPS)
+    assert actions.dtype == torch.float32 and actions.shape == (2, STEPS, 17)
+    assert_close(actions, predicted(small_bottle(), situations(batch())))
+    assert float((actions[0] - actions[1]).abs().max()) > 0.1
+
+
+def test_a_start_off_the_skill_is_blended_in_as_predict_does():
+    observed = batch()
+    observed[STATE][0, 4] += 0.5
+    actions = act(fitted(), observed, STEPS)
+    assert_close(actions[:, 0], observed[STATE].double())
+    assert_close(actions, predicted(small_bottle(), situations(observed)))
+
+
+def test_references_keep_the_speed_limit():
+    observed = batch()
+    joints = act(policy(blend=0.0), observed, STEPS).double()
+    model = copy.copy(small_bottle()).set_params(blend=0.0)
+    assert_close(joints, predicted(model, situations(observed)))
+    speed = joints.diff(dim=1) / small_bottle().time_.diff()[:, None]
+    assert bool((speed.abs() <= fitted().kinematics.velocity * (1 + 1e-5)).all())
+
+
+def test_after_the_end_it_holds():
+    actions = act(fitted(), batch(), STEPS + 5)
+    assert torch.equal(actions[:, STEPS:], actions[:, STEPS - 1 : -5][:, :1].expand(-1, 5, -1))
+
+
+@pytest.mark.parametrize("rate", [5.0, 12.5])
+def test_time_advances_by_the_control_rate(rate):
+    model = small_bottle()
+    duration = float(model.time_[-1])
+    time = torch.arange(0, duration, 1 / rate, dtype=torch.float64)
+    actions = act(changed(fitted(), control_fps=rate), batch(), len(time))
+    assert_close(actions, predicted(model, situations(batch(), time)))
+    assert fitted().config.fps == pytest.approx((STEPS - 1) / duration, abs=1e-6)
+
+
+def test_a_chunk_is_what_follows_and_changes_nothing():
+    whole = act(fitted(), batch(), STEPS)
+    short = changed(fitted(), chunk_size=7)
+    with torch.inference_mode():
+        assert torch.equal(short.predict_action_chunk(batch()), whole[:, :7])
+        for step in range(20):
+            ahead = short.predict_action_chunk(batch())
+            assert torch.equal(ahead, whole[:, step : step + 7])
+            assert torch.equal(short.select_action(batch()), whole[:, step])
+    assert fitted().predict_action_chunk(batch()).shape == (2, 50, 17)
+
+
+def test_an_episode_begins_with_reset():
+    acting, first, second = fitted(), batch(), batch()
+    second[STATE] += 0.1
+    one, other = act(acting, first, 5), act(acting, second, 5)
+    assert_close(other[:, 0], second[STATE].double())
+    assert torch.equal(act(acting, first, 5), one)
+
+
+@pytest.mark.parametrize("feedback", ["reference", "observation"])
+def test_a_sub_environment_that_jumps_disturbs_no_other(feedback):
+    acting = changed(fitted(), feedback=feedback)
+    observed, alone = batch(), {key: value[:1] for key, value in batch().items()}
+    wanted = act(acting, alone, 30)
+    acting.reset()
+    for step in range(30):
+        now = {key: value.clone() for key, value in observed.items()}
+        if step > 10:  # finished, and reset to somewhere else
+            now[STATE][1] = -now[STATE][1]
+            now[ENVIRONMENT][1, :3] += 1.0
+        with torch.inference_mode():
+            action = acting.select_action(now)
+        assert_close(action[:1], wanted[:, step].double())
+
+
+def test_q_before_may_be_what_was_measured():
+    model = copy.copy(small_bottle()).set_params(keep_limits=False)
+    acting = policy(feedback="observation", blend=0.0, keep_limits=False)
+    generator = torch.Generator().manual_seed(0)
+    frames = {"bottle": Frame(*batch()[ENVIRONMENT].double().split([3, 4], dim=-1))}
+    for time in model.time_[:10]:
+        noise = 0.02 * torch.randn(2, 17, generator=generator)
+        now = {**batch(), STATE: batch()[STATE] + noise}
+        with torch.inference_mode():
+            action = acting.select_action(now)
+        assert_close(action, model.step(time, now[STATE].double(), frames).joints)
+    with pytest.raises(ShapeError, match=r"began with 2 robots, now there are 1"):
+        acting.select_action({key: value[:1] for key, value in batch().items()})
+
+
+@pytest.mark.parametrize("follow", [False, True])
+def test_objects_are_read_at_the_start_or_followed(follow):
+    acting = changed(fitted(), follow_frames=follow)
+    path = batch()[ENVIRONMENT].double()[:1].repeat(STEPS, 1)
+    path[:, :3] += 0.05 * small_bottle().time_[:, None] / small_bottle().time_[-1]
+    acting.reset()
+    with torch.inference_mode():
+        actions = torch.cat(
+            [
+                acting.select_action({STATE: batch()[STATE][:1], ENVIRONMENT: at[None].float()})
+                for at in path
+            ]
+        )
+    seen = path.float().double() if follow else path.float().double()[0]
+    [situation] = situations({key: value[:1] for key, value in batch().items()})
+    frame = Frame(seen[..., :3], seen[..., 3:])
+    moved = Situation(situation.joints, {"bottle": frame}, small_bottle().time_)
+    assert_close(actions, predicted(small_bottle(), [moved])[0])
+
+
+def test_a_robot_that_stands_far_from_the_start_is_refused():
+    observed = batch()
+    observed[STATE][1, 7] += 1.8
+    message = r"'l_forearm_yaw' of robot 1 stands at .*--policy.units.*--policy.largest_start"
+    with pytest.raises(DataError, match=message):
+        act(fitted(), observed, 1)
+    changed(fitted(), largest_start_gap=None).select_action(observed)
+    degrees = {**batch(), STATE: batch()[STATE].rad2deg()}
+    with pytest.raises(DataError, match="or their unit"):
+        act(fitted(), degrees, 1)
+
+
+def test_joints_alone_need_no_robot_and_no_frames():
+    model = canonical().fit(waves())
+    acting = TPGMMPolicy.from_estimator(model)
+    assert set(acting.config.input_features) == {STATE}
+    start = waves()[1].joints[0]
+    actions = act(acting, {STATE: start[None].float()}, len(model.time_))
+    assert_close(actions[0], predicted(model, [Situation(start.float().double())])[0])
+
+
+def test_tracked_bodies_are_moved_on_their_manifold():
+    situation, _ = new_handling()
+    acting = TPGMMPolicy.from_estimator(hands(), largest_start_gap=None)
+    cup = situation.frames["cup"]
+    observed = {
+        STATE: situation.joints[None].float(),
+        ENVIRONMENT: torch.cat([cup.position, cup.orientation])[None].float(),
+    }
+    actions = act(acting, observed, len(hands().time_))[0]
+    at = observed[ENVIRONMENT][0].double()
+    given = Situation(observed[STATE][0].double(), {"cup": Frame(at[:3], at[3:])})
+    assert_close(actions, predicted(hands(), [given])[0])
+    for start in HANDS.quaternion_starts:
+        norms = actions[:, start : start + 4].norm(dim=-1)
+        torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
+
+
+def test_several_frames_follow_one_another_in_the_environments_state():
+    one, other = cups(2)
+    frames = TPGMMPolicy.from_estimator(hands()).frames
+    assert frames.in_environment == {"cup": list(range(7))}
+    values = torch.cat([one.position, one.orientation])[None]
+    found = frames.frames({STATE: torch.zeros(1, 14), ENVIRONMENT: values})
+    torch.testing.assert_close(found["cup"].position, one.position[None])
+    assert float((found["cup"].position - other.position).abs().max()) > 0
+
+
+def test_a_gradient_can_follow_inference():
+    acting = policy()
+    act(acting, batch(), 2)
+    model = acting.to_estimator()
+    weights, means, _ = acting.mixture.tensors()
+    (weights.square().sum() + means[0].sum()).backward()
+    assert acting.mixture.logits.grad is not None
+    joints = small_bottle().time_.new_zeros(17).requires_grad_()
+    frame = situations(batch())[0].frames["bottle"]
+    model.step(0.0, model.kinematics_.state(joints), {"bottle": frame}).joints.sum().backward()
+    assert joints.grad is not None

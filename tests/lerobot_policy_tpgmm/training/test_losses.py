@@ -1,0 +1,220 @@
+"""Training by gradient from the EM solution: the losses, and what comes of them."""
+
+from itertools import cycle, islice
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_policy_tpgmm.training.clocks import Clock
+from tests.support.skills import same
+from tests.support.training import (
+    FPS,
+    HANDLINGS,
+    WAVES,
+    dataset,
+    epoch,
+    fresh,
+    handlings_set,
+    resumed,
+    trained,
+    waves_set,
+)
+from tpgmm_datasets import load_lerobot
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.exceptions import DataError
+
+LOSSES = ("likelihood", "imitation")
+
+
+@pytest.fixture(scope="module")
+def waves(tmp_path_factory):
+    return dataset(waves_set(tmp_path_factory.mktemp("waves") / "set"))
+
+
+@pytest.fixture(scope="module")
+def handlings(tmp_path_factory):
+    return dataset(handlings_set(tmp_path_factory.mktemp("handlings") / "set"))
+
+
+def gradient(policy, batch) -> dict[str, torch.Tensor]:
+    policy.zero_grad()
+    policy.forward(batch)[0].backward()
+    return {name: p.grad.clone() for name, p in policy.named_parameters()}
+
+
+def value(policy, batch) -> float:
+    return policy.forward(batch)[0].item()
+
+
+def whole(data) -> dict:
+    """All frames as one batch."""
+    return epoch(data, len(data))[0]
+
+
+# The gradient is that of the loss
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("fusion", ["information", "covariance"])
+def test_gradients_equal_finite_differences(handlings, loss, fusion):
+    policy = trained(handlings, loss=loss, fusion=fusion, activation="product", **HANDLINGS)
+    batch = epoch(handlings, 16)[0]
+    slopes = gradient(policy.train(), batch)
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in policy.named_parameters():
+        direction = torch.randn(parameter.shape, dtype=torch.float64, generator=generator)
+        step = 1e-5 * direction
+        with torch.no_grad():
+            parameter.add_(step)
+            above = value(policy, batch)
+            parameter.sub_(2 * step)
+            below = value(policy, batch)
+            parameter.add_(step)
+        expected = (above - below) / 2e-5
+        slope = float((slopes[name] * direction).sum())
+        scale = float(slopes[name].norm() * direction.norm())
+        assert scale > 0 and abs(slope - expected) < 1e-5 * scale, name
+
+
+# EM's solution
+
+
+def test_the_solution_of_em_is_stationary(waves, monkeypatch):
+    options = {**WAVES, "alignment": "none", "responsibilities": "point"}
+    policy = trained(waves, tol=1e-13, max_iter=5000, **options).train()
+    slopes = gradient(policy, whole(waves))
+    assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
+    # for the likelihood alone, regularised covariances are too large
+    monkeypatch.setattr(policy._learner, "_regularization", None)
+    slopes = gradient(policy, whole(waves))
+    factors = slopes.pop("mixture.factors.0")
+    assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
+    assert (factors.diagonal(dim1=-2, dim2=-1).sum(-1) > 1e-3).all()
+
+
+def test_the_loss_is_the_score_of_the_model(handlings):
+    policy = trained(handlings, alignment="none", **HANDLINGS)
+    score = policy.to_estimator().score(load_lerobot(handlings.root))
+    loss = value(policy, whole(handlings))
+    assert loss == pytest.approx(-score, rel=1e-9)
+
+
+# Training goes down, and is what the policy then does
+
+
+def train(policy, batches: list[dict], steps: int) -> list[float]:
+    """As lerobot-train does it, with the preset of the configuration."""
+    preset = policy.config.get_optimizer_preset()
+    optimizer = preset.build(policy.get_optim_params())
+    values = []
+    for batch in islice(cycle(batches), steps):
+        policy.train()
+        loss, _ = policy.forward(batch)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), preset.grad_clip_norm)
+        optimizer.step()
+        optimizer.zero_grad()
+        values.append(loss.item())
+    return values
+
+
+def test_the_likelihood_rises_where_em_stopped_early(waves):
+    options = {**WAVES, "alignment": "none", "responsibilities": "point"}
+    policy = fresh(waves, tol=10.0, optimizer_lr=1e-2, **options)
+    batch = whole(waves)
+    assert train(policy, [batch], 1) == [0.0]
+    start = value(policy.eval(), batch)
+    train(policy, [batch], 150)
+    best, end = value(trained(waves, **options), batch), value(policy.eval(), batch)
+    assert best + 0.1 < start and end < (start + best) / 2
+
+
+def test_the_imitation_error_falls_and_the_policy_acts_on_it(handlings, tmp_path):
+    options = {**HANDLINGS, "loss": "imitation", "n_components": 3, "blend": 0.0}
+    untrained = trained(handlings, **options)
+    policy = fresh(handlings, optimizer_lr=1e-3, **options)
+    assert train(policy, epoch(handlings, 32), 60)[:4] == [0.0] * 4
+    batch = whole(handlings)
+    error, before = (value(one.eval(), batch) for one in (policy, untrained))
+    assert error < 0.9 * before
+    start = {k: v[:1] for k, v in batch.items() if k.startswith("observation")}
+    [action, other] = [one.select_action(start) for one in (policy, untrained)]
+    assert not torch.equal(action, other)
+    policy.save_pretrained(tmp_path)
+    loaded = type(policy).from_pretrained(tmp_path)
+    assert torch.equal(loaded.select_action(start), action)
+    same(loaded.to_estimator(), policy.to_estimator())
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_a_run_that_is_resumed_goes_on_where_it_was(handlings, tmp_path, loss):
+    policy = trained(handlings, loss=loss, **HANDLINGS).train()
+    policy.save_pretrained(tmp_path)
+    again = resumed(tmp_path, handlings)
+    for batch in epoch(handlings, 32, seed=1):
+        assert value(again, batch) == 0
+    batch = epoch(handlings, 32, seed=2)[0]
+    assert value(again, batch) == pytest.approx(value(policy, batch), rel=1e-9)
+    same(again.to_estimator(), policy.to_estimator())
+
+
+def test_a_fitted_policy_can_be_evaluated_without_training(handlings, tmp_path):
+    policy = trained(handlings, alignment="linear", **HANDLINGS)
+    policy.save_pretrained(tmp_path)
+    batch = whole(handlings)
+    again = resumed(tmp_path, handlings).eval()
+    with torch.no_grad():
+        assert value(again, batch) == pytest.approx(value(policy, batch), rel=1e-9)
+
+
+def test_what_is_not_finite_is_refused(waves, tmp_path):
+    policy = trained(waves, **WAVES).train()
+    batch = epoch(waves, 16)[0]
+    with torch.no_grad():
+        policy.mixture.means[0][0, 0] = torch.inf
+    with pytest.raises(DataError, match=r"the likelihood loss is .*optimizer_lr"):
+        policy.forward(batch)
+    with pytest.raises(DataError, match=r"means\.0"):
+        policy.save_pretrained(tmp_path)
+    assert not (tmp_path / "model.safetensors").exists()
+
+
+def test_frames_are_those_of_the_beginning(handlings):
+    # a cup that is carried away: its pose now is not where the skill's frame is
+    policy = trained(handlings, **HANDLINGS).train()
+    batch = epoch(handlings, 32)[0]
+    poses = batch["observation.environment_state"].clone()
+    poses[:, :3] += 0.5 * (batch["timestamp"].reshape(-1, 1) > 0)
+    carried = {**batch, "observation.environment_state": poses}
+    loss = value(policy, batch)
+    assert value(policy, carried) == loss
+    policy.config.follow_frames = True
+    assert value(policy, batch) == loss != value(policy, carried)
+
+
+# Clocks
+
+
+def test_clocks():
+    episodes, steps = torch.tensor([0, 0, 1, 1]), torch.tensor([0, 3, 0, 4])
+    own = Clock({0: 5, 1: 9}, None, {}, 10.0)
+    assert own(episodes, steps).tolist() == [0.0, 0.3, 0.0, 0.4]
+    grid = np.linspace(0.0, 2.0, 5)
+    clock = Clock({0: 5, 1: 9}, grid, {0: np.array([0.0, 2.0, 3.0, 3.5, 4.0])}, 10.0)
+    assert clock(episodes, steps).tolist() == [0.0, 1.0, 0.0, 1.0]
+    assert clock(episodes, steps + 9).tolist() == [2.0] * 4
+
+
+def test_aligned_frames_stand_where_the_alignment_put_them(waves):
+    policy = trained(waves, **WAVES)
+    clock = policy._learner._clock
+    demonstrations = load_lerobot(waves.root)
+    aligner = DynamicTimeWarping().fit(demonstrations)
+    for number, (one, path) in enumerate(zip(demonstrations, aligner.paths_, strict=True)):
+        steps = torch.arange(len(one))
+        found = clock(torch.full_like(steps, number), steps)
+        # what the alignment plays at these times are the frames themselves
+        played = np.interp(found.numpy(), aligner.time_.numpy(), path.numpy())
+        np.testing.assert_allclose(played, steps.numpy(), atol=1e-9)
+        assert found[-1] == aligner.time_[-1] and len(aligner.time_) / FPS > found[-1]

@@ -1,0 +1,137 @@
+"""What the pages print is right: their Python runs, their commands work, and names exist."""
+
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import typer
+from packaging.requirements import Requirement
+from typer.testing import CliRunner
+
+from tpgmm_datasets import load_lerobot, save_lerobot
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import TASK, BottleShaking
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.cli.application import app
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    path
+    for path in (
+        ROOT / "README.md",
+        *sorted(ROOT.glob("policies/*.md")),
+        *sorted(ROOT.glob("docs/**/*.md")),
+    )
+    if not {"_build", "gallery", "comparison"} & set(path.relative_to(ROOT).parts)
+]
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+TARGETS = re.findall(r"^([a-z]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
+PROJECTS = {
+    project["name"]: project
+    for path in (ROOT / "pyproject.toml", ROOT / "policies" / "pyproject.toml")
+    for project in [tomllib.loads(path.read_text("utf-8"))["project"]]
+}
+
+
+def blocks(page: Path) -> Iterator[tuple[str, str]]:
+    """Language and text of the fenced blocks of a page, in order."""
+    yield from BLOCK.findall(page.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> Path:
+    """A folder with what ``tpgmm demo`` leaves: fewer steps, demonstrations and components."""
+    folder = tmp_path_factory.mktemp("pages")
+    skill = BottleShaking(rate=10)
+    path = folder / "out" / "demo" / "dataset"
+    save_lerobot(skill.demonstrations(5), path, fps=10, task=TASK, robot_type="upper_body")
+    demonstrations = load_lerobot(path, robot=skill.robot)
+    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
+    model = TaskParameterizedGMM(12, bottle_operators(), skill.robot).fit(aligned)
+    model.save(folder / "out" / "demo" / "model")
+    (folder / "robot.urdf").write_text(upper_body_urdf(), encoding="utf-8")
+    return folder
+
+
+def check_options(program: str, arguments: list[str]) -> None:
+    """Options of LeRobot's commands exist; other tests run them, which takes half a minute."""
+    from lerobot.configs.default import DatasetConfig, EvalConfig
+    from lerobot.configs.eval import EvalPipelineConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.envs import EnvConfig
+    from lerobot.robots import RobotConfig, so_follower
+    from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
+
+    from lerobot_policy_tpgmm import TPGMMConfig
+
+    assert so_follower  # registers the robot that the page uses
+    options = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
+    of_command = {
+        "lerobot-eval": EvalPipelineConfig,
+        "lerobot-train": TrainPipelineConfig,
+        "lerobot-rollout": RolloutConfig,
+    }
+    groups = {"policy": TPGMMConfig, "eval": EvalConfig, "dataset": DatasetConfig}
+    choices = {"env": EnvConfig, "robot": RobotConfig, "strategy": RolloutStrategyConfig}
+    for group, registry in choices.items():
+        if f"{group}.type" in options:
+            groups[group] = registry.get_choice_class(options[f"{group}.type"])
+    for option in options:
+        group, _, field = option.rpartition(".")
+        known = {f.name for f in fields(groups[group] if group else of_command[program])}
+        assert field in {*known, "type", "path"}, f"{program} has no option --{option}"
+
+
+def run(command: str) -> None:
+    """Do what a line of a shell would, as far as a test can."""
+    program, *arguments = shlex.split(command, comments=True)
+    if program == "make":
+        asked = {argument for argument in arguments if "=" not in argument}
+        assert asked <= set(TARGETS), f"no such target: {command}"
+    elif program == "pip":
+        for requirement in map(Requirement, arguments[1:]):
+            known = PROJECTS[requirement.name]["optional-dependencies"]
+            assert requirement.extras <= known.keys(), command
+    elif program == "python":
+        assert (ROOT / arguments[0]).is_file(), f"no such script: {command}"
+    elif program == "torchrun":
+        # test_processes.py starts processes: here one does what each would
+        run(shlex.join(arguments[arguments.index("--no-python") + 1 :]))
+    elif program.startswith("lerobot-"):
+        check_options(program, arguments)
+    elif program == "tpgmm" and arguments[0] in ("demo", "compare"):
+        # they take minutes, and other tests run them: here the options are only read
+        group = typer.main.get_command(app)
+        name, known, rest = group.resolve_command(typer.Context(group), arguments)
+        known.make_context(name, rest)
+    elif program == "tpgmm":
+        done = CliRunner().invoke(app, arguments)
+        assert done.exit_code == 0, f"{command}: {done.output}"
+    else:
+        raise AssertionError(f"a page prints {program!r}, which this test cannot check")
+
+
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if any(language != "text" for language, _ in blocks(page))],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
+def test_code_and_commands_of_a_page_run_from_top_to_bottom(page, demo, tmp_path, monkeypatch):
+    shutil.copytree(demo, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": page.stem}
+    for language, text in blocks(page):
+        if language == "python":
+            exec(compile(text, str(page), "exec"), names)
+        elif language == "bash":
+            for command in text.replace("\\\n", " ").splitlines():
+                run(command)
+        else:
+            assert language in ("text", "bibtex"), f"{page} has a block of {language}"

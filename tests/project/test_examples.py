@@ -1,0 +1,130 @@
+"""The gallery: every script runs, draws, and keeps what its text says."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "examples"
+SCRIPTS = sorted(path.name for path in FOLDER.glob("plot_*.py"))
+RECORDINGS = Path(__file__).parents[3] / "shared" / "data"
+
+#: For each script how many figures it draws, and what its text states, of its variables.
+CLAIMS = {
+    "plot_01_planar_arm.py": (1, lambda v: max(v["misses"]) < 2),
+    "plot_02_frames_without_a_robot.py": (
+        1,
+        lambda v: (
+            max(v["misses"]["both frames"]) < 10
+            and v["misses"]["box alone"][1] > 333
+            and v["misses"]["socket alone"][0] > 333
+        ),
+    ),
+    "plot_03_orientation_sign.py": (
+        1,
+        lambda v: (
+            max(v["errors"]["four plain numbers"]) > 90
+            and max(v["errors"]["an orientation"]) < 10
+            and max(v["degrees_off"](v["turning"](tilt)).max() for tilt in v["tilts"]) < 17
+        ),
+    ),
+    "plot_04_competing_constraints.py": (
+        1,
+        lambda v: v["shares"]["grasp"] < 0.05 and v["shares"]["shake"] > 0.5,
+    ),
+    "plot_05_two_hands.py": (
+        2,
+        lambda v: (
+            v["errors"]["stacked"][1] < 2
+            and v["errors"]["stacked"][2] < 0.1
+            and min(e[1] for name, e in v["errors"].items() if name != "stacked") > 35
+            and min(e[7] for name, e in v["errors"].items() if name != "stacked") > 5
+        ),
+    ),
+    "plot_06_choosing.py": (
+        1,
+        lambda v: (
+            v["best"] == "room and tray"
+            and v["errors"]["room and tray"][3] < 25
+            and min(v["errors"]["room"] + v["errors"]["tray"]) > 75
+            and v["errors"]["room and tray"][4] > 0.9 * v["errors"]["room and tray"][3]
+            and bool((np.diff(v["bic"])[:3] < 0).all())
+        ),
+    ),
+    "plot_07_lerobot_dataset.py": (1, lambda v: 0.5 < v["error"] / v["typical"] < 2),
+    "plot_08_alignment.py": (
+        1,
+        lambda v: (
+            max(s for n, s in v["spreads"].items() if "warped" in n)
+            < v["spreads"]["time stretched"] / 5
+        ),
+    ),
+    "plot_09_covariance_along_the_path.py": (
+        1,
+        lambda v: v["at_end"] > 3 * v["at_gate"] and 0.9 < v["ratio"] < 1.1,
+    ),
+    "plot_10_own_operator.py": (
+        1,
+        lambda v: (
+            v["errors"]["with the distance"] < 1
+            and v["errors"]["joints alone"] > 10
+            and abs(float(v["change"] - v["predicted"])) < 1e-9
+        ),
+    ),
+}
+
+
+@pytest.fixture
+def pyplot(monkeypatch):
+    """Figures are kept, not shown; there may be no display."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    monkeypatch.setattr(pyplot, "show", lambda: None)
+    pyplot.close("all")
+    yield pyplot
+    pyplot.close("all")
+
+
+def run(script, monkeypatch, *arguments):
+    """The variables of a script after it has run."""
+    monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
+    return runpy.run_path(str(FOLDER / script))
+
+
+def drawn(figure) -> bool:
+    """Whether there is more than background in a figure."""
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    return float((pixels < 250).any(axis=-1).mean()) > 0.02
+
+
+def test_the_gallery_has_the_examples_that_are_checked_here():
+    assert list(CLAIMS) == SCRIPTS
+    for script in SCRIPTS:
+        text = (FOLDER / script).read_text(encoding="utf-8")
+        assert "\n# %%\n" in text, script
+        title, underline = text.splitlines()[1:3]
+        assert underline == "=" * len(title), script
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_an_example_draws_and_its_text_is_true(script, pyplot, monkeypatch):
+    figures, holds = CLAIMS[script]
+    variables = run(script, monkeypatch)
+    assert holds(variables)
+    numbers = pyplot.get_fignums()
+    assert len(numbers) == figures
+    assert all(drawn(pyplot.figure(number)) for number in numbers)
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason="the recordings are not here")
+def test_a_real_recording_can_be_given(pyplot, monkeypatch):
+    variables = run("plot_07_lerobot_dataset.py", monkeypatch, RECORDINGS / "g1_bottle")
+    assert len(variables["demonstrations"]) == 10
+    assert 0 < variables["error"] < 1
+    assert drawn(pyplot.gcf())

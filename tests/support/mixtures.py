@@ -1,0 +1,194 @@
+"""Random regression problems, in our terms and in the oracles'."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tests.support import oracles
+from tests.support.oracles import Array
+from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    RobotState,
+    Stack,
+)
+from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.regression import Estimate, Regression
+
+Rows = Callable[[oracles.At], list[oracles.Row]]
+
+
+def random_local(rng: np.random.Generator, n_components: int, centre: Array) -> oracles.Local:
+    """Gaussians over time in [0, 2] s and coordinates around ``centre``, with correlations."""
+    size = 1 + len(centre)
+    means = 0.15 * rng.standard_normal((n_components, size))
+    means[:, 0] = rng.uniform(0, 2, n_components)
+    means[:, 1:] += centre
+    factors = rng.standard_normal((n_components, size, size)) / np.sqrt(size)
+    scale = np.diag([0.4] + [0.2] * (size - 1))
+    return oracles.Local(means, scale @ (factors @ factors.mT + 0.2 * np.eye(size)) @ scale)
+
+
+def local_mixture(local: oracles.Local) -> LocalMixture:
+    return LocalMixture.of(torch.from_numpy(local.means), torch.from_numpy(local.covariances))
+
+
+@dataclass(frozen=True)
+class Case:
+    """Operators in a world, with their rows of Table I."""
+
+    world: World
+    operators: Sequence[Operator]
+    rows: Rows
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A case at random states (of a batch) with a random mixture."""
+
+    case: Case
+    state: RobotState
+    frames: Mapping[str, Frame]
+    mixtures: list[oracles.Local]
+    weights: np.ndarray
+
+    @classmethod
+    def of(cls, case: Case, n_components: int, *batch: int, seed: int = 0) -> "Problem":
+        rng = np.random.default_rng([seed, n_components])
+        kinematics = case.world.kinematics
+        centre, around = case.world.scene(seed=seed)
+        # states around one, so that the same mixture is near all of them
+        near = 0.05 * rng.standard_normal((*batch, kinematics.n_joints))
+        joints = kinematics.retract(centre.joints + torch.from_numpy(near))
+        shift = torch.from_numpy(0.05 * rng.standard_normal((*batch, 3)))
+        pose = around[OBJECT]
+        frames = {OBJECT: Frame(pose.position + shift, pose.orientation.expand(*batch, 4))}
+        centres = [operator.coordinates(centre, around).numpy() for operator in case.operators]
+        mixtures = [random_local(rng, n_components, at) for at in centres]
+        weights = rng.dirichlet(3 * np.ones(n_components))
+        return cls(case, kinematics.state(joints), frames, mixtures, weights)
+
+    def regression(self, **options: Any) -> Regression:
+        mixtures = [local_mixture(local) for local in self.mixtures]
+        log_weights = torch.from_numpy(self.weights).log()
+        kinematics = self.case.world.kinematics
+        return Regression(kinematics, self.case.operators, mixtures, log_weights, **options)
+
+    def rows(self, index: tuple[int, ...] = ()) -> list[oracles.Row]:
+        return self.case.rows(self.at(index))
+
+    def at(self, index: tuple[int, ...] = ()) -> oracles.At:
+        here = {name: frame[index] for name, frame in self.frames.items()}
+        return self.case.world.at(self.state[index], here)
+
+    def answer(self, time: float, index: tuple[int, ...] = (), **how: Any) -> oracles.Answer:
+        at = self.at(index)
+        rows = self.case.rows(at)
+        return oracles.regress(time, at.joints, rows, self.mixtures, self.weights, **how)
+
+
+def times(*batch: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(9).uniform(0, 2, batch))
+
+
+def assert_close(actual: Tensor, expected: object, tolerance: float = 1e-8) -> None:
+    expected = torch.as_tensor(np.asarray(expected))
+    torch.testing.assert_close(actual, expected, rtol=tolerance, atol=tolerance)
+
+
+def assert_equal_estimates(a: Estimate, b: Estimate, tolerance: float = 1e-10) -> None:
+    assert_close(a.joints, b.joints, tolerance)
+    assert_close(a.covariance, b.covariance, tolerance)
+    assert_close(a.activation, b.activation, tolerance)
+    for one, other in zip(a.candidates, b.candidates, strict=True):
+        assert_close(one.mean, other.mean, tolerance)
+        assert_close(one.covariance, other.covariance, tolerance)
+        assert_close(one.share, other.share, tolerance)
+
+
+def pose_of(link: str, frame: str) -> Stack:
+    return Stack(RelativePosition(link, frame), RelativeOrientation(link, frame))
+
+
+def pose_rows(at: oracles.At, link: str, frame: str) -> list[oracles.Row]:
+    return [
+        oracles.relative_position(at, link, frame),
+        oracles.relative_orientation(at, link, frame),
+    ]
+
+
+BOTH_HANDS = Stack(pose_of(LEFT, OBJECT), pose_of(RIGHT, OBJECT))
+
+
+def both_hands(at: oracles.At) -> oracles.Row:
+    return oracles.stack(*pose_rows(at, LEFT, OBJECT), *pose_rows(at, RIGHT, OBJECT))
+
+
+CASES = {
+    "canonical": Case(OnRobot(), [Canonical()], lambda at: [oracles.canonical(at)]),
+    "both hands": Case(OnRobot(), [BOTH_HANDS], lambda at: [both_hands(at)]),
+    "the paper's": Case(
+        OnRobot(), [BOTH_HANDS, Canonical()], lambda at: [both_hands(at), oracles.canonical(at)]
+    ),
+    "positions": Case(
+        OnRobot(),
+        [Stack(RelativePosition(LEFT, OBJECT), AbsolutePosition(RIGHT)), Canonical()],
+        lambda at: [
+            oracles.stack(
+                oracles.relative_position(at, LEFT, OBJECT),
+                oracles.absolute_position(at, RIGHT),
+            ),
+            oracles.canonical(at),
+        ],
+    ),
+    "three": Case(
+        OnRobot(),
+        [RelativePosition(LEFT, OBJECT), pose_of(LEFT, RIGHT), Canonical()],
+        lambda at: [
+            oracles.relative_position(at, LEFT, OBJECT),
+            oracles.stack(*pose_rows(at, LEFT, RIGHT)),
+            oracles.canonical(at),
+        ],
+    ),
+    "two that leave joints free": Case(
+        OnRobot(),
+        [AbsolutePosition(LEFT), AbsoluteOrientation(RIGHT)],
+        lambda at: [
+            oracles.absolute_position(at, LEFT),
+            oracles.absolute_orientation(at, RIGHT),
+        ],
+    ),
+    "poses in two frames": Case(
+        OnPoses(),
+        [
+            BOTH_HANDS,
+            Stack(
+                AbsolutePosition(LEFT),
+                AbsoluteOrientation(LEFT),
+                AbsolutePosition(RIGHT),
+                AbsoluteOrientation(RIGHT),
+            ),
+            Canonical(),
+        ],
+        lambda at: [
+            both_hands(at),
+            oracles.stack(
+                oracles.absolute_position(at, LEFT),
+                oracles.absolute_orientation(at, LEFT),
+                oracles.absolute_position(at, RIGHT),
+                oracles.absolute_orientation(at, RIGHT),
+            ),
+            oracles.canonical(at),
+        ],
+    ),
+}

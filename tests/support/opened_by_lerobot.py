@@ -1,0 +1,103 @@
+"""Run by the test of the writer in a process of its own: LeRobot warns on import."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.datasets.compute_stats import compute_episode_stats
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from test_lerobot_writer import FPS, assert_same, demonstration
+
+from tpgmm_datasets import load_lerobot, save_lerobot
+from tpgmm_torch.data.demonstrations import Demonstration
+
+NUMBERS = ("episode_index", "index", "frame_index")
+
+
+def opened(root):
+    return LeRobotDataset("local/set", root=root)
+
+
+def pose(frame):
+    return torch.cat((frame.position, frame.orientation), dim=-1)
+
+
+def check_every_frame(root, demonstrations):
+    dataset = opened(root)
+    assert dataset.fps == FPS
+    assert dataset.num_episodes == len(demonstrations)
+    assert len(dataset) == sum(map(len, demonstrations))
+    row = 0
+    for episode, item in enumerate(demonstrations):
+        joints = item.joints.float()
+        for step in range(len(item)):
+            frame = dataset[row]
+            poses = torch.cat((pose(item.frames["bottle"]), pose(item.frames["hand"])[step]))
+            assert torch.equal(frame["observation.state"], joints[step])
+            assert torch.equal(frame["action"], joints[min(step + 1, len(item) - 1)])
+            assert torch.equal(frame["observation.environment_state"], poses.float())
+            assert bool(frame["event.close"]) == (step == len(item) // 2)
+            assert frame["timestamp"].item() == np.float32(step / FPS)
+            assert [frame[key].item() for key in NUMBERS] == [episode, row, step]
+            assert frame["task"] == "reach"
+            row += 1
+    return dataset
+
+
+def check_statistics(dataset):
+    """Equal to LeRobot's own, but for the quantiles, which it takes from histograms."""
+    features = dataset.meta.features
+    rows = dataset.hf_dataset.with_format("numpy")[:]
+    rows = {key: rows[key].reshape(len(dataset), -1) for key in features}
+    theirs = compute_episode_stats(rows, features)
+    for key in features:
+        for name in ("min", "max", "mean", "std", "count"):
+            ours = dataset.meta.stats[key][name]
+            assert np.allclose(ours, theirs[key][name], rtol=1e-4, atol=1e-5), (key, name)
+
+
+def record(dataset, item):
+    joints = item.joints.float().numpy()
+    for step, values in enumerate(joints):
+        following = joints[min(step + 1, len(item) - 1)]
+        dataset.add_frame({"observation.state": values, "action": following, "task": "reach"})
+    dataset.save_episode()
+
+
+def check_sets_of_lerobot(root, written):
+    """A set that LeRobot made is read, and grows by our hand and by theirs."""
+    names = list(written[0].joint_names)
+    vector = {"dtype": "float32", "shape": (len(names),), "names": names}
+    features = {"observation.state": vector, "action": vector}
+    made = LeRobotDataset.create(
+        "local/set", fps=FPS, features=features, root=root, use_videos=False
+    )
+    record(made, written[0])
+    record(made, written[1])
+    made.finalize()
+    save_lerobot(written[2:3], root, fps=FPS, task="reach", append=True)
+    assert len(opened(root)) == sum(map(len, written[:3]))
+    grown = LeRobotDataset.resume("local/set", root=root)
+    record(grown, written[3])
+    grown.finalize()
+    assert len(opened(root)) == sum(map(len, written))
+    for found, expected in zip(load_lerobot(root), written, strict=True):
+        assert_same(found, expected, 1e-6)
+
+
+def main(folder):
+    written = [demonstration(seed, length=20 + seed) for seed in range(4)]
+    root = save_lerobot(written, folder / "ours", fps=FPS, task="reach", file_megabytes=0.006)
+    assert len(list(root.glob("data/*/*.parquet"))) > 1
+    check_statistics(check_every_frame(root, written))
+    some = LeRobotDataset("local/set", root=root, episodes=[1, 3])
+    assert len(some) == len(written[1]) + len(written[3])
+    wide = save_lerobot(written, folder / "wide", fps=FPS, task="reach", dtype="float64")
+    check_every_frame(wide, written)
+    bare = [Demonstration(d.time, d.joints, {}, d.joint_names) for d in written]
+    check_sets_of_lerobot(folder / "theirs", bare)
+    print("all equal")
+
+
+main(Path(sys.argv[1]))

@@ -1,0 +1,61 @@
+"""Policies for tests: a small one of the paper's skill, and what it observes."""
+
+import copy
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.skills import bottle_demonstrations, small_bottle
+from tpgmm_torch import Demonstration, Frame, Situation
+
+STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
+
+
+@cache
+def fitted() -> TPGMMPolicy:
+    """Of :func:`small_bottle`; not to be changed."""
+    return TPGMMPolicy.from_estimator(small_bottle())
+
+
+def policy(**options: object) -> TPGMMPolicy:
+    return TPGMMPolicy.from_estimator(small_bottle(), **options)
+
+
+def pose(frame: Frame) -> Tensor:
+    return torch.cat([frame.position, frame.orientation], dim=-1)
+
+
+def batch(demonstrations: tuple[Demonstration, ...] | None = None) -> dict[str, Tensor]:
+    """What LeRobot observes at the starts of demonstrations, by default of two unseen ones."""
+    chosen = bottle_demonstrations()[5:7] if demonstrations is None else demonstrations
+    return {
+        STATE: torch.stack([d.joints[0] for d in chosen]).float(),
+        ENVIRONMENT: torch.stack([pose(d.frames["bottle"]) for d in chosen]).float(),
+    }
+
+
+def situations(observed: dict[str, Tensor], time: Tensor | None = None) -> list[Situation]:
+    """The same for ``model.predict``."""
+    return [
+        Situation(state.double(), {"bottle": Frame(at[:3].double(), at[3:].double())}, time)
+        for state, at in zip(observed[STATE], observed[ENVIRONMENT], strict=True)
+    ]
+
+
+def act(acting: TPGMMPolicy, observed: dict[str, Tensor], steps: int) -> Tensor:
+    """Actions (B, steps, n) as LeRobot asks for them."""
+    acting.reset()
+    with torch.inference_mode():
+        return torch.stack([acting.select_action(observed) for _ in range(steps)], dim=1)
+
+
+def changed(given: TPGMMPolicy, **fields: object) -> TPGMMPolicy:
+    """The same numbers under another configuration."""
+    config = copy.deepcopy(given.config)
+    for name, value in fields.items():
+        setattr(config, name, value)
+    other = TPGMMPolicy(config)
+    other.load_state_dict(given.state_dict())
+    return other.eval()

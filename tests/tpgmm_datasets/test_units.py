@@ -1,0 +1,91 @@
+import math
+
+import pytest
+import torch
+
+from tests.support.lerobot_sets import (
+    DATA,
+    NAMES,
+    Arm,
+    assert_equal,
+    change_info,
+    change_table,
+    joints_of,
+    set_column,
+    undeclared,
+    write,
+)
+from tpgmm_datasets import (
+    DatasetError,
+    Scale,
+    load_lerobot,
+)
+
+
+@pytest.fixture
+def root(tmp_path):
+    write(tmp_path / "set")
+    return tmp_path / "set"
+
+
+def test_degrees_become_radians(root):
+    expected = joints_of(load_lerobot(root))
+    undeclared(root, 180 / math.pi)
+    assert_equal(joints_of(load_lerobot(root, units="deg")), expected)
+    by_name = dict.fromkeys(NAMES, "deg")
+    assert_equal(joints_of(load_lerobot(root, units=by_name)), expected)
+
+
+def test_declared_units_are_believed(root):
+    expected = joints_of(load_lerobot(root))
+    undeclared(root, 180 / math.pi)
+    units = {"units": ["deg", "deg", "deg"]}
+    change_info(root, lambda i: i["features"]["observation.state"].update(info=units))
+    assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def test_a_unit_of_one_value_leaves_the_others(root):
+    plain = joints_of(load_lerobot(root))
+    found = joints_of(load_lerobot(root, units={"gripper": Scale(2.0, 1.0)}))
+    for a, b in zip(found, plain, strict=True):
+        torch.testing.assert_close(a[:, :2], b[:, :2])
+        torch.testing.assert_close(a[:, 2], 2 * b[:, 2] + 1)
+
+
+def test_values_that_cannot_be_radians_are_refused_until_said_what_they_are(root):
+    undeclared(root, 1000)
+    with pytest.raises(
+        DatasetError, match=r"not radians: 'left_elbow' .*units='deg'"
+    ) as caught:
+        load_lerobot(root)
+    assert caught.value.column == "observation.state"
+    assert caught.value.file == DATA
+    raw = joints_of(load_lerobot(root, units="raw"))
+    assert max(float(joints.abs().max()) for joints in raw) > 4 * math.pi
+
+
+def test_values_that_are_no_joints_of_the_robot_need_no_unit(root):
+    def percent(values):
+        return values * [1, 1, 1000]
+
+    change_table(root, DATA, lambda t: set_column(t, "observation.state", percent))
+    change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
+    seen = []
+    load_lerobot(
+        root,
+        robot=Arm("left_elbow", "right_elbow"),
+        events={"largest": lambda d: seen.append(d) or float(d.time[d.joints[:, 2].argmax()])},
+    )
+    assert seen[0].joint_names == NAMES
+
+
+def test_scales_take_the_ends_of_a_range_to_each_other():
+    scale = Scale.between((-100, 100), (-1.0, 3.0))
+    assert [scale.factor * x + scale.offset for x in (-100, 0, 100)] == [-1.0, 1.0, 3.0]
+    calibrated = Scale.calibrated(1024, 3072)
+    ends = [calibrated.factor * x + calibrated.offset for x in (-100, 100)]
+    assert ends == pytest.approx([-math.pi / 2, math.pi / 2])
+    ticks = Scale.ticks(4096, zero=2048)
+    assert ticks.factor * 3072 + ticks.offset == pytest.approx(math.pi / 2)
+    with pytest.raises(DatasetError, match="two different ends"):
+        Scale.between((1, 1), (0, 1))

@@ -1,0 +1,306 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
+from tpgmm_datasets import writer as writer_module
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+
+FPS = 50
+
+
+def unit(rng, *shape):
+    values = rng.normal(size=(*shape, 4))
+    return values / np.linalg.norm(values, axis=-1, keepdims=True)
+
+
+def demonstration(seed=0, length=20, n_joints=3, event=True):
+    rng = np.random.default_rng(seed)
+    frames = {
+        "bottle": Frame(rng.normal(size=3), unit(rng)),
+        "hand": Frame(rng.normal(size=(length, 3)), unit(rng, length)),
+    }
+    return Demonstration(
+        np.arange(length) / FPS,
+        rng.normal(size=(length, n_joints)),
+        frames,
+        [f"joint_{i}" for i in range(n_joints)],
+        {"close": (length // 2) / FPS} if event else {},
+    )
+
+
+def assert_same(found, expected, tolerance):
+    options = {"rtol": 0.0, "atol": tolerance}
+    assert found.joint_names == expected.joint_names
+    assert dict(found.events) == pytest.approx(dict(expected.events), abs=1e-12)
+    torch.testing.assert_close(found.time, expected.time - expected.time[0], **options)
+    torch.testing.assert_close(found.joints, expected.joints, **options)
+    assert list(found.frames) == list(expected.frames)
+    for name, frame in expected.frames.items():
+        for part in ("position", "orientation"):
+            values = torch.broadcast_to(
+                getattr(frame, part), (len(expected), *getattr(frame, part).shape[-1:])
+            )
+            other = torch.broadcast_to(getattr(found.frames[name], part), values.shape)
+            torch.testing.assert_close(other, values, **options)
+
+
+def read_info(root):
+    return json.loads((root / "meta" / "info.json").read_text())
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("float64", 4e-16)])
+def test_write_then_read_is_the_identity(tmp_path, dtype, tolerance):
+    written = [demonstration(seed, length=10 + 3 * seed) for seed in range(4)]
+    root = save_lerobot(written, tmp_path / "set", fps=FPS, task="reach", dtype=dtype)
+    read = load_lerobot(root)
+    for found, expected in zip(read, written, strict=True):
+        assert_same(found, expected, tolerance)
+        assert found.frames["bottle"].batch_shape == ()
+        assert found.frames["hand"].batch_shape == (len(expected),)
+
+
+NAMES = st.text(st.characters(codec="utf-8", exclude_categories=["Cs"]), min_size=1, max_size=9)
+
+
+@settings(deadline=None, max_examples=25)
+@given(
+    lengths=st.lists(st.integers(1, 40), min_size=1, max_size=5),
+    names=st.one_of(st.none(), st.lists(NAMES, min_size=3, max_size=3, unique=True)),
+    frames=st.lists(NAMES, max_size=3, unique=True),
+    fps=st.integers(1, 500),
+    start=st.sampled_from([0.0, 3.5]),
+)
+def test_identity_over_lengths_names_and_rates(
+    tmp_path_factory, lengths, names, frames, fps, start
+):
+    rng = np.random.default_rng(sum(lengths))
+    written = [
+        Demonstration(
+            start + np.arange(length) / fps,
+            rng.normal(size=(length, 3)),
+            {name: Frame(rng.normal(size=3), unit(rng)) for name in frames},
+            names,
+        )
+        for length in lengths
+    ]
+    root = tmp_path_factory.mktemp("sets") / "set"
+    save_lerobot(written, root, fps=fps, task="x", dtype="float64", file_megabytes=0.002)
+    for found, expected in zip(load_lerobot(root), written, strict=True):
+        assert_same(found, expected, 1e-12)
+
+
+def test_action_is_the_next_joint_reference(tmp_path):
+    root = save_lerobot([demonstration()], tmp_path / "set", fps=FPS, task="reach")
+    table = pq.read_table(root / "data" / "chunk-000" / "file-000.parquet")
+    state = np.stack(table["observation.state"].to_numpy())
+    action = np.stack(table["action"].to_numpy())
+    assert (action[:-1] == state[1:]).all()
+    assert (action[-1] == state[-1]).all()
+
+
+def test_actions_are_the_references_that_were_given(tmp_path):
+    first, second = (
+        demonstration(0),
+        demonstration(1).reordered(["joint_2", "joint_0", "joint_1"]),
+    )
+    references = [motion.joints + 0.5 for motion in (first, second)]
+    root = save_lerobot(
+        [first, second], tmp_path / "set", fps=FPS, task="reach", actions=references
+    )
+    for key, shift in (("observation.state", 0.0), ("action", 0.5)):
+        found = load_lerobot(root, joints=key)
+        for read, written in zip(found, (first, second), strict=True):
+            expected = written.reordered(read.joint_names).joints + shift
+            torch.testing.assert_close(read.joints, expected, rtol=0, atol=1e-6)
+
+
+def test_actions_that_do_not_fit_are_refused(tmp_path):
+    motion = demonstration()
+    for actions, message in (
+        ([], "actions of 0 and joints of 1"),
+        ([motion.joints[:, :2]], "joint_names needs 2"),
+        ([motion.joints[:5]], "T = 20"),
+        ([motion.joints * np.nan], "NaN"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_lerobot([motion], tmp_path / "set", fps=FPS, task="reach", actions=actions)
+    unnamed = Demonstration(motion.time, motion.joints)
+    with pytest.raises(DatasetError, match="3 joints and actions of 2"):
+        save_lerobot(
+            [unnamed], tmp_path / "set", fps=FPS, task="reach", actions=[motion.joints[:, :2]]
+        )
+    assert not (tmp_path / "set").exists()
+
+
+def test_many_episodes_are_split_into_files_and_chunks(tmp_path):
+    written = [demonstration(seed) for seed in range(12)]
+    root = save_lerobot(
+        written, tmp_path / "set", fps=FPS, task="reach", file_megabytes=0.006, chunk_files=3
+    )
+    files = sorted(root.glob("data/*/*.parquet"))
+    assert len(files) > 3
+    assert {len(list(chunk.iterdir())) for chunk in sorted(root.glob("data/*"))[:-1]} == {3}
+    for found, expected in zip(load_lerobot(root), written, strict=True):
+        assert_same(found, expected, 1e-6)
+
+
+def test_episodes_without_an_event_read_back_without_it(tmp_path):
+    written = [demonstration(0), demonstration(1, event=False)]
+    root = save_lerobot(written, tmp_path / "set", fps=FPS, task="reach")
+    assert [dict(d.events) for d in load_lerobot(root)] == [{"close": 0.2}, {}]
+
+
+def test_joints_in_another_order_are_written_in_the_order_of_the_first(tmp_path):
+    first, second = demonstration(0), demonstration(1)
+    turned = second.reordered(second.joint_names[::-1])
+    root = save_lerobot([first, turned], tmp_path / "set", fps=FPS, task="reach")
+    assert_same(load_lerobot(root)[1], second, 1e-6)
+
+
+def test_append_adds_episodes_tasks_and_statistics(tmp_path):
+    written = [demonstration(seed, length=10 + seed) for seed in range(5)]
+    once = save_lerobot(written, tmp_path / "once", fps=FPS, task=["a", "a", "b", "b", "a"])
+    root = tmp_path / "twice"
+    save_lerobot(written[:2], root, fps=FPS, task="a", append=True)
+    save_lerobot(written[2:], root, fps=FPS, task=["b", "b", "a"], append=True)
+    for found, expected in zip(load_lerobot(root), written, strict=True):
+        assert_same(found, expected, 1e-6)
+    assert len(load_lerobot(root, episodes="b")) == 2
+    assert read_info(root) == read_info(once)
+    both = [json.loads((r / "meta" / "stats.json").read_text()) for r in (root, once)]
+    for key, column in both[1].items():
+        for name, values in column.items():
+            assert both[0][key][name] == pytest.approx(values), (key, name)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fps": 25}, "not sampled at 25 Hz"),
+        ({"fps": 12.5}, "whole number"),
+        ({"task": ["a", "b"]}, "one per demonstration"),
+        ({"task": ""}, "not empty"),
+        ({"dtype": "float16"}, "dtype"),
+        ({"file_megabytes": 0}, "file_megabytes"),
+    ],
+)
+def test_wrong_arguments_are_refused_and_leave_nothing(tmp_path, change, message):
+    arguments = {"fps": FPS, "task": "reach", **change}
+    with pytest.raises(DatasetError, match=message):
+        save_lerobot([demonstration()], tmp_path / "set", **arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_not_overwritten(tmp_path):
+    with pytest.raises(DatasetError, match="append=True"):
+        save_lerobot([demonstration()], tmp_path, fps=FPS, task="reach")
+
+
+def test_values_beyond_float32_are_refused(tmp_path):
+    large = Demonstration([0.0, 0.02], [[1e39], [0.0]])
+    with pytest.raises(DatasetError, match="range of float32"):
+        save_lerobot([large], tmp_path / "set", fps=FPS, task="reach")
+
+
+@pytest.mark.parametrize(
+    ("other", "arguments", "message"),
+    [
+        (demonstration(n_joints=4), {}, "shape"),
+        (demonstration(), {"dtype": "float64"}, "dtype"),
+        (demonstration(), {"robot_type": "other"}, "robot_type"),
+        (Demonstration(np.arange(9) / FPS, np.zeros((9, 3)), {}, list("abc")), {}, "features"),
+    ],
+)
+def test_append_refuses_what_does_not_fit(tmp_path, other, arguments, message):
+    root = save_lerobot([demonstration()], tmp_path / "set", fps=FPS, task="reach")
+    before = {p: p.read_bytes() for p in root.rglob("*") if p.is_file()}
+    with pytest.raises(DatasetError, match=message):
+        save_lerobot([other], root, fps=FPS, task="reach", append=True, **arguments)
+    assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
+
+
+@pytest.mark.parametrize("stage", ["_episode", "_flush", "_tables"])
+@pytest.mark.parametrize("append", [False, True])
+def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, stage, append):
+    root = tmp_path / "set"
+    old = [demonstration(0)]
+    if append:
+        save_lerobot(old, root, fps=FPS, task="reach")
+
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(writer_module._Writer, stage, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
+    assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])
+    if append:
+        assert_same(load_lerobot(root)[0], old[0], 1e-6)
+
+
+def test_a_failed_exchange_brings_the_old_set_back(tmp_path, monkeypatch):
+    root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
+    rename = Path.rename
+
+    def failing(path, target):
+        if path.suffix == ".partial":
+            raise OSError("no space left on device")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(OSError, match="no space"):
+        save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    assert_same(load_lerobot(root)[0], demonstration(0), 1e-6)
+
+
+def test_an_exchange_that_was_killed_is_pointed_out(tmp_path):
+    root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
+    root.rename(tmp_path / ".set.0123.previous")
+    with pytest.raises(DatasetError, match=r"interrupted.*\.set\.0123\.previous"):
+        load_lerobot(root)
+
+
+def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
+    environment = {
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(tmp_path / "hub"),
+        "OMP_NUM_THREADS": "1",
+        "CUDA_VISIBLE_DEVICES": "",
+    }
+    script = Path(__file__).parents[1] / "support" / "opened_by_lerobot.py"
+    command = [sys.executable, str(script), str(tmp_path)]
+    result = subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert "all equal" in result.stdout
+
+
+def test_units_that_are_no_angles_are_declared_and_read_back(tmp_path):
+    time = np.arange(5) / 10
+    values = np.stack((np.linspace(0, 1, 5), np.linspace(0, 90, 5)), axis=1)
+    demonstration = Demonstration(time, values, joint_names=("elbow", "gripper"))
+    with pytest.raises(DatasetError, match="units gives 'finger' the unit 'raw'"):
+        save_lerobot([demonstration], tmp_path / "a", fps=10, task="t", units={"finger": "raw"})
+    with pytest.raises(DatasetError, match="the unit 'ticks'"):
+        save_lerobot(
+            [demonstration], tmp_path / "a", fps=10, task="t", units={"elbow": "ticks"}
+        )
+    save_lerobot([demonstration], tmp_path / "a", fps=10, task="t", units={"gripper": "raw"})
+    info = json.loads((tmp_path / "a" / "meta" / "info.json").read_text())
+    assert info["features"]["observation.state"]["info"]["units"] == ["rad", "raw"]
+    [found] = load_lerobot(tmp_path / "a")
+    np.testing.assert_allclose(found.joints, values, rtol=1e-6)

@@ -1,0 +1,399 @@
+"""Laws of the alignment in time, on generated demonstrations whose true phase is known."""
+
+import pickle
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.base import clone
+from sklearn.pipeline import Pipeline
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    NotFittedError,
+    ShapeError,
+    UnknownNameError,
+)
+from tpgmm_torch.robots.tracked_poses import Poses
+
+NOMINAL = 13.0
+EVENTS = {"grasped": 3.0, "shake": 8.0, "rest": 12.0}
+
+
+def ease(s, start, end):
+    u = np.clip((s - start) / (end - start), 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def motion(s, start, goal):
+    """Reach until 3, hold until 5, bring until 8, shake two joints at 1 Hz until 12."""
+    joints = start + np.outer(ease(s, 0, 3), goal) - np.outer(ease(s, 5, 8), 0.6 * goal)
+    envelope = ease(s, 8, 8.6) * (1 - ease(s, 11.4, 12))
+    joints[:, 2:4] += (0.25 * envelope * np.sin(2 * np.pi * (s - 8)))[:, None]
+    return joints
+
+
+def random_clock(rng, duration, rate=100.0, strength=0.15):
+    """Time and the nominal phase s(t) reached: smooth, increasing, both ends fixed."""
+    time = np.arange(round(duration * rate) + 1) / rate
+    u = time / time[-1]
+    speed = np.ones_like(u)
+    for k in (1, 2, 3):
+        speed += strength * rng.uniform(-1, 1) * np.cos(np.pi * k * u + rng.uniform(0, 6))
+    phase = np.concatenate(([0], np.cumsum((speed[1:] + speed[:-1]) / 2)))
+    return time, NOMINAL * phase / phase[-1]
+
+
+def generate(n=10, seed=0, rate=100.0):
+    """Demonstrations and the true phase at each of their time steps."""
+    rng = np.random.default_rng(seed)
+    goal = np.array([0.8, -0.5, 0.6, 0.7, 1.0])
+    demonstrations, phases = [], []
+    for scale in rng.permutation(np.linspace(0.85, 1.15, n)):
+        time, phase = random_clock(rng, NOMINAL * scale, rate)
+        own = goal + rng.uniform(-0.1, 0.1, 5)
+        joints = motion(phase, rng.uniform(-0.05, 0.05, 5), own)
+        events = {name: np.interp(s, phase, time) for name, s in EVENTS.items()}
+        frames = {"bottle": Frame(rng.uniform(-0.2, 0.2, 3))}
+        demonstrations.append(Demonstration(time, joints, frames, tuple("abcde"), events))
+        phases.append(phase)
+    return demonstrations, phases
+
+
+DEMONSTRATIONS, PHASES = generate()
+
+
+class Arm:
+    """What the alignment needs of a robot, and nothing else: two links of a planar arm."""
+
+    links = ("elbow", "hand")
+
+    def state(self, joints):
+        turn = joints[:, 0] + joints[:, 2]
+        elbow = torch.stack((joints[:, 0].cos(), joints[:, 0].sin(), 0 * turn), 1)
+        hand = elbow + torch.stack((turn.cos(), turn.sin(), joints[:, 4]), 1)
+        return SimpleNamespace(position=lambda link: {"elbow": elbow, "hand": hand}[link])
+
+
+def spread_of_shake(paths):
+    """Standard deviation between demonstrations of the shake's phase [rad], worst instant."""
+    reached = [
+        np.interp(path.numpy(), np.arange(len(phase)), phase)
+        for path, phase in zip(paths, PHASES, strict=True)
+    ]
+    shaking = np.all([(s > 8.2) & (s < 11.8) for s in reached], axis=0)
+    assert shaking.sum() > 100
+    return 2 * np.pi * np.std(reached, axis=0)[shaking].max()
+
+
+def spread_of_events(aligned):
+    return {name: np.std([d.events[name] for d in aligned]) for name in EVENTS}
+
+
+@pytest.fixture(scope="module")
+def linear():
+    transformer = LinearTimeNormalization()
+    return transformer, transformer.fit_transform(DEMONSTRATIONS)
+
+
+@pytest.fixture(scope="module", params=["joints", "robot", "barycenter"])
+def warped(request):
+    transformer = DynamicTimeWarping(
+        "barycenter" if request.param == "barycenter" else "medoid",
+        robot=Arm() if request.param == "robot" else None,
+        n_iter=4,
+    )
+    return transformer, transformer.fit_transform(DEMONSTRATIONS)
+
+
+def test_warping_lowers_the_spread_of_the_shake_tenfold(linear, warped):
+    before, after = spread_of_shake(linear[0].paths_), spread_of_shake(warped[0].paths_)
+    assert after < before / 10
+
+
+def test_events_of_the_motion_come_together(linear, warped):
+    before, after = spread_of_events(linear[1]), spread_of_events(warped[1])
+    assert all(after[name] < before[name] / 4 for name in EVENTS)
+    assert after["shake"] < 0.05 and after["rest"] < 0.05
+
+
+def test_all_results_share_one_increasing_clock(warped):
+    transformer, aligned = warped
+    assert all(torch.equal(d.time, transformer.time_) for d in aligned)
+    assert (transformer.time_.diff() > 0).all()
+    assert transformer.time_.dtype == torch.float64
+
+
+def test_paths_increase_and_keep_both_ends(warped):
+    for path, demonstration in zip(warped[0].paths_, DEMONSTRATIONS, strict=True):
+        assert (path.diff() > 0).all()
+        assert path[0] == pytest.approx(0, abs=1e-9)
+        assert path[-1] == pytest.approx(len(demonstration) - 1, abs=1e-9)
+
+
+def test_warped_joints_have_no_bursts_of_speed(warped):
+    for aligned, own in zip(warped[1], DEMONSTRATIONS, strict=True):
+        fastest = (own.joints.diff(dim=0) / own.time.diff()[:, None]).abs().max()
+        assert (aligned.joints.diff(dim=0) / 0.01).abs().max() < 1.5 * fastest
+
+
+def test_names_constant_frames_and_inputs_stay(warped):
+    for aligned, own in zip(warped[1], DEMONSTRATIONS, strict=True):
+        assert aligned.joint_names == own.joint_names
+        assert aligned.frames["bottle"] is own.frames["bottle"]
+    again, _ = generate()
+    for own, fresh in zip(DEMONSTRATIONS, again, strict=True):
+        assert torch.equal(own.joints, fresh.joints) and own.events == fresh.events
+
+
+def test_transform_repeats_what_fit_transform_gave(warped):
+    transformer, aligned = warped
+    for one, other in zip(transformer.transform(DEMONSTRATIONS[:3]), aligned, strict=False):
+        torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-12)
+
+
+def test_the_reference_is_recovered_exactly():
+    transformer = DynamicTimeWarping(reference=2, robot=Arm())
+    aligned = transformer.fit_transform(DEMONSTRATIONS[:4])
+    own = DEMONSTRATIONS[2]
+    assert transformer.reference_ is own and transformer.reference_index_ == 2
+    torch.testing.assert_close(aligned[2].joints, own.joints, rtol=0, atol=1e-11)
+    assert torch.equal(aligned[2].time, own.time)
+    assert dict(aligned[2].events) == pytest.approx(dict(own.events), abs=1e-9)
+    assert transformer.distortions_[2] < 1e-9
+    assert (np.delete(transformer.distortions_, 2) > 0.01).all()
+
+
+@settings(max_examples=15)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    scale=st.floats(0.6, 1.6),
+    rate=st.sampled_from([60.0, 100.0]),
+)
+def test_a_time_warped_copy_is_recovered(seed, scale, rate):
+    rng = np.random.default_rng(seed)
+    start, goal = rng.uniform(-0.3, 0.3, 5), rng.uniform(0.5, 1.0, 5)
+    even = np.linspace(0, NOMINAL, 1301)
+    original = Demonstration(even, motion(even, start, goal))
+    time, phase = random_clock(rng, NOMINAL * scale, rate)
+    copy = Demonstration(time, motion(phase, start, goal))
+    # copies match exactly in joint space; directions and penalty are for those that do not
+    transformer = DynamicTimeWarping(reference=0, features=["joints"], penalty=0.0)
+    aligned = transformer.fit_transform([original, copy])[1]
+    assert (aligned.joints - original.joints).abs().max() < 0.02
+    moving = ((even > 0.8) & (even < 2.2)) | ((even > 8.4) & (even < 11.6))
+    reached = np.interp(transformer.paths_[1].numpy(), np.arange(len(phase)), phase)
+    assert np.abs(reached - even)[moving].max() < 0.05
+
+
+def test_the_barycenter_represents_all_better_than_any_one_of_them():
+    medoid = DynamicTimeWarping().fit(DEMONSTRATIONS)
+    average = DynamicTimeWarping("barycenter", n_iter=4).fit(DEMONSTRATIONS)
+    assert np.sqrt((average.distortions_**2).mean()) < 0.95 * np.sqrt(
+        (medoid.distortions_**2).mean()
+    )
+    assert average.reference_.shape[0] == len(average.time_) == len(medoid.time_)
+    durations = [d.duration for d in DEMONSTRATIONS]
+    assert float(average.time_[-1]) == pytest.approx(np.mean(durations), rel=1e-9)
+
+
+def test_the_medoid_is_the_one_in_the_middle():
+    even = np.linspace(0, 1, 80)
+    family = [
+        Demonstration(even, np.stack((np.sin(5 * even) + c * even, even), 1))
+        for c in (-1.0, 1.0, 0.0, 2.0, -2.0)
+    ]
+    assert DynamicTimeWarping().fit(family).reference_index_ == 2
+
+
+def turning(time, phase):
+    """One rotating frame and one hand pose, both a function of the phase in [0, 1]."""
+    angle = torch.from_numpy(2.5 * phase)
+    turn = quaternions.exp(angle[:, None] * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64))
+    place = np.stack((np.sin(3 * phase), phase, phase**2), 1)
+    poses = torch.cat((torch.from_numpy(place), turn), 1)
+    return Demonstration(
+        time, poses, {"moving": Frame(place, turn)}, Poses(["hand"]).joint_names
+    )
+
+
+def test_the_sign_of_recorded_quaternions_does_not_matter():
+    time = np.linspace(0, 2, 120)
+    one, other = turning(time, time / 2), turning(time, (time / 2) ** 1.2)
+    flipped = torch.cat((other.joints[:, :3], -other.joints[:, 3:]), 1)
+    negative = Demonstration(time, flipped, other.frames, other.joint_names)
+    same, opposite = (
+        DynamicTimeWarping(0, robot=Poses(["hand"])).fit([one, d]).paths_[1]
+        for d in (other, negative)
+    )
+    torch.testing.assert_close(same, opposite, rtol=0, atol=1e-9)
+
+
+def test_units_do_not_decide_but_weights_do():
+    rng = np.random.default_rng(3)
+    family = DEMONSTRATIONS[:3]
+    milli = [Demonstration(d.time, d.joints * 1000, d.frames) for d in family]
+    paths = [DynamicTimeWarping(0, n_steps=200).fit(x).paths_[1] for x in (family, milli)]
+    torch.testing.assert_close(*paths, rtol=0, atol=1e-9)
+    noise = [Demonstration(d.time, rng.normal(size=(len(d), 5)), d.frames) for d in family]
+    with_weight = DynamicTimeWarping(weights={"directions": 0}).fit(noise)
+    assert with_weight.feature_names_ == ("joints",)
+
+
+def test_features_are_named_and_constant_ones_left_out():
+    transformer = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
+    assert transformer.feature_names_ == ("joints", "directions", "elbow", "hand")
+    chosen = ["hand in bottle", "joints"]
+    transformer = DynamicTimeWarping(0, features=chosen, robot=Arm()).fit(DEMONSTRATIONS[:2])
+    assert transformer.feature_names_ == tuple(chosen)
+    still = [
+        Demonstration(d.time, d.joints * torch.tensor([0.0, 1, 0, 1, 1]), d.frames)
+        for d in DEMONSTRATIONS[:2]
+    ]
+    assert "elbow" not in DynamicTimeWarping(0, robot=Arm()).fit(still).feature_names_
+
+
+def test_an_open_end_matches_the_best_prefix():
+    even = np.linspace(0, 8, 801)
+    short = Demonstration(even, motion(even, np.zeros(5), np.ones(5)))
+    time, phase = random_clock(np.random.default_rng(5), 13.0)
+    events = {name: np.interp(s, phase, time) for name, s in (("early", 6.5), ("late", 12.0))}
+    whole = Demonstration(time, motion(phase, np.zeros(5), np.ones(5)), events=events)
+    open_end = DynamicTimeWarping(0, features=["joints"], penalty=0.0, open_end=True)
+    aligned = open_end.fit_transform([short, whole])[1]
+    assert (aligned.joints - short.joints).abs().max() < 0.02
+    assert np.interp(open_end.paths_[1][-1], np.arange(len(phase)), phase) < 8.3
+    assert aligned.events["early"] == pytest.approx(6.5, abs=0.05)
+    assert "late" not in aligned.events
+    closed = DynamicTimeWarping(0).fit_transform([short, whole])[1]
+    assert (closed.joints - short.joints).abs().max() > 0.1
+
+
+def test_the_window_bounds_the_difference_from_linear_normalization():
+    transformer = DynamicTimeWarping(window=0.02, smoothing=0).fit(DEMONSTRATIONS)
+    free = DynamicTimeWarping(smoothing=0).fit(DEMONSTRATIONS)
+
+    def deviation(fitted):
+        return max(
+            np.abs(path.numpy() / path[-1].item() - np.linspace(0, 1, len(path))).max()
+            for path in fitted.paths_
+        )
+
+    assert deviation(transformer) < 0.0205 < deviation(free)
+
+
+def test_a_window_too_narrow_for_an_open_end_names_the_smallest():
+    even = np.linspace(0, 10, 501)
+    long = Demonstration(even, np.sin(even)[:, None])
+    short = Demonstration(even[:401], np.sin(even[:401])[:, None])
+    with pytest.raises(DataError, match=r"smallest possible is 0\.2000"):
+        DynamicTimeWarping(0, open_end=True, window=0.1).fit([long, short])
+    DynamicTimeWarping(0, open_end=True, window=0.2).fit([long, short])
+
+
+@pytest.mark.parametrize("reference", ["medoid", "barycenter", 0, -1])
+def test_one_demonstration_alone_stays_itself(reference):
+    own = DEMONSTRATIONS[0]
+    [aligned] = DynamicTimeWarping(reference).fit_transform([own])
+    torch.testing.assert_close(aligned.joints, own.joints, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
+def test_n_steps_sets_the_grid(transformer):
+    aligned = clone(transformer).set_params(n_steps=57).fit_transform(DEMONSTRATIONS[:2])
+    assert [len(d) for d in aligned] == [57, 57]
+    torch.testing.assert_close(aligned[0].time.diff(), aligned[0].time.diff()[:1].expand(56))
+
+
+def test_float32_and_uneven_sampling_are_kept():
+    own = DEMONSTRATIONS[0]
+    keep = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(own))[:700]))
+    keep[0], keep[-1] = 0, len(own) - 1
+    uneven = Demonstration(own.time[keep].float(), own.joints[keep].float(), own.frames)
+    transformer = DynamicTimeWarping(1)
+    aligned = transformer.fit_transform([uneven, own])
+    assert aligned[0].joints.dtype == aligned[0].time.dtype == torch.float32
+    assert (aligned[0].joints - own.joints).abs().max() < 0.02
+
+
+def test_joints_are_brought_into_the_order_of_the_first():
+    first, second = DEMONSTRATIONS[:2]
+    swapped = second.reordered(tuple("edcba"))
+    expected = DynamicTimeWarping(0).fit_transform([first, second])[1]
+    given_swapped = DynamicTimeWarping(0).fit_transform([first, swapped])[1]
+    assert given_swapped.joint_names == first.joint_names
+    torch.testing.assert_close(given_swapped.joints, expected.joints, rtol=0, atol=0)
+
+
+def test_it_is_a_transformer_of_scikit_learn():
+    transformer = DynamicTimeWarping("barycenter", weights={"joints": 2.0}, n_steps=100)
+    copy = clone(transformer)
+    assert copy.get_params() == transformer.get_params()
+    fitted = pickle.loads(pickle.dumps(transformer.fit(DEMONSTRATIONS[:2])))
+    [aligned] = Pipeline([("align", fitted)]).transform(DEMONSTRATIONS[:1])
+    assert len(aligned) == 100
+    situations = [Situation(torch.zeros(5))]
+    assert fitted.transform(situations) == situations
+
+
+@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
+def test_errors_say_what_is_wrong_with_the_input(transformer):
+    with pytest.raises(NotFittedError, match="call fit"):
+        clone(transformer).transform(DEMONSTRATIONS)
+    for wrong in (DEMONSTRATIONS[0], [], [1], 5):
+        with pytest.raises(DataError, match="expected"):
+            clone(transformer).fit_transform(wrong)
+    with pytest.raises(DataError, match="one time step"):
+        clone(transformer).fit([Demonstration([0.0], [[1.0]])])
+    fitted = clone(transformer).fit(DEMONSTRATIONS[:2])
+    with pytest.raises(UnknownNameError, match="'a' is not in the demonstration"):
+        fitted.transform([Demonstration([0.0, 1.0], np.eye(2), joint_names=("x", "y"))])
+    with pytest.raises(ShapeError, match="the robot has 7"):
+        clone(transformer).set_params(robot=Poses(["hand"])).fit_transform(
+            [Demonstration([0.0, 1.0], np.eye(2))]
+        )
+
+
+@pytest.mark.parametrize(
+    "parameters, error, message",
+    [
+        ({"features": ["elbow"]}, UnknownNameError, "'elbow' is not in the features; it has"),
+        ({"weights": {"hand": 1.0}}, UnknownNameError, "weight 'hand' is not in the features"),
+        ({"weights": {"joints": -1.0}}, DataError, "number >= 0, got -1"),
+        ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
+        ({"reference": "mean"}, ValueError, "reference"),
+        ({"window": 0}, ValueError, "window"),
+    ],
+)
+def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
+    with pytest.raises(error, match=message):
+        DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2])
+
+
+def test_nothing_to_align_by_is_an_error():
+    still = Demonstration(np.arange(5.0), np.ones((5, 2)))
+    with pytest.raises(DataError, match="nothing to align by"):
+        DynamicTimeWarping().fit([still, still])
+
+
+def test_frames_unknown_to_fit_are_an_error():
+    fitted = DynamicTimeWarping(0, features=["elbow in bottle"], robot=Arm())
+    fitted.fit(DEMONSTRATIONS[:2])
+    bare = Demonstration(DEMONSTRATIONS[0].time, DEMONSTRATIONS[0].joints, None, tuple("abcde"))
+    with pytest.raises(UnknownNameError, match="'elbow in bottle'"):
+        fitted.transform([bare])
+
+
+def test_without_dtaidistance_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "dtaidistance", None)
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[data\]"):
+        DynamicTimeWarping().fit(DEMONSTRATIONS[:2])

@@ -1,0 +1,179 @@
+"""Commands that write data sets: ``tpgmm dataset generate`` and ``tpgmm dataset convert``."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.support.command_line import output, refusal
+from tests.support.lerobot_sets import (
+    FPS,
+    assert_equal,
+    joints_of,
+    to_v21,
+    undeclared,
+    write,
+)
+from tpgmm_datasets import describe_lerobot, load_lerobot, resample
+from tpgmm_datasets.bottle.skill import BottleShaking
+
+RATE = 10
+
+
+def generate(path, *more, number=2, seed=0, rate=RATE):
+    size = ("--n-demonstrations", number, "--random-state", seed, "--rate", rate)
+    return "dataset", "generate", path, *size, *more
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("generated") / "set"
+    output(*generate(folder))
+    return folder
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """A small set of three episodes in layout v3.0, and what is in it."""
+    return tmp_path / "arm", write(tmp_path / "arm")
+
+
+def assert_same(found, expected, tolerance=0.0):
+    """Everything, joints and poses to a tolerance, events to the step."""
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        assert (a.joint_names, list(a.frames)) == (b.joint_names, list(b.frames))
+        assert a.time.tolist() == pytest.approx(b.time.tolist())
+        assert a.joints.numpy() == pytest.approx(b.joints.numpy(), abs=tolerance)
+        step = float(a.time[1] - a.time[0])
+        assert a.events == pytest.approx(b.events, abs=0.501 * step)
+        for name, pose in a.frames.items():
+            for part in ("position", "orientation"):
+                wanted = getattr(b.frames[name], part).numpy()
+                assert getattr(pose, part).numpy() == pytest.approx(wanted, abs=1e-6)
+
+
+def test_generated_demonstrations_are_those_of_the_skill_with_that_seed(tmp_path):
+    text = output(*generate(tmp_path / "new" / "set", number=2, seed=3))
+    expected = BottleShaking(rate=RATE).demonstrations(2, seed=3)
+    assert_same(load_lerobot(tmp_path / "new" / "set"), expected, 1e-6)
+    rows = sum(map(len, expected))
+    assert text == f"2 episodes, {rows} rows written to {tmp_path / 'new' / 'set'}\n"
+    found = describe_lerobot(tmp_path / "new" / "set")
+    assert (found.fps, found.robot_type) == (RATE, "upper_body")
+    assert found.tasks == ("shake the bottle",)
+    assert found.problems == ()
+
+
+def test_generated_demonstrations_may_share_one_rhythm(tmp_path):
+    output(*generate(tmp_path / "set", "--steady-rhythm"))
+    expected = BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(2, seed=0)
+    assert_same(load_lerobot(tmp_path / "set"), expected, 1e-6)
+
+
+def test_appended_episodes_follow_those_that_were_there(tmp_path):
+    root = tmp_path / "set"
+    for seed in (0, 1):
+        output(*generate(root, "--append", seed=seed))
+    skill = BottleShaking(rate=RATE)
+    expected = skill.demonstrations(2, seed=0) + skill.demonstrations(2, seed=1)
+    assert_same(load_lerobot(root), expected, 1e-6)
+
+
+def test_converted_coordinates_keep_their_unit(tmp_path):
+    name = write(tmp_path / "arm")[0].joint_names[-1]
+    undeclared(tmp_path / "arm", 1.0)
+    output("dataset", "convert", tmp_path / "arm", tmp_path / "set", "--units", f"{name}=raw")
+    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
+    joints = info["features"]["observation.state"]
+    assert dict(zip(joints["names"], joints["info"]["units"], strict=True))[name] == "raw"
+
+
+@pytest.mark.parametrize("command", ["generate", "convert"])
+def test_a_set_that_exists_is_left_alone_without_append(command, generated, arm, tmp_path):
+    root, written = arm
+    words = generate(root) if command == "generate" else ("dataset", "convert", generated, root)
+    assert f"{root} exists; remove it, or" in refusal(*words)
+    assert_same(load_lerobot(root), written)
+
+
+def test_episodes_at_another_rate_are_not_appended(generated):
+    before = load_lerobot(generated)
+    other = ("dataset", "convert", generated, generated, "--append", "--rate", RATE / 2)
+    for words in (generate(generated, "--append", rate=RATE // 2), other):
+        assert f"the set has fps {RATE}, the demonstrations {RATE // 2}" in refusal(*words)
+    assert_same(load_lerobot(generated), before)
+
+
+def test_converting_a_set_of_layout_v30_changes_nothing(generated, tmp_path):
+    output("dataset", "convert", generated, tmp_path / "copy")
+    assert_same(load_lerobot(tmp_path / "copy"), load_lerobot(generated))
+    found, expected = describe_lerobot(tmp_path / "copy"), describe_lerobot(generated)
+    assert found.columns == expected.columns
+    for name in ("version", "robot_type", "fps", "tasks", "lengths", "problems"):
+        assert getattr(found, name) == getattr(expected, name)
+
+
+def test_layout_v21_becomes_v30_and_each_episode_keeps_its_task(arm, tmp_path):
+    root, written = arm
+    output("dataset", "convert", to_v21(root, tmp_path / "old"), tmp_path / "new")
+    found = describe_lerobot(tmp_path / "new")
+    assert (found.version, found.robot_type, found.cameras) == ("v3.0", "arm", ())
+    assert (found.fps, found.problems) == (FPS, ())
+    assert_same(load_lerobot(tmp_path / "new"), written, 1e-6)
+    joints = joints_of(load_lerobot(tmp_path / "new", episodes="shake"))
+    assert_equal(joints, joints_of(load_lerobot(tmp_path / "new"))[1:2])
+
+
+def test_degrees_become_radians_if_told_and_are_refused_if_not(tmp_path):
+    root, new = tmp_path / "set", tmp_path / "new"
+    written = write(root)
+    undeclared(root, 100)
+    words = ("dataset", "convert", root, new)
+    assert "not radians" in refusal(*words)
+    assert not new.exists()
+    output(*words, *("--units", "deg"), *("--episodes", "0,2"))
+    found = load_lerobot(new)
+    for a, b in zip(found, (written[0], written[2]), strict=True):
+        expected = np.radians(100 * b.joints.numpy())
+        assert a.joints.numpy() == pytest.approx(expected, abs=1e-5)
+
+
+def test_rate_resamples_and_task_names_all_episodes(arm, tmp_path):
+    root, written = arm
+    options = ("--rate", 25, "--task", "wave", "--episodes", "1:")
+    output("dataset", "convert", root, tmp_path / "new", *options)
+    found = load_lerobot(tmp_path / "new")
+    assert_same(found, [resample(item, 25) for item in written[1:]], 1e-6)
+    assert describe_lerobot(tmp_path / "new").tasks == ("wave",)
+
+
+def test_a_rate_that_is_no_whole_number_is_refused(arm, tmp_path):
+    line = refusal("dataset", "convert", arm[0], tmp_path / "new", "--rate", 12.5)
+    assert "fps as a whole number" in line
+
+
+@pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])
+def test_an_episode_that_has_not_one_task_of_its_own_needs_to_be_told(arm, tmp_path, tasks):
+    root = to_v21(arm[0], tmp_path / "old")
+    file = root / "meta" / "episodes.jsonl"
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+    rows[1]["tasks"] = tasks
+    file.write_text("\n".join(map(json.dumps, rows)))
+    words = ("dataset", "convert", root, tmp_path / "new")
+    assert f"episode 1 has {len(tasks)} tasks, not one: give --task" in refusal(*words)
+    output(*words, "--task", "wave")
+    assert len(load_lerobot(tmp_path / "new", episodes="wave")) == 3
+
+
+def test_joints_of_a_robot_are_chosen_in_its_order(generated, tmp_path):
+    robot = ("--robot", "upper_body", "--robot-joint", "r_*", "--link", "r_hand")
+    at = ("--frame", "held=r_hand@grasp")
+    output("dataset", "convert", generated, tmp_path / "new", *robot, *at)
+    for found, before in zip(
+        load_lerobot(tmp_path / "new"), load_lerobot(generated), strict=True
+    ):
+        names = [name for name in before.joint_names if name.startswith("r_")]
+        assert list(found.joint_names) == names
+        assert_equal([found.joints], [before.reordered(names).joints])
+        assert list(found.frames) == ["held"]

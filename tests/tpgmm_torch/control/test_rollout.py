@@ -1,0 +1,286 @@
+"""The synthesis loop: a batch is its members, starts do not jump, limits are kept."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.support.mixtures import CASES, Case, Problem, assert_close, times
+from tests.support.worlds import OBJECT
+from tpgmm_torch import Frame, Situation, Trajectory, quaternions
+from tpgmm_torch.control.rollout import Synthesis, minimum_jerk, rollout, stacked
+from tpgmm_torch.regression.regression import Regression
+
+NAMES = ["the paper's", "poses in two frames"]
+EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
+
+
+def grid(length: int = 12, end: float = 2.0) -> Tensor:
+    return torch.linspace(0, end, length, dtype=torch.float64)
+
+
+def moving(pose: Frame, time: Tensor) -> Frame:
+    """The object drifts and turns."""
+    drift = 0.1 * time[:, None] * torch.tensor([1.0, -0.5, 0.2], dtype=torch.float64)
+    turn = quaternions.exp(0.3 * drift)
+    return Frame(pose.position + drift, quaternions.product(turn, pose.orientation))
+
+
+def situations(problem: Problem, *grids: Tensor, moves: bool = False) -> list[Situation]:
+    """One situation per time grid; of two, every second object moves if asked for."""
+    result = []
+    for index, time in enumerate(grids):
+        pose = problem.frames[OBJECT][index]
+        frame = moving(pose, time) if moves and index % 2 else pose
+        result.append(Situation(problem.state.joints[index], {OBJECT: frame}, time))
+    return result
+
+
+def run(regression: Regression, given: list[Situation], **options) -> list[Trajectory]:
+    defaults = {"blend": 0.5, "keep_limits": False, "candidates": True}
+    return rollout(regression, given, **{**defaults, **options})
+
+
+def assert_same(a: Trajectory, b: Trajectory) -> None:
+    assert torch.equal(a.time, b.time)
+    assert_close(a.joints, b.joints)
+    assert_close(a.covariance, b.covariance)
+    for one, other in zip(a.candidates, b.candidates, strict=True):
+        assert_close(one.mean, other.mean)
+        assert_close(one.covariance, other.covariance)
+        assert_close(one.share, other.share)
+
+
+# The fade
+
+
+def test_minimum_jerk_goes_from_zero_to_one():
+    ends = torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0], dtype=torch.float64)
+    assert minimum_jerk(ends).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
+
+
+def test_minimum_jerk_rises_symmetrically():
+    u = torch.linspace(0, 1, 101, dtype=torch.float64)
+    assert bool((minimum_jerk(u).diff() > 0).all())
+    assert_close(minimum_jerk(u) + minimum_jerk(1 - u), np.ones(101))
+
+
+def test_minimum_jerk_is_at_rest_at_both_ends():
+    u = torch.tensor([0.0, 1.0], dtype=torch.float64, requires_grad=True)
+    value = minimum_jerk(u)
+    for _ in range(2):
+        [value] = torch.autograd.grad(value.sum(), u, create_graph=True)
+        assert_close(value.detach(), np.zeros(2))
+
+
+# The loop
+
+
+@EVERY_WORLD
+def test_each_reference_is_the_state_of_the_next_step(case: Case):
+    problem = Problem.of(case, 3, 1)
+    regression, kinematics = problem.regression(), case.world.kinematics
+    [trajectory] = run(regression, situations(problem, grid()), blend=0)
+    joints, frames = problem.state.joints[0], {OBJECT: problem.frames[OBJECT][0]}
+    for time, reference, covariance in zip(
+        grid(), trajectory.joints, trajectory.covariance, strict=True
+    ):
+        estimate = regression.step(time, kinematics.state(joints), frames)
+        joints = kinematics.retract(estimate.joints)
+        assert_close(reference, joints)
+        assert_close(covariance, estimate.covariance)
+
+
+@EVERY_WORLD
+@pytest.mark.parametrize("moves", [False, True], ids=["standing", "moving"])
+@pytest.mark.parametrize("keep_limits", [False, True], ids=["free", "limited"])
+def test_a_batch_is_its_situations_one_at_a_time(case: Case, moves, keep_limits):
+    problem = Problem.of(case, 3, 3)
+    given = situations(problem, grid(), grid(), grid(), moves=moves)
+    regression = problem.regression()
+    batch = run(regression, given, keep_limits=keep_limits)
+    for one, situation in zip(batch, given, strict=True):
+        [single] = run(regression, [situation], keep_limits=keep_limits)
+        assert_same(one, single)
+
+
+def test_time_grids_may_differ_and_the_order_is_kept():
+    problem = Problem.of(CASES["the paper's"], 3, 4)
+    grids = grid(), grid(7, 1.5), grid(), grid(12, 1.9)
+    given = situations(problem, *grids)
+    regression = problem.regression()
+    for one, situation in zip(run(regression, given), given, strict=True):
+        assert torch.equal(one.time, situation.time)
+        assert len(one) == len(situation.time)
+        assert_same(one, run(regression, [situation])[0])
+
+
+def test_an_object_that_moves_is_followed_as_it_moves():
+    problem = Problem.of(CASES["the paper's"], 3, 1)
+    pose, time = problem.frames[OBJECT][0], grid()
+    start = problem.state.joints[0]
+    path = moving(pose, time)
+    still = Frame(pose.position.expand(12, 3), pose.orientation.expand(12, 4))
+    constant, repeated, moved = run(
+        problem.regression(),
+        [Situation(start, {OBJECT: frame}, time) for frame in (pose, still, path)],
+    )
+    assert_same(constant, repeated)
+    assert_close(moved.joints[0], constant.joints[0])
+    assert (moved.joints[-1] - constant.joints[-1]).abs().max() > 1e-3
+
+
+def test_situations_without_objects_need_none():
+    problem = Problem.of(CASES["canonical"], 3, 1)
+    [trajectory] = run(problem.regression(), [Situation(problem.state.joints[0], time=grid())])
+    assert trajectory.joints.shape == (12, 17)
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_candidates_are_kept_if_wanted(wanted):
+    problem = Problem.of(CASES["three"], 2, 2)
+    names = problem.case.world.kinematics.joint_names
+    for trajectory in run(
+        problem.regression(), situations(problem, grid(), grid()), candidates=wanted
+    ):
+        assert len(trajectory.candidates) == (3 if wanted else 0)
+        assert trajectory.joint_names == names
+        assert trajectory.covariance.shape == (12, 17, 17)
+        for candidate in trajectory.candidates:
+            assert candidate.mean.shape == candidate.share.shape == (12, 17)
+            assert candidate.covariance.shape == (12, 17, 17)
+
+
+@EVERY_WORLD
+@pytest.mark.parametrize("moves", [False, True], ids=["still", "moving"])
+@pytest.mark.parametrize("activation", ["time", "product"])
+@pytest.mark.parametrize("part", [1, 7, 512])
+def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, monkeypatch):
+    monkeypatch.setattr("tpgmm_torch.control.rollout.PART", part)
+    problem = Problem.of(case, 3, 2)
+    regression, time = problem.regression(activation=activation), grid()
+    given = situations(problem, time, time, moves=moves)
+    trajectories = run(regression, given)
+    together = {OBJECT: stacked([item.frames[OBJECT] for item in given])}
+    loop = Synthesis(regression, problem.state.joints, 0.5, False)
+    for k, now in enumerate(time):
+        here = {name: pose[k] if moves else pose for name, pose in together.items()}
+        estimate = loop.step(now, here, candidates=True)
+        for row, trajectory in enumerate(trajectories):
+            for one, other in zip(trajectory.candidates, estimate.candidates, strict=True):
+                assert_close(one.mean[k], other.mean[row])
+                assert_close(one.covariance[k], other.covariance[row])
+                assert_close(one.share[k], other.share[row])
+
+
+@EVERY_WORLD
+def test_what_was_measured_may_stand_for_the_last_reference(case: Case):
+    problem = Problem.of(case, 3, 2)
+    regression, kinematics = problem.regression(), case.world.kinematics
+    loop = Synthesis(regression, problem.state.joints, 0.0, False)
+    for time in grid():
+        measured = loop.reference + 0.01
+        loop.step(time, problem.frames, kinematics.retract(measured))
+        expected = regression.step(
+            time, kinematics.state(kinematics.retract(measured)), problem.frames
+        )
+        assert_close(loop.reference, kinematics.retract(expected.joints))
+
+
+# The start
+
+
+@EVERY_WORLD
+def test_with_a_blend_the_first_reference_is_the_start(case: Case):
+    problem = Problem.of(case, 3, 2)
+    given = situations(problem, grid(), grid())
+    for trajectory, situation in zip(
+        run(problem.regression(), given, blend=1.0), given, strict=True
+    ):
+        assert_close(trajectory.joints[0], situation.joints)
+
+
+def test_without_a_blend_the_first_reference_is_the_models():
+    problem = Problem.of(CASES["canonical"], 3, 1)
+    given = situations(problem, grid())
+    [trajectory] = run(problem.regression(), given, blend=0)
+    frames = {OBJECT: problem.frames[OBJECT][0]}
+    first = problem.regression().step(grid()[0], problem.state[0], frames)
+    assert_close(trajectory.joints[0], first.joints)
+    assert (trajectory.joints[0] - given[0].joints).abs().max() > 1e-2
+
+
+def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
+    problem = Problem.of(CASES["canonical"], 3, 1)  # its references do not depend on the state
+    given = situations(problem, grid(41))
+    [plain] = run(problem.regression(), given, blend=0)
+    [blended] = run(problem.regression(), given, blend=0.8)
+    fade = 1 - minimum_jerk(grid(41) / 0.8)
+    gap = given[0].joints - plain.joints[0]
+    assert_close(blended.joints, plain.joints + fade[:, None] * gap)
+    assert_close(blended.joints[grid(41) >= 0.8], plain.joints[grid(41) >= 0.8])
+
+
+# Limits
+
+
+def test_inside_its_bounds_a_step_is_what_it_was():
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    now = times(2), problem.state, problem.frames
+    plain = problem.regression().step(*now)
+    bounds = plain.joints - 1e-9, plain.joints + 1e-9
+    assert torch.equal(problem.regression().step(*now, bounds=bounds).joints, plain.joints)
+
+
+@pytest.mark.parametrize("width", [0.01, 0.1])
+def test_joints_at_a_bound_stand_and_the_others_take_over(width):
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    now = times(2), problem.state, problem.frames
+    plain = problem.regression().step(*now)
+    lower, upper = problem.state.joints - width, problem.state.joints + width
+    bounded = problem.regression().step(*now, bounds=(lower, upper)).joints
+    assert bool(((bounded >= lower) & (bounded <= upper)).all())
+    for index in range(2):
+        mean, covariance = plain.joints[index], plain.covariance[index]
+        low, high = lower[index], upper[index]
+        joints, stands = mean.clone(), torch.zeros(17, dtype=torch.bool)
+        while bool((beyond := ((joints < low) | (joints > high)) & ~stands).any()):
+            joints = torch.where(beyond, joints.clamp(low, high), joints)
+            stands |= beyond
+            inverse = torch.linalg.inv(covariance[stands][:, stands])
+            gain = covariance[~stands][:, stands] @ inverse
+            joints[~stands] = mean[~stands] + gain @ (joints[stands] - mean[stands])
+        assert int(stands.sum()) > 0
+        assert_close(bounded[index], joints, 1e-6)
+
+
+def test_references_keep_the_limits_of_position_and_speed():
+    problem = Problem.of(CASES["the paper's"], 4, 2)
+    slow = copy.copy(problem.case.world.kinematics)
+    slow.velocity = torch.full_like(slow.velocity, 0.3)
+    slow.lower = low = problem.state.joints.amin(0) - 0.1
+    slow.upper = high = problem.state.joints.amax(0) + 0.1
+    regression = replace(problem.regression(), kinematics=slow)
+    time = grid(21)
+    given = situations(problem, time, time)
+    for free, kept in zip(
+        run(regression, given), run(regression, given, keep_limits=True), strict=True
+    ):
+        assert bool(((free.joints < low) | (free.joints > high)).any())
+        assert bool((kept.joints >= low - 1e-9).all() and (kept.joints <= high + 1e-9).all())
+        speed = kept.joints.diff(dim=0) / time.diff()[:, None]
+        assert float(speed.abs().max()) <= 0.3 * (1 + 1e-9)
+
+
+def test_a_robot_that_starts_beyond_its_limits_returns_to_them():
+    problem = Problem.of(CASES["the paper's"], 2, 1)
+    kinematics = problem.case.world.kinematics
+    start = problem.state.joints[0].clone()
+    start[5] = kinematics.upper[5] + 0.5
+    given = [Situation(start, {OBJECT: problem.frames[OBJECT][0]}, grid(30))]
+    [trajectory] = run(problem.regression(), given, keep_limits=True)
+    assert bool(torch.isfinite(trajectory.joints).all())
+    assert float(trajectory.joints[-1, 5]) <= float(kinematics.upper[5]) + 1e-9

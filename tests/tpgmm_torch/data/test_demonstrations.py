@@ -1,0 +1,343 @@
+"""Demonstrations and situations: what they take, refuse and say, and that they never share."""
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
+from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.trajectories import Candidate, Trajectory
+from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+
+
+def moving_frame(length: int = 5) -> Frame:
+    turns = torch.linspace(0, 1, length, dtype=torch.float64)[:, None]
+    about_z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return Frame(turns * torch.ones(3, dtype=torch.float64), quaternions.exp(turns * about_z))
+
+
+def demonstration(**changes) -> Demonstration:
+    arguments = {
+        "time": np.linspace(0.0, 2.0, 5),
+        "joints": np.arange(10.0).reshape(5, 2),
+        "frames": {"bottle": Frame([1.0, 2.0, 3.0]), "tray": moving_frame()},
+        "joint_names": ("shoulder", "elbow"),
+        "events": {"grasp": 0.5},
+    }
+    return Demonstration(**(arguments | changes))
+
+
+# Conversion at the boundary
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[1, 2], (1.0, 2.0), np.array([1, 2]), np.float32([1, 2]), torch.tensor([1, 2])],
+    ids=["list", "tuple", "integers", "float32 array", "integer tensor"],
+)
+def test_what_is_no_floating_tensor_becomes_float64(values):
+    tensor = as_tensor(values, "joints")
+    assert tensor.dtype == torch.float64
+    assert tensor.tolist() == [1.0, 2.0]
+
+
+def test_floating_tensors_keep_type_and_gradient():
+    given = torch.ones(3, dtype=torch.float32, requires_grad=True)
+    tensor = as_tensor(given, "joints")
+    assert tensor.dtype == torch.float32
+    tensor.sum().backward()
+    assert torch.equal(given.grad, torch.ones(3))
+
+
+@pytest.mark.parametrize("kind", ["numpy", "torch", "torch with gradient"])
+def test_no_memory_is_shared_with_the_input(kind):
+    if kind == "numpy":
+        given = np.ones(3)
+        tensor = as_tensor(given, "joints")
+        given[0] = 7.0
+    else:
+        given = torch.ones(3, requires_grad=kind != "torch")
+        tensor = as_tensor(given, "joints")
+        with torch.no_grad():
+            given[0] = 7.0
+    assert tensor.tolist() == [1.0, 1.0, 1.0]
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6), min_size=6, max_size=6),
+    st.integers(0, 5),
+    st.sampled_from([math.nan, math.inf, -math.inf]),
+)
+def test_nan_and_infinity_are_refused_with_their_index(values, index, bad):
+    values[index] = bad
+    where = [index // 3, index % 3]
+    with pytest.raises(DataError) as error:
+        as_tensor(np.reshape(values, (2, 3)), "joints")
+    assert "joints holds 1 value(s) that are NaN or infinite" in str(error.value)
+    assert f"the first is {bad} at index {where}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [[1.0], [1.0, 2.0]],
+        ["one"],
+        ["1.0"],
+        [1j],
+        torch.ones(2, dtype=torch.complex64),
+        np.array(["2026-01-01"], dtype="datetime64[s]"),
+        [10**400],
+        [torch.ones((), requires_grad=True), torch.ones(())],
+        {"a": 1.0},
+    ],
+    ids=[
+        "ragged",
+        "word",
+        "digits",
+        "complex",
+        "complex tensor",
+        "date",
+        "huge",
+        "mixed",
+        "dict",
+    ],
+)
+def test_what_is_no_array_of_numbers_is_refused(values):
+    with pytest.raises(DataError, match="joints must be an array of numbers"):
+        as_tensor(values, "joints")
+
+
+def test_a_missing_value_counts_as_nan():
+    with pytest.raises(DataError, match=r"NaN or infinite, the first is nan at index \[1\]"):
+        as_tensor([1.0, None], "joints")
+
+
+# Demonstrations
+
+
+def test_a_demonstration_knows_its_size():
+    demo = demonstration()
+    assert (len(demo), demo.n_joints, demo.duration) == (5, 2, 2.0)
+    assert demo.joint_names == ("shoulder", "elbow")
+    assert repr(demo) == (
+        "Demonstration(5 steps, 2.00 s, 2 joints, frames=['bottle', 'tray'], "
+        "events={'grasp': 0.5})"
+    )
+
+
+def test_frames_are_found_by_name():
+    assert demonstration().frame("bottle").position.tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(UnknownNameError) as error:
+        demonstration().frame("cup")
+    expected = "frame 'cup' is not in the demonstration; it has ['bottle', 'tray']"
+    assert str(error.value) == expected
+    assert isinstance(error.value, KeyError)
+    assert isinstance(error.value, TPGMMError)
+    assert str(pickle.loads(pickle.dumps(error.value))) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"time": []}, ShapeError, r"time has shape \(T,\) with T >= 1, got \(0,\)"),
+        ({"time": 1.0}, ShapeError, r"time has shape \(T,\) with T >= 1, got \(\)"),
+        ({"time": [[0.0, 1.0]]}, ShapeError, r"got \(1, 2\)"),
+        (
+            {"time": [0.0, 1.0, 1.0, 2.0, 3.0]},
+            DataError,
+            "increase strictly: it goes from 1 to 1 s at index 2",
+        ),
+        ({"time": [0, 1, 2, 3, 2.5]}, DataError, "from 3 to 2.5 s at index 4"),
+        ({"time": [0, 1, 2, 3, math.nan]}, DataError, "time holds 1 value"),
+        ({"joints": np.zeros((4, 2))}, ShapeError, r"T = 5 as in time, got \(4, 2\)"),
+        ({"joints": np.zeros(5)}, ShapeError, r"T = 5 as in time, got \(5,\)"),
+        ({"joints": np.full((5, 2), math.inf)}, DataError, "joints holds 10 value"),
+        ({"joint_names": ("a",)}, ShapeError, r"needs 2 different names, got \('a',\)"),
+        ({"joint_names": ("a", "a")}, ShapeError, r"needs 2 different names, got \('a', 'a'\)"),
+        (
+            {"frames": {"cup": moving_frame(4)}},
+            ShapeError,
+            r"frame 'cup' has leading shape \(4,\); it is one pose, \(\), or one per time "
+            r"step, \(5,\)",
+        ),
+        (
+            {"frames": {"cup": [0.0, 0.0, 0.0]}},
+            DataError,
+            "frames maps names to Frame objects, got 'cup': list",
+        ),
+        (
+            {"frames": {1: Frame([0.0, 0.0, 0.0])}},
+            DataError,
+            "frames maps names to Frame objects, got 1: Frame",
+        ),
+        (
+            {"events": {"grasp": 2.5}},
+            DataError,
+            "event 'grasp' at 2.5 s lies outside the demonstration, 0 to 2 s",
+        ),
+        ({"events": {"grasp": math.nan}}, DataError, "event 'grasp' at nan s lies outside"),
+    ],
+)
+def test_demonstrations_refuse_bad_input(changes, error, message):
+    with pytest.raises(error, match=message):
+        demonstration(**changes)
+
+
+def test_nothing_given_to_a_demonstration_is_shared_or_modified():
+    time, joints = np.linspace(0, 1, 5), np.zeros((5, 2))
+    frames, events = {"bottle": Frame([0.0, 0.0, 0.0])}, {"grasp": 0.5}
+    demo = Demonstration(time, joints, frames, events=events)
+    time[0], joints[0, 0] = -1.0, 7.0
+    frames["cup"], events["shake"] = Frame([1.0, 1.0, 1.0]), 0.7
+    assert (demo.time[0], demo.joints[0, 0]) == (0.0, 0.0)
+    assert (list(demo.frames), dict(demo.events)) == (["bottle"], {"grasp": 0.5})
+
+
+@pytest.mark.parametrize("attribute", ["time", "joints", "frames", "joint_names", "events"])
+def test_attributes_cannot_be_replaced(attribute):
+    with pytest.raises(AttributeError, match="cannot assign to field"):
+        setattr(demonstration(), attribute, None)
+
+
+def test_frames_and_events_cannot_be_changed():
+    demo = demonstration()
+    with pytest.raises(TypeError):
+        demo.frames["cup"] = Frame([0.0, 0.0, 0.0])
+    with pytest.raises(TypeError):
+        demo.events["shake"] = 1.0
+    with pytest.raises(AttributeError, match="cannot assign to field"):
+        demo.frames["bottle"].position = torch.ones(3)
+
+
+def test_reordered_moves_the_columns_and_keeps_the_rest():
+    demo = demonstration()
+    turned = demo.reordered(["elbow", "shoulder"])
+    assert torch.equal(turned.joints, demo.joints[:, [1, 0]])
+    assert turned.joint_names == ("elbow", "shoulder")
+    assert (dict(turned.frames), turned.events) == (dict(demo.frames), demo.events)
+    assert torch.equal(turned.reordered(["shoulder", "elbow"]).joints, demo.joints)
+    assert torch.equal(demo.reordered(["elbow"]).joints, demo.joints[:, [1]])
+
+
+def test_reordered_without_names_trusts_the_order():
+    demo = demonstration(joint_names=None)
+    assert demo.reordered(["elbow", "shoulder"]) is demo
+
+
+def test_reordered_names_the_joint_that_is_missing():
+    with pytest.raises(UnknownNameError, match="joint 'wrist' is not in the demonstration; "):
+        demonstration().reordered(["elbow", "wrist"])
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_are_equal_and_still_read_only(copied):
+    demo = demonstration()
+    twin = copied(demo)
+    assert torch.equal(twin.time, demo.time)
+    assert torch.equal(twin.joints, demo.joints)
+    assert twin.joint_names == demo.joint_names
+    assert twin.events == demo.events
+    for name, frame in demo.frames.items():
+        assert torch.equal(twin.frame(name).position, frame.position)
+        assert torch.equal(twin.frame(name).orientation, frame.orientation)
+    with pytest.raises(TypeError):
+        twin.events["shake"] = 1.0
+    situation = copied(Situation.of(demo))
+    assert torch.equal(situation.joints, demo.joints[0])
+    assert list(situation.frames) == ["bottle", "tray"]
+
+
+# Situations
+
+
+def test_the_situation_of_a_demonstration_is_its_start():
+    demo = demonstration()
+    situation = Situation.of(demo)
+    assert situation.joints.tolist() == [0.0, 1.0]
+    assert torch.equal(situation.time, demo.time)
+    assert dict(situation.frames) == dict(demo.frames)
+
+
+def test_without_time_frames_per_step_have_one_length():
+    frames = {"a": Frame([0.0, 0.0, 0.0]), "b": moving_frame(4), "c": moving_frame(4)}
+    assert Situation([0.0], frames).frames["b"].batch_shape == (4,)
+    with pytest.raises(ShapeError, match=r"'d' has leading shape \(6,\); .* step, \(4,"):
+        Situation([0.0], frames | {"d": moving_frame(6)})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        (
+            {"joints": [[0.0]]},
+            ShapeError,
+            r"posture has shape \(n_joints,\), got \(1, 1\)",
+        ),
+        ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
+        ({"frames": {"cup": [0.0] * 3}}, DataError, "maps names to Frame objects, got 'cup'"),
+        ({"time": [1.0, 0.0]}, DataError, "time must increase strictly"),
+        (
+            {"time": [0.0, 1.0], "frames": {"cup": moving_frame(3)}},
+            ShapeError,
+            r"frame 'cup' has leading shape \(3,\); .* \(2,\)",
+        ),
+    ],
+)
+def test_situations_refuse_bad_input(arguments, error, message):
+    with pytest.raises(error, match=message):
+        Situation(**({"joints": [0.0]} | arguments))
+
+
+# Trajectories
+
+
+def test_a_trajectory_says_what_it_is():
+    eye = torch.eye(2).expand(3, 2, 2)
+    candidate = Candidate(torch.zeros(3, 2), eye, torch.ones(3, 2))
+    trajectory = Trajectory(
+        torch.arange(3.0), torch.zeros(3, 2), eye, (candidate,), ("shoulder", "elbow")
+    )
+    assert len(trajectory) == 3
+    assert repr(trajectory) == "Trajectory(3 steps, 2.00 s, 2 joints, 1 candidates)"
+
+
+# Lists of demonstrations
+
+
+def test_check_demonstrations_takes_any_sequence():
+    demos = [demonstration(), demonstration()]
+    for sequence in (demos, tuple(demos), iter(demos), np.array([*demos, None])[:2]):
+        assert check_demonstrations(sequence) == demos
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        (demonstration(), DataError, r"got one: wrap it, \[demonstration\]"),
+        (5, DataError, "expected a list of Demonstration, got int"),
+        ([], DataError, "at least one demonstration, got an empty list"),
+        ([demonstration(), None], DataError, "item 1 is NoneType"),
+        (np.zeros((2, 3)), DataError, "item 0 is ndarray"),
+        (
+            [demonstration(), demonstration(joints=np.zeros((5, 3)), joint_names=None)],
+            ShapeError,
+            "demonstration 1 has 3 joints, the first has 2",
+        ),
+        (
+            [demonstration(), demonstration(frames={})],
+            DataError,
+            r"demonstration 1 has frames \[\], the first has \['bottle', 'tray'\]",
+        ),
+    ],
+    ids=["one", "number", "empty", "other type", "array", "joints", "frames"],
+)
+def test_check_demonstrations_says_what_is_wrong(given, error, message):
+    with pytest.raises(error, match=message):
+        check_demonstrations(given)

@@ -1,0 +1,105 @@
+"""Rows of Table I for many operators at once, against each operator's own."""
+
+from dataclasses import fields
+
+import pytest
+import torch
+
+from tests.support.robot_zoo import random_joints, upper_body
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Frame,
+    RelativeOrientation,
+    RelativePosition,
+    RobotState,
+    Stack,
+    quaternions,
+)
+from tpgmm_torch.exceptions import UnknownNameError
+from tpgmm_torch.operators.pose_terms import pose_terms
+
+STACKS = {
+    "one": Stack(RelativePosition("l_hand", "cup")),
+    "absolute": Stack(AbsoluteOrientation("r_hand", 1.0), AbsolutePosition("l_hand")),
+    "two frames": Stack(
+        Stack(RelativeOrientation("r_hand", "lid"), RelativePosition("l_hand", "cup")),
+        RelativeOrientation("l_hand", "cup", 1.5),
+        AbsolutePosition("r_hand"),
+    ),
+}
+
+
+class SaysItself(RobotState):
+    """A state whose orientations are mapped one by one."""
+
+    def orientation_map(self, link, gain):
+        return super().orientation_map(link, gain)
+
+
+def scene(*batch: int) -> tuple[RobotState, dict[str, Frame]]:
+    generator = torch.Generator().manual_seed(len(batch))
+    joints = random_joints(upper_body(), 6)[: max(1, torch.Size(batch).numel())]
+    state = upper_body().state(joints.reshape(*batch, 17))
+    frames = {}
+    for name in ("cup", "lid"):
+        options = {"generator": generator, "dtype": torch.float64}
+        turn = quaternions.normalize(torch.randn(*batch, 4, **options))
+        frames[name] = Frame(torch.randn(*batch, 3, **options), turn)
+    return state, frames
+
+
+def one_by_one(state: RobotState) -> SaysItself:
+    return SaysItself(*(getattr(state, field.name) for field in fields(state)))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (6,), (2, 3)])
+@pytest.mark.parametrize("stack", STACKS.values(), ids=list(STACKS))
+def test_together_is_one_by_one(stack, batch):
+    state, frames = scene(*batch)
+    together = stack.linearize(state, frames)
+    expected = stack.linearize(one_by_one(state), frames)
+    assert together.present is not None
+    assert expected.present is None
+    for name in ("jacobian", "matrix", "displacement"):
+        torch.testing.assert_close(
+            getattr(together, name), getattr(expected, name), rtol=0, atol=1e-14
+        )
+    coordinates = stack.coordinates(state, frames)
+    turned = torch.zeros_like(coordinates)
+    for start in stack.quaternion_starts(upper_body()):
+        turned[..., start : start + 4] = coordinates[..., start : start + 4]
+    torch.testing.assert_close(together.present, turned, rtol=0, atol=1e-14)
+
+
+def test_one_frame_serves_many_robots_and_many_frames_one():
+    stack = STACKS["two frames"]
+    state, frames = scene(6)
+    single = {name: frame[0] for name, frame in frames.items()}
+    for few, many in ((state, single), (state[0], frames)):
+        together = stack.linearize(few, many)
+        expected = stack.linearize(one_by_one(few), many)
+        torch.testing.assert_close(together.displacement, expected.displacement)
+        for row in range(6):
+            at, there = (
+                (x[row] if x.ndim == 3 else x) for x in (together.matrix, expected.matrix)
+            )
+            torch.testing.assert_close(at, there)
+
+
+def test_operators_that_differ_speak_for_themselves():
+    links, like = upper_body().links, upper_body().lower
+
+    class Mine(AbsolutePosition):
+        pass
+
+    for other in (Canonical(), Mine("l_hand"), RelativePosition("l_hand", "r_hand")):
+        operators = (AbsolutePosition("l_hand"), other)
+        assert pose_terms(operators, links, like.dtype, like.device) is None
+
+
+def test_a_frame_that_is_not_there_is_named():
+    state, frames = scene()
+    with pytest.raises(UnknownNameError, match=r"'cup'.*'lid'"):
+        STACKS["two frames"].linearize(state, {"lid": frames["lid"]})

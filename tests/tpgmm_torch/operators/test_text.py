@@ -1,0 +1,70 @@
+"""Operators as text."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from tests.support.worlds import upper_body
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators.text import format_operator, parse_operator
+
+OPERATORS = [
+    Canonical(),
+    AbsolutePosition("l_hand"),
+    RelativePosition("l_hand", "bottle"),
+    AbsoluteOrientation("l_hand"),
+    RelativeOrientation("l_hand", "r_hand"),
+    Stack(RelativePosition("l_hand", "bottle"), AbsoluteOrientation("r_hand"), Canonical()),
+]
+
+
+@pytest.mark.parametrize("operator", OPERATORS, ids=format_operator)
+def test_the_text_of_an_operator_stands_for_it(operator):
+    assert parse_operator(format_operator(operator)) == operator
+
+
+def test_a_pose_is_position_and_orientation():
+    both = Stack(RelativePosition("l_hand", "bottle"), RelativeOrientation("l_hand", "bottle"))
+    assert parse_operator(" pose:l_hand@bottle ") == both
+    assert parse_operator("pose:l_hand + position:r_hand").operators == (
+        AbsolutePosition("l_hand"),
+        AbsoluteOrientation("l_hand"),
+        AbsolutePosition("r_hand"),
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["", "canonical +", "pos:l_hand", "position:", "position:a@", "position:a@b@c"]
+)
+def test_what_is_no_operator_is_refused_and_explained(text):
+    with pytest.raises(DataError, match="A term is 'canonical', or"):
+        parse_operator(text)
+
+
+def test_an_operator_of_ones_own_goes_by_its_repr():
+    @dataclass(frozen=True)
+    class Height(AbsolutePosition):
+        floor: float = 0.0
+
+    class Mine(Operator):
+        dimension = linearize = coordinates = links = None
+
+        def __repr__(self):
+            return "Mine()"
+
+    assert format_operator(Mine()) == "Mine()"
+    assert format_operator(Height("hand", floor=0.1)) == repr(Height("hand", floor=0.1))
+
+
+def test_parsed_operators_fit_the_robot_they_name():
+    operator = parse_operator("pose:l_hand@r_hand + canonical")
+    assert operator.dimension(upper_body()) == 3 + 4 + 17

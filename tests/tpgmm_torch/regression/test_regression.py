@@ -1,0 +1,359 @@
+"""Regression in joint space against dense oracles that keep time inside the Gaussians."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tests.support import oracles
+from tests.support.mixtures import (
+    BOTH_HANDS,
+    CASES,
+    Case,
+    Problem,
+    assert_close,
+    assert_equal_estimates,
+    local_mixture,
+    times,
+)
+from tests.support.worlds import OBJECT
+from tpgmm_torch import Frame
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.local_mixtures import LocalMixture
+
+EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
+ACTIVATIONS = pytest.mark.parametrize("activation", ["time", "product"])
+FUSIONS = pytest.mark.parametrize("fusion", ["information", "covariance"])
+EPSILON, PRIOR_STD = 1e-2, 3.0
+
+
+def options_of(case: Case, fusion: str) -> dict[str, float]:
+    """What the oracle needs to know of the fusion."""
+    if fusion == "covariance":
+        return {"epsilon": EPSILON}
+    closed = any(operator.determines_joints for operator in case.operators)
+    return {} if closed else {"prior_std": PRIOR_STD}
+
+
+# Eqs (1), (2)
+
+
+@EVERY_CASE
+@ACTIVATIONS
+@FUSIONS
+@pytest.mark.parametrize("n_components", [1, 2, 5])
+def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion, n_components):
+    problem = Problem.of(case, n_components, 2, 2)
+    regression = problem.regression(
+        activation=activation, fusion=fusion, epsilon=EPSILON, prior_std=PRIOR_STD
+    )
+    options = {"activation": activation, **options_of(case, fusion)}
+    for time in (times(), times(2, 2)):
+        estimate = regression.step(time, problem.state, problem.frames)
+        assert estimate.joints.shape == problem.state.joints.shape
+        for index in np.ndindex(2, 2):
+            now = float(time.expand(2, 2)[index])
+            expected = problem.answer(now, index, **options)
+            activations = estimate.activation.expand(2, 2, n_components)
+            assert_close(activations[index], expected.activation)
+            assert_close(estimate.joints[index], expected.mean)
+            assert_close(estimate.covariance[index], expected.covariance)
+
+
+@EVERY_CASE
+def test_the_activations_are_different_models_of_two_operators_and_one_of_one(case):
+    problem = Problem.of(case, 4)
+    weights = [
+        problem.regression(activation=name, fusion="covariance").step(
+            times(), problem.state, problem.frames
+        )
+        for name in ("time", "product")
+    ]
+    differ = (weights[0].activation - weights[1].activation).abs().max() > 1e-3
+    assert differ == (len(case.operators) > 1)
+
+
+@ACTIVATIONS
+@pytest.mark.parametrize("n_components", [1, 4])
+def test_both_forms_agree_where_every_jacobian_is_invertible(activation, n_components):
+    problem = Problem.of(CASES["poses in two frames"], n_components, 3)
+    now = times(3), problem.state, problem.frames
+    information = problem.regression(activation=activation).step(*now)
+    covariance = problem.regression(
+        activation=activation, fusion="covariance", epsilon=0.0
+    ).step(*now)
+    assert_equal_estimates(information, covariance)
+
+
+def test_the_covariance_form_tends_to_the_information_form_as_epsilon_vanishes():
+    problem = Problem.of(CASES["poses in two frames"], 3)
+    now = times(), problem.state, problem.frames
+    limit = problem.regression().step(*now).joints
+    errors = [
+        (problem.regression(fusion="covariance", epsilon=eps).step(*now).joints - limit).norm()
+        for eps in (1e-4, 1e-5, 1e-6)
+    ]
+    for coarse, fine in itertools.pairwise(errors):
+        assert float(fine / coarse) == pytest.approx(0.1, rel=0.05)
+
+
+def test_the_forms_part_where_a_task_leaves_joints_free():
+    problem = Problem.of(CASES["the paper's"], 1)
+    now = times(), problem.state, problem.frames
+    information = problem.regression().step(*now).joints
+    pinned = problem.regression(fusion="covariance", epsilon=1e-9).step(*now).joints
+    assert (information - pinned).abs().max() > 1e-2
+
+
+def test_twelve_by_seventeen_is_the_explicit_sum_of_the_design():
+    problem = Problem.of(CASES["the paper's"], 1)
+    time, joints = 0.7, problem.state.joints.numpy()
+    precision, vector = np.zeros((17, 17)), np.zeros(17)
+    for row, local in zip(problem.rows(), problem.mixtures, strict=True):
+        mean, covariance = local.means[0], local.covariances[0]
+        gain = covariance[1:, 0] / covariance[0, 0]
+        mu = mean[1:] + gain * (time - mean[0])
+        sigma = covariance[1:, 1:] - np.outer(gain, covariance[0, 1:])
+        weight = row.jacobian.T @ np.linalg.inv(row.matrix @ sigma @ row.matrix.T)
+        precision += weight @ row.jacobian
+        vector += weight @ (row.matrix @ mu + row.displacement + row.jacobian @ joints)
+    assert problem.rows()[0].jacobian.shape == (12, 17)
+    estimate = problem.regression().step(torch.tensor(time), problem.state, problem.frames)
+    assert_close(estimate.joints, np.linalg.solve(precision, vector))
+    assert_close(estimate.covariance, np.linalg.inv(precision))
+
+
+def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
+    problem = Problem.of(CASES["both hands"], 1)
+    now = torch.tensor(0.8, dtype=torch.float64), problem.state, problem.frames
+    linear, offset = problem.rows()[0].linear_and_offset(problem.state.joints.numpy())
+    mu = local_mixture(problem.mixtures[0]).at(now[0])[0].numpy()
+    limit = torch.from_numpy(linear @ mu + offset)
+    distances = [
+        float((problem.regression(prior_std=std).step(*now).joints - limit).norm())
+        for std in (10.0, 100.0, 1000.0)
+    ]
+    for near, nearer in itertools.pairwise(distances):
+        assert nearer == pytest.approx(near / 100, rel=0.2)
+    printed = problem.regression(fusion="covariance").step(*now).joints
+    assert_close(printed, limit)
+
+
+# Mixing
+
+
+def test_activations_are_weights():
+    problem = Problem.of(CASES["three"], 5, 3)
+    for activation in ("time", "product"):
+        regression = problem.regression(activation=activation)
+        weights = regression.step(times(3), problem.state, problem.frames).activation
+        assert bool((weights >= 0).all())
+        assert_close(weights.sum(-1), np.ones(3))
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.15])
+def test_leaving_components_out_moves_the_mean_by_no_more_than_their_weight(threshold):
+    problem = Problem.of(CASES["the paper's"], 5, seed=3)
+    now = times(), problem.state, problem.frames
+    full = problem.regression(negligible=0.0).step(*now)
+    fewer = problem.regression(negligible=threshold).step(*now)
+    dropped = fewer.activation == 0
+    assert 0 < int(dropped.sum()) < 5
+    assert bool((full.activation[dropped] < threshold * full.activation.max()).all())
+    assert_close(fewer.activation.sum(), 1.0)
+    components = problem.answer(float(now[0]), activation="time").component_means
+    apart = (torch.from_numpy(components)[dropped] - fewer.joints).norm(dim=-1).max()
+    moved = (full.joints - fewer.joints).norm()
+    assert 0 < moved <= full.activation[dropped].sum() * apart * (1 + 1e-9)
+
+
+def test_the_most_likely_component_is_never_left_out():
+    problem = Problem.of(CASES["the paper's"], 5)
+    now = times(), problem.state, problem.frames
+    best = problem.regression().step(*now).activation.argmax()
+    one = problem.regression(negligible=0.99).step(*now).activation
+    assert torch.equal(one, torch.eye(5, dtype=torch.float64)[best])
+
+
+def test_expected_coordinates_are_those_of_regression_in_the_local_space():
+    problem = Problem.of(CASES["the paper's"], 4)
+    grid, local = times(6), problem.mixtures[0]
+    regression = problem.regression()
+    expected = regression.expected(0, grid)
+    for time, actual in zip(grid.tolist(), expected, strict=True):
+        marginals = [
+            w * oracles.normal(time, m[0], c[0, 0])
+            for w, m, c in zip(problem.weights, local.means, local.covariances, strict=True)
+        ]
+        at = [
+            m[1:] + c[1:, 0] / c[0, 0] * (time - m[0])
+            for m, c in zip(local.means, local.covariances, strict=True)
+        ]
+        assert_close(actual, np.array(marginals) / sum(marginals) @ np.array(at))
+
+
+# Signs, batches, precision, gradients
+
+
+def flipped(local: LocalMixture, starts: tuple[int, ...]) -> LocalMixture:
+    signs = torch.ones_like(local.mean[0])
+    for start in starts:
+        signs[start : start + 4] = -1
+    covariance = signs[:, None] * local.covariance * signs
+    return replace(
+        local, mean=signs * local.mean, gain=signs * local.gain, covariance=covariance
+    )
+
+
+@ACTIVATIONS
+@pytest.mark.parametrize("name", ["the paper's", "three"])
+def test_signs_of_quaternions_mean_nothing(name, activation):
+    problem = Problem.of(CASES[name], 3, 2)
+    regression = problem.regression(activation=activation)
+    plain = regression.step(times(2), problem.state, problem.frames, candidates=True)
+    mixtures = [
+        flipped(mixture, operator.quaternion_starts(regression.kinematics))
+        for mixture, operator in zip(regression.mixtures, regression.operators, strict=True)
+    ]
+    state = problem.case.world.flipped(problem.state)
+    pose = problem.frames[OBJECT]
+    frames = {OBJECT: Frame(pose.position, -pose.orientation)}
+    other = replace(regression, mixtures=mixtures)
+    for step in (
+        other.step(times(2), problem.state, problem.frames, candidates=True),
+        regression.step(times(2), state, problem.frames, candidates=True),
+        regression.step(times(2), problem.state, frames, candidates=True),
+        other.step(times(2), state, frames, candidates=True),
+    ):
+        assert_equal_estimates(step, plain)
+
+
+def test_each_component_has_its_own_sign():
+    problem = Problem.of(CASES["the paper's"], 3)
+    regression = problem.regression()
+    plain = regression.step(times(), problem.state, problem.frames)
+    first = flipped(regression.mixtures[0], BOTH_HANDS.quaternion_starts(None))
+    mixed = LocalMixture(
+        *(
+            torch.cat((getattr(first, name)[:1], getattr(regression.mixtures[0], name)[1:]))
+            for name in ("mean", "gain", "covariance", "time_mean", "time_variance")
+        )
+    )
+    other = replace(regression, mixtures=[mixed, regression.mixtures[1]])
+    assert_equal_estimates(other.step(times(), problem.state, problem.frames), plain)
+
+
+@EVERY_CASE
+@ACTIVATIONS
+def test_a_batch_is_its_members_one_at_a_time(case, activation):
+    problem = Problem.of(case, 3, 2, 3)
+    regression = problem.regression(activation=activation)
+    batch = regression.step(times(2, 3), problem.state, problem.frames, candidates=True)
+    for index in np.ndindex(2, 3):
+        frames = {name: frame[index] for name, frame in problem.frames.items()}
+        single = regression.step(
+            times(2, 3)[index], problem.state[index], frames, candidates=True
+        )
+        assert_close(batch.joints[index], single.joints)
+        assert_close(batch.covariance[index], single.covariance)
+        assert_close(batch.activation[index], single.activation)
+        for many, one in zip(batch.candidates, single.candidates, strict=True):
+            assert_close(many.mean[index], one.mean)
+            assert_close(many.share[index], one.share)
+
+
+@EVERY_CASE
+def test_many_times_and_many_frames_serve_one_state(case):
+    problem = Problem.of(case, 2, 3)
+    state, regression = problem.state[0], problem.regression()
+    batch = regression.step(times(3), state, problem.frames, candidates=True)
+    for index in range(3):
+        frames = {name: frame[index] for name, frame in problem.frames.items()}
+        single = regression.step(times(3)[index], state, frames, candidates=True)
+        assert_close(batch.joints[index], single.joints)
+        for many, one in zip(batch.candidates, single.candidates, strict=True):
+            assert_close(many.mean[index], one.mean)
+
+
+@EVERY_CASE
+def test_inference_mode_changes_nothing(case):
+    problem = Problem.of(case, 3, 2)
+    plain = problem.regression().step(times(2), problem.state, problem.frames, candidates=True)
+    with torch.inference_mode():
+        state = case.world.kinematics.state(problem.state.joints)
+        step = problem.regression().step(times(2), state, problem.frames, candidates=True)
+    assert_equal_estimates(step, plain, 0.0)
+    assert not step.joints.requires_grad
+
+
+@pytest.mark.parametrize("name", ["the paper's", "both hands", "poses in two frames"])
+@FUSIONS
+@ACTIVATIONS
+def test_single_precision_stays_single_and_near(name, fusion, activation):
+    problem = Problem.of(CASES[name], 3, 2)
+    regression = problem.regression(fusion=fusion, activation=activation, epsilon=EPSILON)
+    exact = regression.step(times(2), problem.state, problem.frames, candidates=True)
+    kinematics = regression.kinematics.to(torch.float32)
+    rounded = replace(
+        regression,
+        kinematics=kinematics,
+        mixtures=[
+            LocalMixture(*(value.float() for value in vars(mixture).values()))
+            for mixture in regression.mixtures
+        ],
+        log_weights=regression.log_weights.float(),
+    ).step(
+        times(2).float(),
+        kinematics.state(problem.state.joints),
+        {name: frame.to(torch.float32) for name, frame in problem.frames.items()},
+        candidates=True,
+    )
+    assert rounded.joints.dtype == rounded.covariance.dtype == torch.float32
+    assert rounded.candidates[0].share.dtype == torch.float32
+    torch.testing.assert_close(rounded.joints.double(), exact.joints, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["the paper's", "both hands", "poses in two frames"])
+@FUSIONS
+@ACTIVATIONS
+def test_gradients_are_those_of_finite_differences(name, fusion, activation):
+    problem = Problem.of(CASES[name], 2)
+    regression = problem.regression(fusion=fusion, activation=activation, epsilon=EPSILON)
+    mixture, pose = regression.mixtures[0], problem.frames[OBJECT]
+    factor = torch.linalg.cholesky(mixture.covariance)
+    joints = problem.state.joints.clone()
+    inputs = times(), mixture.mean, factor, joints, pose.position, pose.orientation
+
+    def step(
+        time: Tensor,
+        mean: Tensor,
+        factor: Tensor,
+        joints: Tensor,
+        position: Tensor,
+        orientation: Tensor,
+    ) -> tuple[Tensor, ...]:
+        learned = replace(mixture, mean=mean, covariance=factor @ factor.mT)
+        estimate = replace(regression, mixtures=[learned, *regression.mixtures[1:]]).step(
+            time,
+            regression.kinematics.state(joints),
+            {OBJECT: Frame(position, orientation)},
+            candidates=True,
+        )
+        alone = estimate.candidates[0]
+        return estimate.joints, estimate.covariance, alone.mean, alone.covariance
+
+    leaves = [leaf.detach().clone().requires_grad_() for leaf in inputs]
+    assert torch.autograd.gradcheck(step, leaves, fast_mode=True, atol=1e-4, rtol=1e-3)
+
+
+def test_a_component_without_variance_is_refused_with_advice():
+    problem = Problem.of(CASES["canonical"], 2)
+    regression = problem.regression()
+    flat = replace(
+        regression.mixtures[0], covariance=torch.zeros_like(regression.mixtures[0].covariance)
+    )
+    with pytest.raises(DataError, match=r"projected component .*2 of 2 .*reg_covar"):
+        replace(regression, mixtures=[flat]).step(times(), problem.state, problem.frames)

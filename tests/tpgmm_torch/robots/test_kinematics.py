@@ -1,0 +1,160 @@
+"""States of robots as tensors, and robots of a user's own."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from torch.autograd import gradcheck, gradgradcheck
+
+from tests.support.robot_zoo import assert_differences_agree, random_joints, upper_body, zoo
+from tpgmm_torch import quaternions
+from tpgmm_torch.exceptions import UnknownNameError
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+
+
+class TestTensors:
+    @pytest.mark.parametrize("batch", [(), (0,), (1,), (2, 3)])
+    @pytest.mark.parametrize("make", [upper_body, lambda: zoo(base="tip")])
+    def test_any_leading_dimensions(self, make: Any, batch: tuple[int, ...]) -> None:
+        robot = make()
+        joints, n, links = random_joints(robot, *batch), robot.n_joints, len(robot.links)
+        state = robot.state(joints)
+        assert state.joints.shape == (*batch, n)
+        assert state.positions.shape == (*batch, links, 3)
+        assert state.orientations.shape == (*batch, links, 4)
+        assert state.jacobians.shape == (*batch, links, 6, n)
+        for index in np.ndindex(*batch):
+            single, selected = robot.state(joints[index]), state[index]
+            torch.testing.assert_close(selected.positions, single.positions)
+            torch.testing.assert_close(selected.orientations, single.orientations)
+            torch.testing.assert_close(selected.jacobians, single.jacobians)
+            torch.testing.assert_close(selected.joints, single.joints)
+
+    def test_numpy_and_lists_are_taken_and_left_alone(self) -> None:
+        robot, values = zoo(), np.full((2, 5), 0.1)
+        state = robot.state(values)
+        torch.testing.assert_close(state.positions, robot.state(values.tolist()).positions)
+        assert (values == 0.1).all()
+        state.joints.zero_()
+        assert (values == 0.1).all()
+
+    def test_quaternions_have_unit_norm(self) -> None:
+        robot = zoo()
+        norm = robot.state(random_joints(robot, 50)).orientations.norm(dim=-1)
+        torch.testing.assert_close(norm, torch.ones_like(norm), rtol=0, atol=1e-14)
+
+    @pytest.mark.parametrize("part", ["positions", "orientations", "jacobians"])
+    @pytest.mark.parametrize("make", [upper_body, lambda: zoo(base="tip")])
+    def test_gradients(self, make: Any, part: str) -> None:
+        robot = make()
+        joints = random_joints(robot, 2, seed=3).requires_grad_()
+        fast = part == "jacobians"  # many outputs: random projections of them
+        assert gradcheck(lambda q: getattr(robot.state(q), part), (joints,), fast_mode=fast)
+
+    def test_second_gradients(self) -> None:
+        robot = zoo(("r_finger",), joints=["elbow", "grip"])
+        joints = torch.tensor([0.3, 0.05], dtype=torch.float64, requires_grad=True)
+        assert gradgradcheck(lambda q: robot.state(q).positions, (joints,))
+
+    def test_float32_is_float64_rounded(self) -> None:
+        robot = upper_body()
+        single = robot.to(torch.float32)
+        joints = random_joints(robot, 4)
+        state, rounded = robot.state(joints), single.state(joints)
+        assert rounded.positions.dtype == rounded.jacobians.dtype == torch.float32
+        torch.testing.assert_close(
+            rounded.positions.double(), state.positions, rtol=0, atol=1e-6
+        )
+        torch.testing.assert_close(
+            rounded.jacobians.double(), state.jacobians, rtol=0, atol=1e-6
+        )
+        assert single == upper_body(dtype=torch.float32) != robot
+        assert single.to(torch.float64) == robot
+        assert (single.to(torch.float64).state(joints).positions == state.positions).all()
+        assert robot.to(torch.float64, "cpu") is robot
+
+    def test_runs_in_inference_mode_and_serves_gradients_if_made_there(self) -> None:
+        with torch.inference_mode():
+            robot = zoo()
+            assert robot.state(torch.ones(5)).positions.is_inference()
+        joints = torch.ones(5, dtype=torch.float64, requires_grad=True)
+        robot.state(joints).positions.sum().backward()
+        assert joints.grad is not None and bool(joints.grad.abs().sum() > 0)
+
+    def test_the_default_device_does_not_matter(self) -> None:
+        expected = zoo().state(torch.ones(5)).positions
+        torch.set_default_device("meta")
+        try:
+            robot = zoo()
+        finally:
+            torch.set_default_device(None)
+        assert (robot.state(torch.ones(5)).positions == expected).all()
+
+
+class TestState:
+    def test_parts_are_found_by_link(self) -> None:
+        robot = zoo(("tip", "flange"))
+        state = robot.state(random_joints(robot, 3))
+        assert (state.position("flange") == state.positions[:, 1]).all()
+        assert (state.orientation("flange") == state.orientations[:, 1]).all()
+        assert (state.linear_jacobian("flange") == state.jacobians[:, 1, :3]).all()
+        assert (state.angular_jacobian("flange") == state.jacobians[:, 1, 3:]).all()
+
+    def test_unknown_link(self) -> None:
+        state = zoo(("tip",)).state(torch.zeros(5))
+        with pytest.raises(UnknownNameError, match=r"link 'cup' is not in .*\['tip'\]"):
+            state.position("cup")
+
+    def test_orientation_map_asks_for_the_rotation_only_with_gain_two(self) -> None:
+        robot = upper_body()
+        joints, step = random_joints(robot), 1e-5 * random_joints(robot, seed=5)
+        state = robot.state(joints)
+        wanted = robot.state(joints + step).orientation("l_hand")
+        wanted = quaternions.match_hemisphere(wanted, state.orientation("l_hand"))
+        for gain, agrees in ((2.0, True), (1.0, False)):
+            jacobian, matrix, offset = state.orientation_map("l_hand", gain)
+            error = (jacobian @ step - matrix @ wanted - offset).norm()
+            assert bool(error < 1e-8) is agrees
+
+
+class PlanarArm(Kinematics):
+    """Two hinges about z, in closed form: a robot of a user's own."""
+
+    joint_names, links = ("shoulder", "elbow"), ("tip",)
+
+    def __init__(self) -> None:
+        self.upper = torch.full((2,), math.pi, dtype=torch.float64)
+        self.lower, self.velocity = -self.upper, self.upper
+
+    def state(self, joints: Any) -> RobotState:
+        q = self.joint_tensor(joints)
+        angles = q.cumsum(-1)
+        sine, cosine, zero = angles.sin(), angles.cos(), torch.zeros_like(angles[..., 0])
+        position = torch.stack((cosine.sum(-1), sine.sum(-1), zero), dim=-1)
+        turn = torch.stack((zero, zero, angles[..., 1]), dim=-1)
+        columns = torch.zeros(*q.shape[:-1], 1, 6, 2, dtype=q.dtype)
+        for joint in range(2):
+            columns[..., 0, 0, joint] = -sine[..., joint:].sum(-1)
+            columns[..., 0, 1, joint] = cosine[..., joint:].sum(-1)
+            columns[..., 0, 5, joint] = 1.0
+        orientation = quaternions.exp(turn)[..., None, :]
+        return RobotState(q, self.links, position[..., None, :], orientation, columns)
+
+
+class TestOwnKinematics:
+    def test_a_user_defined_robot_needs_only_its_state(self) -> None:
+        arm = PlanarArm()
+        assert arm.n_joints == 2
+        assert_differences_agree(arm, random_joints(arm))
+        assert clone(arm) is arm
+        joints = torch.ones(3, 2)
+        assert arm.retract(joints) is joints
+
+    def test_it_converts_to_another_dtype(self) -> None:
+        arm = PlanarArm()
+        single = arm.to(torch.float32)
+        assert single.state([0.1, 0.2]).positions.dtype == torch.float32
+        assert arm.lower.dtype == torch.float64

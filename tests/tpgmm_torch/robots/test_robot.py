@@ -1,0 +1,360 @@
+"""Robots of a URDF against pinocchio, MuJoCo, finite differences and closed forms."""
+
+import copy
+import json
+import math
+import pickle
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+from sklearn.base import clone
+
+from tests.support.robot_zoo import (
+    G1_PATH,
+    HANDS,
+    ZOO,
+    ZOO_FOLLOWERS,
+    ZOO_JOINTS,
+    ZOO_LINKS,
+    Pinocchio,
+    assert_agrees,
+    assert_differences_agree,
+    g1,
+    random_joints,
+    upper_body,
+    zoo,
+)
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots.robot import Robot
+
+
+class TestOracles:
+    def test_upper_body_agrees_with_pinocchio(self) -> None:
+        oracle = Pinocchio(pin.buildModelFromXML(upper_body_urdf()), {})
+        assert_agrees(upper_body(), oracle, "base")
+
+    def test_g1_agrees_with_pinocchio(self) -> None:
+        oracle = Pinocchio(pin.buildModelFromUrdf(str(G1_PATH)), {})
+        robot = g1()
+        assert robot.n_joints == 17
+        assert_agrees(robot, oracle, "pelvis")
+
+    @pytest.mark.parametrize("base", [None, "tip", "r_finger", "flange", "column", "turret"])
+    def test_every_kind_of_joint_and_base_agrees_with_pinocchio(self, base: str | None) -> None:
+        oracle = Pinocchio(pin.buildModelFromXML(ZOO), ZOO_FOLLOWERS)
+        robot = zoo(base=base)
+        assert robot.joint_names == ZOO_JOINTS
+        assert_agrees(robot, oracle, base or "ground")
+
+    def test_locked_joints_agree_with_pinocchio(self) -> None:
+        locked = {"elbow": 0.7, "lift": 0.3}
+        oracle = Pinocchio(pin.buildModelFromXML(ZOO), ZOO_FOLLOWERS)
+        robot = zoo(base="l_finger", locked=locked)
+        assert robot.joint_names == ("swivel", "grip", "wag")
+        assert_agrees(robot, oracle, "l_finger", locked)
+
+    def test_upper_body_agrees_with_mujoco(self) -> None:
+        model = mujoco.MjModel.from_xml_string(upper_body_urdf())
+        data = mujoco.MjData(model)
+        robot = upper_body()
+        assert robot.joint_names == tuple(model.joint(i).name for i in range(model.njnt))
+        for joints in random_joints(robot, 20):
+            data.qpos[:] = joints.numpy()
+            mujoco.mj_kinematics(model, data)
+            state = robot.state(joints)
+            for hand in HANDS:
+                rotation = quaternions.to_matrix(state.orientation(hand)).numpy()
+                body = data.body(hand)
+                position = state.position(hand).numpy()
+                np.testing.assert_allclose(position, body.xpos, atol=1e-12)
+                np.testing.assert_allclose(rotation, body.xmat.reshape(3, 3), atol=1e-12)
+
+    @pytest.mark.parametrize("make", [upper_body, zoo, lambda: zoo(base="tip"), g1])
+    def test_jacobian_is_the_derivative_of_the_poses(self, make: Any) -> None:
+        robot = make()
+        assert_differences_agree(robot, random_joints(robot, seed=1))
+
+
+class TestUpperBody:
+    def test_shoulder_centres_are_the_published_ones(self) -> None:
+        shoulders = ("l_shoulder_2", "r_shoulder_2")
+        state = Robot.from_urdf(upper_body_urdf(), shoulders).state(torch.zeros(17))
+        expected = torch.tensor(
+            [[0.0053, 0.1558, 0.3243], [0.0053, -0.1558, 0.3243]], dtype=torch.float64
+        )
+        torch.testing.assert_close(state.positions, expected, rtol=0, atol=5e-5)
+
+    def test_both_shoulder_pitch_axes_are_one_line(self) -> None:
+        robot = Robot.from_urdf(upper_body_urdf(), ("l_shoulder_1", "r_shoulder_1"))
+        state = robot.state(random_joints(robot))
+        left, right = (robot.joint_names.index(f"{s}_shoulder_pitch") for s in "lr")
+        axis = state.angular_jacobian("l_shoulder_1")[:, left]
+        torch.testing.assert_close(axis, state.angular_jacobian("r_shoulder_1")[:, right])
+        between = state.position("l_shoulder_1") - state.position("r_shoulder_1")
+        torch.testing.assert_close(
+            torch.linalg.cross(axis, between), 0 * axis, rtol=0, atol=1e-15
+        )
+
+    def test_arm_lengths_masses_and_limits_are_the_published_ones(self) -> None:
+        model = mujoco.MjModel.from_xml_string(upper_body_urdf())
+        arm = 0.568 + 0.777 + 1.046 + 0.633 + 0.934 + 0.261 + 0.054 + 0.3
+        robot = upper_body()
+        assert model.body_mass.sum() == pytest.approx(1.801 + 0.546 + 0.754 + 6.362 + 2 * arm)
+        assert (robot.velocity == 4).all()
+        limits = dict(
+            zip(robot.joint_names, zip(robot.lower, robot.upper, strict=True), strict=True)
+        )
+        assert tuple(map(float, limits["waist_roll"])) == (-0.5236, 0.5235)
+        assert tuple(map(float, limits["l_wrist_roll"])) == (-0.785375, 1.395)
+        assert tuple(map(float, limits["r_wrist_roll"])) == (-1.395, 0.785375)
+        reach = robot.state(torch.zeros(17)).position("l_hand")[2]
+        assert float(reach) == pytest.approx(0.32432899 - 0.18 - 0.19468 - 0.07, abs=1e-12)
+
+    def test_arms_share_the_waist_and_nothing_else(self) -> None:
+        robot = upper_body()
+        state = robot.state(random_joints(robot, 5))
+        left, right = slice(3, 10), slice(10, 17)
+        assert (state.jacobians[:, 0, :, right] == 0).all()
+        assert (state.jacobians[:, 1, :, left] == 0).all()
+        assert (state.jacobians[..., :3].norm(dim=-2) > 0.1).all()
+
+
+class TestSettings:
+    def test_joints_are_matched_by_name_in_any_order(self) -> None:
+        robot, joints = zoo(), random_joints(zoo())
+        order = (3, 0, 4, 2, 1)
+        other = zoo(joints=[ZOO_JOINTS[i] for i in order])
+        state, shuffled = robot.state(joints), other.state(joints[list(order)])
+        torch.testing.assert_close(shuffled.positions, state.positions)
+        torch.testing.assert_close(shuffled.jacobians, state.jacobians[..., list(order)])
+        torch.testing.assert_close(other.upper, robot.upper[list(order)])
+
+    def test_names_may_come_from_any_iterable(self) -> None:
+        robot = zoo((link for link in ("tip", "arm")), joints=iter(ZOO_JOINTS))
+        assert (robot.links, robot.joint_names) == (("tip", "arm"), ZOO_JOINTS)
+
+    def test_joints_that_are_not_named_stand_at_zero(self) -> None:
+        robot = zoo(joints=["elbow", "lift"])
+        full = zoo().state([0.2, 0.0, 0.4, 0.0, 0.0])
+        part = robot.state([0.4, 0.2])
+        torch.testing.assert_close(part.positions, full.positions)
+        torch.testing.assert_close(part.jacobians, full.jacobians[..., [2, 0]])
+
+    def test_followers_of_a_locked_joint_stand_where_it_puts_them(self) -> None:
+        robot = zoo(("tip",), locked={"elbow": 0.6})
+        turn = quaternions.log(robot.state(torch.zeros(4)).orientation("tip"))
+        torch.testing.assert_close(turn, turn.new_tensor([0, 0, 0.5 * 0.6 + 0.2]))
+        assert (robot.state(torch.zeros(4)).jacobians[0, :, :3] == 0).all()
+
+    def test_a_follower_of_a_follower_follows_the_first(self) -> None:
+        chained = ZOO.replace(
+            '<parent link="ground"/><child link="tail"/>',
+            '<parent link="ground"/><child link="tail"/>'
+            '<mimic joint="grip_too" multiplier="3" offset="0.1"/>',
+        )
+        robot = Robot.from_urdf(chained, ("tail",))
+        grip = robot.joint_names.index("grip")
+        state = robot.state(0.05 * torch.eye(robot.n_joints)[grip])
+        angle = 3 * (-0.05 + 0.01) + 0.1
+        torch.testing.assert_close(
+            quaternions.log(state.orientation("tail")), state.joints.new_tensor([0, angle, 0])
+        )
+        assert float(state.angular_jacobian("tail")[1, grip]) == pytest.approx(-3)
+
+    def test_coordinates_without_kinematics_have_zero_columns(self) -> None:
+        robot, plain = upper_body(coordinates=["l_grip", "r_grip"]), upper_body()
+        assert robot.joint_names == (*plain.joint_names, "l_grip", "r_grip")
+        joints = random_joints(robot)
+        state, bare = robot.state(joints), plain.state(joints[:17])
+        torch.testing.assert_close(state.positions, bare.positions)
+        torch.testing.assert_close(state.jacobians[..., :17], bare.jacobians)
+        assert (state.jacobians[..., 17:] == 0).all()
+        assert robot.lower[17:].tolist() == [-math.inf] * 2
+        assert robot.velocity[17:].tolist() == [math.inf] * 2
+
+    def test_coordinates_stand_where_joints_puts_them(self) -> None:
+        robot = zoo(joints=["wag", "hand", "lift"], coordinates=["hand", "camera"])
+        assert robot.joint_names == ("wag", "hand", "lift", "camera")
+        state = robot.state([0.1, 9.0, 0.2, 9.0])
+        torch.testing.assert_close(
+            state.positions, zoo(joints=["wag", "lift"]).state([0.1, 0.2]).positions
+        )
+        assert (state.jacobians[..., [1, 3]] == 0).all()
+
+    @pytest.mark.parametrize("base", [None, "flange"])
+    def test_tools_move_with_their_parent(self, base: str | None) -> None:
+        offset = Frame(
+            [0.1, -0.2, 0.3], quaternions.exp(torch.tensor([0.3, -1.0, 0.5]).double())
+        )
+        tools = {"cup": ("r_finger", offset), "pen": ("ground", [0, 0, 0.1])}
+        robot = zoo(("cup", "r_finger", "pen", "ground"), tools=tools, base=base)
+        joints = random_joints(robot)
+        state = robot.state(joints)
+        parent = Frame(state.position("r_finger"), state.orientation("r_finger"))
+        turned = quaternions.product(parent.orientation, offset.orientation)
+        torch.testing.assert_close(state.position("cup"), parent.transform(offset.position))
+        torch.testing.assert_close(
+            quaternions.to_matrix(state.orientation("cup")), quaternions.to_matrix(turned)
+        )
+        ground = Frame(state.position("ground"), state.orientation("ground"))
+        torch.testing.assert_close(
+            ground.inverse_transform(state.position("pen")), joints.new_tensor([0, 0, 0.1])
+        )
+        assert_differences_agree(robot, joints)
+
+    def test_a_link_that_nothing_moves_has_a_zero_jacobian(self) -> None:
+        robot = Robot.from_urdf(ZOO, ("flange", "arm"), base="arm")
+        state = robot.state(torch.ones(2, 5))
+        assert (state.jacobians == 0).all()
+        torch.testing.assert_close(state.position("arm"), torch.zeros(2, 3).double())
+        torch.testing.assert_close(
+            state.position("flange"), torch.tensor([0.2, 0, 0]).double().expand(2, 3)
+        )
+
+    def test_a_robot_may_have_no_links(self) -> None:
+        state = zoo(()).state(torch.zeros(3, 5))
+        assert state.positions.shape == (3, 0, 3)
+        assert state.jacobians.shape == (3, 0, 6, 5)
+
+    def test_limits_are_those_of_the_description(self) -> None:
+        robot = zoo()
+        assert robot.lower.tolist() == [-0.1, -math.inf, -1, 0, -1]
+        assert robot.upper.tolist() == [0.5, math.inf, 2, 0.1, 1]
+        assert robot.velocity.tolist() == [0.2, math.inf, 3, 1, 1]
+
+    def test_a_floating_base_is_no_obstacle_beyond_the_base(self) -> None:
+        text = ZOO.replace("</robot>", "") + (
+            '<link name="world"/><joint name="free" type="floating">'
+            '<parent link="world"/><child link="ground"/></joint></robot>'
+        )
+        robot = Robot.from_urdf(text, ("flange",), base="ground")
+        torch.testing.assert_close(
+            robot.state(torch.ones(5)).positions,
+            zoo(("flange",)).state(torch.ones(5)).positions,
+        )
+        with pytest.raises(DataError, match="'free' of type 'floating' lies between"):
+            Robot.from_urdf(text, ("flange",))
+
+
+class TestObject:
+    @pytest.fixture
+    def robot(self) -> Robot:
+        tools = {"cup": ("flange", [0.1, 0.2, 0.3], [0.6, 0.0, 0.8001, 0.0])}
+        return zoo(
+            ("cup", "tip"),
+            joints=["elbow", "hand", "wag"],
+            locked={"lift": 0.2},
+            coordinates=["hand"],
+            base="column",
+            tools=tools,
+            dtype=torch.float32,
+        )
+
+    def test_config_is_json_and_gives_the_same_robot(self, robot: Robot) -> None:
+        again = Robot.from_config(json.loads(json.dumps(robot.config())))
+        assert again == robot
+        assert again.config() == robot.config()
+        assert (
+            again.state(torch.ones(3)).jacobians == robot.state(torch.ones(3)).jacobians
+        ).all()
+
+    @pytest.mark.parametrize(
+        "copied", [copy.copy, copy.deepcopy, lambda r: pickle.loads(pickle.dumps(r))]
+    )
+    def test_copies_are_equal_and_work(self, robot: Robot, copied: Any) -> None:
+        other = copied(robot)
+        assert other == robot and hash(other) == hash(robot)
+        joints = torch.ones(2, 3)
+        assert (other.state(joints).positions == robot.state(joints).positions).all()
+
+    def test_clone_keeps_the_robot(self, robot: Robot) -> None:
+        assert clone(robot) is robot
+
+    def test_equality_compares_what_matters(self, robot: Robot) -> None:
+        assert zoo() == zoo(joints=ZOO_JOINTS, locked={}, base="ground")
+        assert len({zoo(), zoo(), robot}) == 2
+        others = [
+            zoo(("tip",)),
+            zoo(base="tip"),
+            zoo(locked={"lift": 0.1}),
+            zoo(coordinates=["hand"]),
+            zoo(joints=ZOO_JOINTS[::-1]),
+            Robot.from_urdf(ZOO.replace("0.3 -0.2 0.1", "0.3 -0.2 0"), ZOO_LINKS),
+        ]
+        assert all(zoo() != other for other in others)
+        assert zoo() != "zoo"
+
+    def test_config_is_a_copy(self, robot: Robot) -> None:
+        robot.config()["locked"]["lift"] = 7.0
+        assert robot.config()["locked"]["lift"] == 0.2
+
+    def test_repr_is_short_and_tells_what_it_is(self, robot: Robot) -> None:
+        assert repr(robot) == (
+            "Robot('zoo', n_joints=3, links=('cup', 'tip'), base='column', float32)"
+        )
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"color": "red"}, "color"),
+            ({"dtype": "int8"}, "int8"),
+            ({"urdf": "robot.urdf"}, "not a path"),
+            ({"links": ["cup", "nose"]}, "nose"),
+        ],
+    )
+    def test_a_tampered_config_is_refused(
+        self, robot: Robot, change: dict[str, Any], message: str
+    ) -> None:
+        with pytest.raises((DataError, UnknownNameError), match=message):
+            Robot.from_config(robot.config() | change)
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("settings", "error", "message"),
+        [
+            ({"links": "tip"}, DataError, "links is a sequence of names, got 'tip'"),
+            ({"links": ("tip", "tip")}, DataError, "links names something twice"),
+            ({"links": ("nose",)}, UnknownNameError, "link 'nose' is not in .* 'flange'"),
+            ({"base": "nose"}, UnknownNameError, "base link 'nose' is not in the URDF"),
+            ({"joints": ["lift", "knee"]}, UnknownNameError, "'knee' is not in .*'elbow'"),
+            ({"joints": ["weld"]}, UnknownNameError, "'weld' is not in the movable joints"),
+            ({"joints": ["lift", "lift"]}, DataError, "joints names something twice"),
+            ({"joints": ["wag_too"]}, DataError, "mimics 'elbow'.* choose or lock 'elbow'"),
+            ({"locked": {"knee": 0.0}}, UnknownNameError, "joint 'knee'"),
+            ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
+            ({"locked": {"lift": math.nan}}, DataError, "'lift' is locked at nan"),
+            ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
+            ({"coordinates": ["lift"]}, DataError, "'lift' is a joint of the URDF"),
+            ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
+            ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
+            ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),
+            ({"tools": {"cup": ("arm", np.zeros((2, 3)))}}, ShapeError, "one constant pose"),
+            ({"tools": {"cup": ("arm", [0, 0])}}, ShapeError, "position"),
+            ({"tools": {"cup": "arm"}}, DataError, "tool 'cup' is"),
+            ({"dtype": torch.float16}, DataError, "float16"),
+        ],
+    )
+    def test_wrong_settings(
+        self, settings: dict[str, Any], error: type[Exception], message: str
+    ) -> None:
+        with pytest.raises(error, match=message):
+            Robot.from_urdf(ZOO, **({"links": ("tip",)} | settings))
+
+    def test_a_wrong_number_of_joints_names_those_expected(self) -> None:
+        with pytest.raises(ShapeError, match=r"\(\.\.\., 5\).*'lift', 'swivel'.*got \(2, 4\)"):
+            zoo().state(torch.zeros(2, 4))
+        with pytest.raises(ShapeError, match=r"got \(\)"):
+            zoo().state(torch.zeros(()))
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_joints_that_are_not_finite(self, value: float) -> None:
+        with pytest.raises(DataError, match="NaN or infinite"):
+            zoo().state([0.0, value, 0.0, 0.0, 0.0])

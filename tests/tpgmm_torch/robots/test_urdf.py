@@ -1,0 +1,201 @@
+"""The URDF reader: what it reads, and what it refuses."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.robots.urdf import Mimic, read_urdf
+
+LINKS = '<link name="a"/><link name="b"/><link name="c"/>'
+
+
+def joint(name: str, parent: str, child: str, inside: str = "", kind: str = "revolute") -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f"{inside}</joint>"
+    )
+
+
+def urdf(*parts: str, links: str = LINKS) -> str:
+    return f'<robot name="r">{links}{"".join(parts)}</robot>'
+
+
+def one(inside: str = "", kind: str = "revolute") -> str:
+    return urdf(joint("j", "a", "b", inside, kind), links='<link name="a"/><link name="b"/>')
+
+
+class TestReading:
+    def test_names_are_in_document_order(self) -> None:
+        model = read_urdf(urdf(joint("two", "b", "c"), joint("one", "a", "b", kind="fixed")))
+        assert (model.name, model.root, model.links) == ("r", "a", ("a", "b", "c"))
+        assert [j.name for j in model.joints] == ["two", "one"]
+        assert model.actuated == ("two",)
+
+    def test_defaults_are_those_of_the_specification(self) -> None:
+        (j,) = read_urdf(one()).joints
+        assert j.axis.tolist() == [1, 0, 0]
+        assert (j.origin == np.eye(4)).all()
+        assert (j.lower, j.upper, j.velocity) == (-math.inf, math.inf, math.inf)
+        assert j.mimic is None
+
+    def test_one_given_limit_sets_the_other_to_zero(self) -> None:
+        (j,) = read_urdf(one('<limit upper="2" effort="1" velocity="3"/>')).joints
+        assert (j.lower, j.upper, j.velocity) == (0, 2, 3)
+
+    def test_continuous_joints_have_no_range(self) -> None:
+        (j,) = read_urdf(one('<limit lower="-1" upper="1" velocity="3"/>', "continuous")).joints
+        assert (j.lower, j.upper, j.velocity) == (-math.inf, math.inf, 3)
+
+    def test_origin_turns_about_fixed_axes_x_then_y_then_z(self) -> None:
+        (j,) = read_urdf(one('<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>')).joints
+
+        def turn(axis: int, angle: float) -> np.ndarray:
+            matrix = np.eye(3)
+            i, k = [index for index in range(3) if index != axis]
+            sign = -1 if axis == 1 else 1
+            matrix[i, i] = matrix[k, k] = math.cos(angle)
+            matrix[k, i] = sign * math.sin(angle)
+            matrix[i, k] = -matrix[k, i]
+            return matrix
+
+        expected = turn(2, 0.3) @ turn(1, 0.2) @ turn(0, 0.1)
+        np.testing.assert_allclose(j.origin[:3, :3], expected, atol=1e-15)
+        assert j.origin[:3, 3].tolist() == [1, 2, 3]
+        assert j.origin[3].tolist() == [0, 0, 0, 1]
+
+    def test_numbers_keep_float64(self) -> None:
+        (j,) = read_urdf(one('<origin xyz="0.1234567890123456 0 0"/>')).joints
+        assert j.origin[0, 3] == 0.1234567890123456
+
+    def test_axes_become_unit_vectors(self) -> None:
+        (j,) = read_urdf(one('<axis xyz="0 3 4"/>')).joints
+        assert j.axis.tolist() == [0, 0.6, 0.8]
+
+    def test_leaders_are_found_through_followers(self) -> None:
+        links = LINKS + '<link name="d"/>'
+        second = joint("second", "b", "c", '<mimic joint="first" multiplier="2" offset="1"/>')
+        third = joint("third", "c", "d", '<mimic joint="second" multiplier="-3"/>')
+        model = read_urdf(urdf(joint("first", "a", "b"), second, third, links=links))
+        assert model.actuated == ("first",)
+        assert model.leader("third") == Mimic("first", -6, -3)
+        assert model.leader("first") == Mimic("first", 1, 0)
+
+    def test_unknown_elements_are_passed_over(self) -> None:
+        extra = '<transmission name="t"><joint name="j"/></transmission><gazebo/><material/>'
+        assert read_urdf(one().replace("</robot>", extra + "</robot>")).actuated == ("j",)
+
+    def test_paths_strings_and_bytes_give_the_same(self, tmp_path: Path) -> None:
+        text = upper_body_urdf()
+        path = tmp_path / "robot.urdf"
+        path.write_text(text, encoding="utf-8")
+        sources = (text, "\ufeff\n" + text, text.encode(), text.encode("utf-8-sig"), path)
+        models = [read_urdf(source) for source in (*sources, str(path))]
+        assert {model.text for model in models} == {text}
+        assert {model.root for model in models} == {"base"}
+
+    def test_the_declared_encoding_counts(self) -> None:
+        text = '<?xml version="1.0" encoding="latin-1"?>' + one().replace('"j"', '"é"')
+        assert read_urdf(text.encode("latin-1")).actuated == ("é",)
+        assert read_urdf(text).actuated == ("é",)
+
+
+class TestRefusing:
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("<robot", "not well-formed XML"),
+            ("<urdf/>", "root element <robot>, got <urdf>"),
+            ("<robot/>", "no link"),
+            (urdf(links="<link/>"), "<link> number 1 of the URDF has no name"),
+            (urdf(links=LINKS + '<link name="a"/>'), "two links named 'a'"),
+            (urdf(joint("j", "a", "b"), joint("j", "b", "c")), "two joints named 'j'"),
+            (one().replace('name="j"', ""), "<joint> number 1 of the URDF has no name"),
+            (one().replace('type="revolute"', ""), "joint 'j' has type None"),
+            (one(kind="hinge"), "joint 'j' has type 'hinge'; URDF knows .*'revolute'"),
+            (one().replace('<parent link="a"/>', ""), "joint 'j' has no parent link"),
+            (one().replace('<child link="b"/>', "<child/>"), "joint 'j' has no child link"),
+            (
+                urdf(joint("j", "a", "c"), joint("k", "b", "c")),
+                "'c' is the child of two joints",
+            ),
+            (urdf(joint("j", "a", "b")), r"2 links without a parent, not one: \['a', 'c'\]"),
+            (urdf(joint("j", "a", "a")), r"2 links without a parent, not one: \['b', 'c'\]"),
+            (urdf(joint("j", "b", "c"), joint("k", "c", "b")), r"cycle.*\['b', 'c'\]"),
+            (urdf(joint("j", "a", "a"), links='<link name="a"/>'), r"cycle.*\['a'\]"),
+            (one('<axis xyz="0 0 0"/>'), "joint 'j' has the axis 0 0 0"),
+            (one('<axis xyz="0 1"/>'), "<axis xyz> needs 3 finite number.*got '0 1'"),
+            (one('<origin xyz="0 nan 0"/>'), "<origin xyz> needs 3 finite"),
+            (one('<origin rpy="0 ${pi} 0"/>'), "<origin rpy> needs 3 finite"),
+            (one('<limit lower="low" upper="1"/>'), "<limit lower> needs 1 finite"),
+            (one('<limit lower="2" upper="1"/>'), "lower=2, upper=1"),
+            (one('<limit velocity="-1"/>'), "velocity=-1"),
+            (one("<mimic/>"), "<mimic> does not name a joint"),
+            (one('<mimic joint="j" offset="x"/>'), "<mimic offset>"),
+            (
+                '<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>',
+                "xacro macros",
+            ),
+        ],
+    )
+    def test_broken_descriptions(self, text: str, message: str) -> None:
+        with pytest.raises(DataError, match=message):
+            read_urdf(text)
+
+    @pytest.mark.parametrize("ends", [("a", "hand"), ("hand", "a")])
+    def test_links_that_do_not_exist(self, ends: tuple[str, str]) -> None:
+        message = r"link 'hand' is not in the URDF \(joint 'j'\); it has \['a', 'b', 'c'\]"
+        with pytest.raises(UnknownNameError, match=message):
+            read_urdf(urdf(joint("j", *ends)))
+
+    @pytest.mark.parametrize("kind", ["fixed", "floating"])
+    def test_mimicry_of_what_does_not_move_is_refused_where_it_matters(self, kind: str) -> None:
+        follower = joint("j", "a", "b", '<mimic joint="k"/>')
+        for other in (joint("k", "b", "c", kind=kind), joint("l", "b", "c")):
+            model = read_urdf(urdf(follower, other))
+            with pytest.raises(UnknownNameError, match=r"joint 'k' .* 'j' mimics it"):
+                model.leader("j")
+
+    @pytest.mark.parametrize("leaders", [("one", "two"), ("two", "one"), ("two", "two")])
+    def test_mimicry_in_a_circle_is_refused_where_it_matters(
+        self, leaders: tuple[str, str]
+    ) -> None:
+        first, second = (f'<mimic joint="{leader}"/>' for leader in leaders)
+        model = read_urdf(urdf(joint("one", "a", "b", first), joint("two", "b", "c", second)))
+        with pytest.raises(DataError, match=r"'one' follows joints .* in a circle"):
+            model.leader("one")
+
+    @pytest.mark.parametrize(
+        "entities",
+        [
+            '<!ENTITY a "1"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">',
+            '<!ENTITY secret SYSTEM "file:///etc/hostname">',
+            "",
+        ],
+    )
+    def test_document_types_are_refused_before_they_expand(self, entities: str) -> None:
+        text = f"<!DOCTYPE robot [{entities}]>" + one()
+        with pytest.raises(DataError, match="document type"):
+            read_urdf('<?xml version="1.0"?>' + text)
+        with pytest.raises(DataError, match="document type"):
+            read_urdf(text)
+
+    def test_files_that_are_not_there(self, tmp_path: Path) -> None:
+        for source in (tmp_path / "none.urdf", str(tmp_path), "none\0.urdf", ""):
+            with pytest.raises(DataError, match="cannot be read"):
+                read_urdf(source)
+
+    @pytest.mark.parametrize(
+        "data",
+        [
+            b"\xff\xfe<\x00",
+            b'<?xml version="1.0" encoding="klingon"?><robot/>',
+            b'<?xml version="1.0" encoding="hex"?><robot/>',
+        ],
+    )
+    def test_bytes_that_are_not_text(self, data: bytes) -> None:
+        with pytest.raises(DataError, match="not text in the encoding"):
+            read_urdf(data)

@@ -1,0 +1,128 @@
+"""Pictures: what their artists hold, not only that they are drawn."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.collections import PolyCollection
+from matplotlib.patches import Ellipse
+
+from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
+from tests.support.worlds import OnPoses
+from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.plotting import figure, plot_candidates, plot_components, plot_local, shade
+
+
+def joints_model() -> TaskParameterizedGMM:
+    return TaskParameterizedGMM(4, blend=0.0).fit(waves())
+
+
+def test_panels_share_the_time_axis():
+    drawing = figure(3, "a title")
+    axes = drawing.axes
+    assert len(axes) == 3
+    axes[0].set_xlim(1, 2)
+    assert axes[2].get_xlim() == (1, 2)
+    assert [a.get_xlabel() for a in axes] == ["", "", "time [s]"]
+    assert drawing.get_suptitle() == "a title"
+
+
+def test_figures_need_no_window_and_no_closing():
+    script = "import sys; from tpgmm_torch.plotting import figure; figure(1, ''); "
+    script += "sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[plot\]"):
+        figure(1, "")
+
+
+def test_phases_are_bands_with_names():
+    [axes] = figure(1, "").axes
+    shade(axes, {"reach": (0.5, 1.5), "shake": (2.0, 4.0)})
+    assert [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches] == [
+        (0.5, 1.5),
+        (2.0, 4.0),
+    ]
+    assert [(t.get_text(), t.xy[0]) for t in axes.texts] == [("reach", 1.0), ("shake", 3.0)]
+
+
+def test_components_are_contours_of_one_standard_deviation():
+    model, [axes] = joints_model(), figure(1, "").axes
+    plot_components(axes, model, operator=0, column=1)
+    ellipses = [p for p in axes.patches if isinstance(p, Ellipse)]
+    assert len(ellipses) == 4
+    plane = [0, 2]
+    for ellipse, mean, covariance in zip(
+        ellipses, model.means_[0].numpy(), model.covariances_[0].numpy(), strict=True
+    ):
+        np.testing.assert_allclose(ellipse.center, mean[plane])
+        # points of the contour are one standard deviation away, all around
+        angles = np.linspace(0, 2 * np.pi, 7)
+        circle = np.stack((np.cos(angles), np.sin(angles)), axis=1) / 2
+        turn = np.radians(ellipse.angle)
+        rotate = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        rim = circle * [ellipse.width, ellipse.height] @ rotate.T
+        square = np.einsum("ni,ij,nj->n", rim, np.linalg.inv(covariance[plane][:, plane]), rim)
+        np.testing.assert_allclose(square, 1, rtol=1e-6)
+
+
+def test_local_coordinates_are_those_of_the_operator():
+    demonstrations, [axes] = handlings(2), figure(1, "").axes
+    [trajectory] = hands().predict(demonstrations[:1])
+    reproduction = trajectory, demonstrations[0].frames, {"linestyle": "--"}
+    plot_local(axes, hands(), 0, 2, demonstrations, [reproduction])
+    motion = Demonstration(trajectory.time, trajectory.joints, demonstrations[0].frames)
+    assert len(axes.lines) == 3
+    for line, source in zip(axes.lines, [*demonstrations, motion], strict=True):
+        np.testing.assert_array_equal(line.get_xdata(), source.time)
+        wanted = HANDLING[0].local(source, HANDS)[:, 2]
+        np.testing.assert_array_equal(np.abs(line.get_ydata()), wanted.abs())
+    assert axes.lines[2].get_linestyle() == "--"
+    assert axes.lines[2].get_color() != axes.lines[0].get_color()
+    assert len([p for p in axes.patches if isinstance(p, Ellipse)]) == 6
+
+
+def test_quaternions_are_drawn_on_the_side_of_the_components():
+    [demonstration], [axes] = handlings(1), figure(1, "").axes
+    flipped = Demonstration(
+        demonstration.time,
+        OnPoses().flipped_answer(demonstration.joints),
+        demonstration.frames,
+    )
+    plot_local(axes, hands(), 0, 3, [demonstration, flipped])
+    one, other = (line.get_ydata() for line in axes.lines)
+    np.testing.assert_allclose(one, other)
+    means = hands().means_[0][:, 4].numpy()
+    assert np.sign(one.mean()) == np.sign(means.mean())
+
+
+def test_candidates_are_drawn_with_their_spread():
+    model, [axes] = joints_model(), figure(1, "").axes
+    [trajectory] = model.predict([Situation([0.0, 1.0, 0.0])])
+    plot_candidates(axes, trajectory, "b", ["canonical"])
+    candidate, column = trajectory.candidates[0], JOINT_NAMES.index("b")
+    own, result = axes.lines
+    np.testing.assert_array_equal(own.get_ydata(), candidate.mean[:, column])
+    np.testing.assert_array_equal(result.get_ydata(), trajectory.joints[:, column])
+    assert [line.get_label() for line in axes.lines] == ["canonical", "TP-GMM"]
+    [band] = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    spread = candidate.covariance[:, column, column].sqrt()
+    height = torch.from_numpy(band.get_paths()[0].vertices[:, 1])
+    assert float(height.max()) == pytest.approx(float((candidate.mean[:, 1] + spread).max()))
+    assert float(height.min()) == pytest.approx(float((candidate.mean[:, 1] - spread).min()))
+    assert axes.get_ylabel() == "b [rad]"
+
+
+def test_a_figure_is_written(tmp_path):
+    [trajectory] = joints_model().predict([Situation([0.0, 1.0, 0.0])])
+    drawing = figure(3, "joints")
+    for axes, joint in zip(drawing.axes, JOINT_NAMES, strict=True):
+        plot_candidates(axes, trajectory, joint)
+    drawing.savefig(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,60 @@
+"""An operator's tolerance: agreement finer than that is not taken at its word."""
+
+import pytest
+import torch
+
+from tests.support.skills import bottle_demonstrations, bottle_model, generator, waves
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_torch import AbsolutePosition, Canonical, Stack, TaskParameterizedGMM
+
+
+@pytest.mark.parametrize("covariance_type", ["full", "diag", "tied", "spherical"])
+@pytest.mark.parametrize("tolerance", [0.02, 0.1])
+def test_no_canonical_variance_is_below_the_squared_tolerance(covariance_type, tolerance):
+    model = TaskParameterizedGMM(
+        6, [Canonical(tolerance)], covariance_type=covariance_type, reg_covar=0.0
+    ).fit(waves())
+    smallest = torch.linalg.eigvalsh(model.covariances_[0][:, 1:, 1:]).min()
+    assert smallest > 0.999 * tolerance**2
+
+
+def test_time_has_no_tolerance():
+    exact, tolerant = (
+        TaskParameterizedGMM(1, [Canonical(tolerance)]).fit(waves()) for tolerance in (0.0, 0.1)
+    )
+    torch.testing.assert_close(
+        tolerant.covariances_[0][:, 0, 0], exact.covariances_[0][:, 0, 0], rtol=1e-12, atol=0
+    )
+
+
+def test_it_is_an_absolute_variance_whatever_the_spread_of_the_data():
+    added = []
+    for tolerance in (0.0, 0.03):
+        model = TaskParameterizedGMM(1, [Canonical(tolerance)]).fit(waves())
+        added.append(model.covariances_[0][0].diagonal()[1:])
+    torch.testing.assert_close(added[1] - added[0], torch.full((3,), 0.03**2).double())
+
+
+def test_a_stack_has_the_tolerances_of_its_members():
+    stack = Stack(AbsolutePosition("l_hand"), Canonical(0.01))
+    assert stack.tolerances(generator().robot) == (0.0,) * 3 + (0.01,) * 17
+
+
+def test_with_ten_demonstrations_it_keeps_the_joints_from_contradicting_the_task():
+    """Without it relations that the joints keep by chance pull the hands off the bottle."""
+    situations = generator().situations(8, seed=21)
+    time = bottle_demonstrations()[0].time
+    grasp = sum(d.events["grasp"] for d in bottle_demonstrations()) / len(
+        bottle_demonstrations()
+    )
+    contact = int(torch.searchsorted(time, grasp))
+    task, _ = bottle_operators()
+    errors = {}
+    for tolerance in (0.0, Canonical().tolerance):
+        model = bottle_model(30).set_params(operators=[task, Canonical(tolerance)])
+        reproductions = model.fit(bottle_demonstrations()).predict(situations, candidates=False)
+        errors[tolerance] = sum(
+            float(generator().grasp_error(r.joints[contact], s.frames["bottle"])[0])
+            for r, s in zip(reproductions, situations, strict=True)
+        )
+    assert errors[Canonical().tolerance] < errors[0.0] / 3

@@ -1,0 +1,281 @@
+"""What goes into a model: frames, demonstrations and new situations.
+
+SI units and radians; quaternions (w, x, y, z). Everything given as numpy array, list or
+tensor is copied once into tensors, by default of float64; nothing is modified in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+
+__all__ = ["Demonstration", "Situation", "check_demonstrations"]
+
+
+def _checked_time(values: Any) -> Tensor:
+    time = as_tensor(values, "time")
+    if time.ndim != 1 or len(time) == 0:
+        raise ShapeError(f"time has shape (T,) with T >= 1, got {tuple(time.shape)}")
+    steps = time.diff()
+    if bool((steps <= 0).any()):
+        at = int(torch.nonzero(steps <= 0)[0])
+        raise DataError(
+            f"time must increase strictly: it goes from {time[at]:.6g} to {time[at + 1]:.6g} s "
+            f"at index {at + 1}"
+        )
+    return time
+
+
+def _checked_frames(
+    frames: Mapping[str, Frame] | None, length: int | None
+) -> Mapping[str, Frame]:
+    """Check types and lengths; without ``length``, frames per time step share one."""
+    frames = dict(frames or {})
+    for name, frame in frames.items():
+        if not isinstance(name, str) or not isinstance(frame, Frame):
+            raise DataError(
+                f"frames maps names to Frame objects, got {name!r}: {type(frame).__name__}"
+            )
+        if length is None and frame.batch_shape:
+            length = frame.batch_shape[0]
+        if frame.batch_shape not in ((), (length,)):
+            raise ShapeError(
+                f"frame {name!r} has leading shape {tuple(frame.batch_shape)}; "
+                f"it is one pose, (), or one per time step, ({length},)"
+            )
+    return MappingProxyType(frames)
+
+
+class _PlainFrames:
+    """Pickle the read-only views of frames and events as plain dicts."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in vars(self).items()
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for key, value in state.items():
+            value = MappingProxyType(value) if isinstance(value, dict) else value
+            object.__setattr__(self, key, value)
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration(_PlainFrames):
+    """One demonstration of a skill: T_m datapoints and the frames they were made in.
+
+    Parameters
+    ----------
+    time : array-like of shape (T,)
+        Seconds, strictly increasing.
+    joints : array-like of shape (T, n_joints)
+        Joint positions q_t [rad or m], in the order of the robot. Coordinates without
+        kinematics (a gripper) are joints too.
+    frames : mapping of str to Frame, optional
+        Object poses by name, constant or one per time step.
+    joint_names : sequence of str, optional
+        Names of the columns of ``joints``; with them a robot may have another order.
+    events : mapping of str to float, optional
+        Instants that matter, by name [s], for example ``{"grasp": 4.2}``.
+
+    Raises
+    ------
+    ShapeError, DataError
+        If shapes do not match, a value is not finite, or time does not increase.
+
+    Examples
+    --------
+    >>> demonstration = Demonstration(
+    ...     time=[0.0, 0.1, 0.2],
+    ...     joints=[[0.0, 1.0], [0.1, 0.9], [0.2, 0.7]],
+    ...     frames={"cup": Frame([0.4, 0.0, 0.1])},
+    ...     joint_names=["shoulder", "elbow"],
+    ... )
+    >>> demonstration
+    Demonstration(3 steps, 0.20 s, 2 joints, frames=['cup'], events={})
+    >>> demonstration.reordered(["elbow"]).joints[:, 0].tolist()
+    [1.0, 0.9, 0.7]
+    """
+
+    time: Tensor
+    joints: Tensor
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    joint_names: tuple[str, ...] | None = None
+    events: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        time = _checked_time(self.time)
+        joints = as_tensor(self.joints, "joints")
+        if joints.ndim != 2 or len(joints) != len(time):
+            raise ShapeError(
+                f"joints has shape (T, n_joints) with T = {len(time)} as in time, "
+                f"got {tuple(joints.shape)}"
+            )
+        names = None if self.joint_names is None else tuple(self.joint_names)
+        if names is not None and not len(set(names)) == len(names) == joints.shape[1]:
+            raise ShapeError(
+                f"joint_names needs {joints.shape[1]} different names, got {names}"
+            )
+        events = {str(name): float(at) for name, at in dict(self.events).items()}
+        for name, at in events.items():
+            if not time[0] <= at <= time[-1]:
+                raise DataError(
+                    f"event {name!r} at {at} s lies outside the demonstration, "
+                    f"{time[0]:.6g} to {time[-1]:.6g} s"
+                )
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "joints", joints)
+        object.__setattr__(self, "frames", _checked_frames(self.frames, len(time)))
+        object.__setattr__(self, "joint_names", names)
+        object.__setattr__(self, "events", MappingProxyType(events))
+
+    def __len__(self) -> int:
+        """Number of time steps T."""
+        return len(self.time)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints."""
+        return self.joints.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last time step."""
+        return float(self.time[-1] - self.time[0])
+
+    def frame(self, name: str) -> Frame:
+        """The frame of that name.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none; the message lists those that exist.
+        """
+        if name not in self.frames:
+            raise UnknownNameError("frame", name, "the demonstration", self.frames)
+        return self.frames[name]
+
+    def reordered(self, joint_names: Sequence[str]) -> Demonstration:
+        """The same demonstration with its joint columns in the order of ``joint_names``.
+
+        Other columns are left out. Without names of its own its order is trusted.
+
+        Raises
+        ------
+        UnknownNameError
+            If one of the names is not among the demonstration's.
+        """
+        if self.joint_names is None or self.joint_names == tuple(joint_names):
+            return self
+        for name in joint_names:
+            if name not in self.joint_names:
+                raise UnknownNameError("joint", name, "the demonstration", self.joint_names)
+        columns = [self.joint_names.index(name) for name in joint_names]
+        return replace(self, joints=self.joints[:, columns], joint_names=tuple(joint_names))
+
+    def __repr__(self) -> str:
+        return (
+            f"Demonstration({len(self)} steps, {self.duration:.2f} s, {self.n_joints} joints, "
+            f"frames={sorted(self.frames)}, events={dict(self.events)})"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Situation(_PlainFrames):
+    """A new situation: where the robot starts and where the objects are.
+
+    Parameters
+    ----------
+    joints : array-like of shape (n_joints,)
+        The start posture q_0 [rad or m].
+    frames : mapping of str to Frame, optional
+        Object poses by name, constant or one per time step of ``time``.
+    time : array-like of shape (T,), optional
+        When references are wanted [s]; by default the time grid that the model learned.
+
+    Raises
+    ------
+    ShapeError, DataError
+        If shapes do not match, a value is not finite, or time does not increase.
+
+    Examples
+    --------
+    >>> situation = Situation(joints=[0.0, 1.0], frames={"cup": Frame([0.4, 0.0, 0.1])})
+    >>> list(situation.frames)
+    ['cup']
+    """
+
+    joints: Tensor
+    frames: Mapping[str, Frame] = field(default_factory=dict)
+    time: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        joints = as_tensor(self.joints, "the start posture")
+        if joints.ndim != 1:
+            raise ShapeError(
+                f"the start posture has shape (n_joints,), got {tuple(joints.shape)}"
+            )
+        time = None if self.time is None else _checked_time(self.time)
+        length = None if time is None else len(time)
+        object.__setattr__(self, "joints", joints)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "frames", _checked_frames(self.frames, length))
+
+    @classmethod
+    def of(cls, demonstration: Demonstration) -> Situation:
+        """The situation that a demonstration was made in: its start, frames and time grid."""
+        return cls(demonstration.joints[0], demonstration.frames, demonstration.time)
+
+
+def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
+    """Check what a user passes as ``X``: a non-empty sequence of like demonstrations.
+
+    Returns
+    -------
+    list of Demonstration
+        With their joints in the order of the first that names them.
+
+    Raises
+    ------
+    DataError
+        If it is something else, empty, or its members differ in joints or frames.
+    """
+    if isinstance(demonstrations, Demonstration):
+        raise DataError("expected a list of demonstrations, got one: wrap it, [demonstration]")
+    try:
+        checked = list(demonstrations)
+    except TypeError:
+        name = type(demonstrations).__name__
+        raise DataError(f"expected a list of Demonstration, got {name}") from None
+    if not checked:
+        raise DataError("expected at least one demonstration, got an empty list")
+    for index, item in enumerate(checked):
+        if not isinstance(item, Demonstration):
+            raise DataError(
+                f"expected a list of Demonstration, item {index} is {type(item).__name__}"
+            )
+    first, names = checked[0], next((d.joint_names for d in checked if d.joint_names), ())
+    for index, item in enumerate(checked):
+        if item.n_joints != first.n_joints:
+            raise ShapeError(
+                f"demonstration {index} has {item.n_joints} joints, the first has "
+                f"{first.n_joints}"
+            )
+        if set(item.joint_names or names) != set(names):
+            raise DataError(
+                f"demonstration {index} has joint_names {item.joint_names}, another {names}"
+            )
+        if set(item.frames) != set(first.frames):
+            raise DataError(
+                f"demonstration {index} has frames {sorted(item.frames)}, the first has "
+                f"{sorted(first.frames)}"
+            )
+    return [item.reordered(names) for item in checked]

@@ -1,0 +1,1 @@
+"""Expectation-maximisation for mixtures with block-diagonal covariances."""

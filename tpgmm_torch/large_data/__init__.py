@@ -1,0 +1,1 @@
+"""Data larger than memory, and learning by several processes."""

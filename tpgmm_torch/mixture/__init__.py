@@ -1,0 +1,1 @@
+"""The mixture over blocks of columns, as a scikit-learn estimator."""

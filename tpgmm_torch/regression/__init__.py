@@ -1,0 +1,1 @@
+"""Gaussian mixture regression in joint space: from a mixture to one joint reference."""

@@ -1,0 +1,1 @@
+"""Robots and other sources of link poses and Jacobians."""

@@ -1,0 +1,64 @@
+"""Joints without links: what a model has when it is given no robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+
+__all__ = ["JointSpace"]
+
+
+class JointSpace(Kinematics):
+    """A joint vector and nothing else: enough for :class:`Canonical` alone.
+
+    Parameters
+    ----------
+    joint_names : sequence of str
+    dtype : torch.dtype, default=torch.float64
+    device : str, default="cpu"
+    """
+
+    def __init__(
+        self,
+        joint_names: Sequence[str],
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.joint_names = tuple(joint_names)
+        self.links = ()
+        unbounded = torch.full((len(self.joint_names),), torch.inf, dtype=dtype, device=device)
+        self.lower, self.upper, self.velocity = -unbounded, unbounded, unbounded
+
+    def state(self, joints: Any) -> RobotState:
+        """The state with no link in it; see :meth:`Kinematics.state`."""
+        joints = self.joint_tensor(joints)
+        batch = joints.shape[:-1]
+        return RobotState(
+            joints,
+            (),
+            joints.new_zeros(*batch, 0, 3),
+            joints.new_zeros(*batch, 0, 4),
+            joints.new_zeros(*batch, 0, 6, self.n_joints),
+        )
+
+    def config(self) -> dict[str, Any]:
+        """What :meth:`from_config` needs, ready for JSON."""
+        return {"joint_names": list(self.joint_names)}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> JointSpace:
+        """The inverse of :meth:`config`."""
+        return cls(config["joint_names"])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, JointSpace) and self.joint_names == other.joint_names
+
+    def __hash__(self) -> int:
+        return hash(self.joint_names)
+
+    def __repr__(self) -> str:
+        return f"JointSpace({len(self.joint_names)} joints)"

@@ -1,0 +1,204 @@
+"""The part of a URDF that moves some links with respect to a base: a tree of moving frames.
+
+:func:`reduce` hangs the tree on the base link, whichever it is, keeps the joints on the way
+from there to the wanted links, and folds all that does not move (fixed and locked joints,
+tools) into constant matrices. Seen from the base a joint on the way *up* to the root turns
+the other way round, so a base that is itself moved by joints needs no formulas of its own.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfJoint, UrdfModel
+
+__all__ = ["Attachment", "MovingFrame", "MovingTree", "reduce"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MovingFrame:
+    """The frame behind one moving joint.
+
+    Its pose is the parent's pose times ``offset`` times the motion by
+    ``multiplier * q[joint] + shift`` about (or along) ``axis``.
+
+    Attributes
+    ----------
+    parent : int
+        Index of the moving frame that carries it; -1 is the base.
+    offset : ndarray of shape (4, 4)
+        Pose of the joint in the parent frame.
+    axis : ndarray of shape (3,)
+        Unit vector in the frame.
+    prismatic : bool
+        Whether it slides instead of turning.
+    joint : int
+        Position in the joint vector of the joint that moves it.
+    multiplier, shift : float
+        How it follows that joint; 1 and 0 unless it mimics.
+    """
+
+    parent: int
+    offset: Array
+    axis: Array
+    prismatic: bool
+    joint: int
+    multiplier: float
+    shift: float
+
+
+@dataclass(frozen=True, eq=False)
+class Attachment:
+    """Where something sits: ``pose`` (4, 4) in the moving frame ``frame``; -1 is the base."""
+
+    frame: int
+    pose: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MovingTree:
+    """Moving frames, parents first, and where the wanted links sit on them."""
+
+    frames: tuple[MovingFrame, ...]
+    links: tuple[Attachment, ...]
+
+    def moved_by(self, frame: int) -> set[int]:
+        """Indices of the moving frames from the base to ``frame``, itself included."""
+        moving: set[int] = set()
+        while frame >= 0:
+            moving.add(frame)
+            frame = self.frames[frame].parent
+        return moving
+
+
+def reduce(
+    model: UrdfModel,
+    base: str,
+    links: Sequence[tuple[str, Array]],
+    joints: Mapping[str, int],
+    locked: Mapping[str, float],
+) -> MovingTree:
+    """Reduce a description to what moves ``links`` with respect to ``base``.
+
+    Parameters
+    ----------
+    model : UrdfModel
+    base : str
+        The link that stands still.
+    links : sequence of (str, ndarray of shape (4, 4))
+        The wanted poses: a link and a pose in it.
+    joints : mapping of str to int
+        Position in the joint vector of each actuated joint that is used.
+    locked : mapping of str to float
+        Values at which all other actuated joints stand [rad or m].
+
+    Returns
+    -------
+    MovingTree
+
+    Raises
+    ------
+    DataError
+        If a joint of several degrees of freedom lies between the base and a link.
+    """
+    frames: list[MovingFrame] = []
+    places = {base: Attachment(-1, np.eye(4))}
+    steps = _steps_from(model, base)
+    for link, _ in links:
+        for joint, near, far in _way(steps, base, link):
+            if far not in places:
+                places[far] = _cross(model, joint, near, places[near], joints, locked, frames)
+    attached = [
+        Attachment(places[link].frame, places[link].pose @ pose) for link, pose in links
+    ]
+    return MovingTree(tuple(frames), tuple(attached))
+
+
+def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:
+    """The last step from the base to each other link: the joint, and the link before it."""
+    neighbours: dict[str, list[tuple[UrdfJoint, str]]] = {link: [] for link in model.links}
+    for joint in model.joints:
+        neighbours[joint.parent].append((joint, joint.child))
+        neighbours[joint.child].append((joint, joint.parent))
+    steps: dict[str, tuple[UrdfJoint, str]] = {}
+    front = [base]
+    while front:
+        near = front.pop()
+        for joint, far in neighbours[near]:
+            if far != base and far not in steps:
+                steps[far] = joint, near
+                front.append(far)
+    return steps
+
+
+def _way(
+    steps: Mapping[str, tuple[UrdfJoint, str]], base: str, link: str
+) -> list[tuple[UrdfJoint, str, str]]:
+    """Joint, near link and far link of each step from the base to ``link``."""
+    way = []
+    while link != base:
+        joint, near = steps[link]
+        way.append((joint, near, link))
+        link = near
+    return way[::-1]
+
+
+def _cross(
+    model: UrdfModel,
+    joint: UrdfJoint,
+    near: str,
+    place: Attachment,
+    joints: Mapping[str, int],
+    locked: Mapping[str, float],
+    frames: list[MovingFrame],
+) -> Attachment:
+    """Where the far link of a joint sits; a joint that moves adds its frame to ``frames``."""
+    if joint.type in MULTIPLE_TYPES:
+        raise DataError(
+            f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
+            "joints of several degrees of freedom are not supported; give a base beyond it, or "
+            "describe it by prismatic and revolute joints"
+        )
+    downwards = joint.parent == near
+    before = place.pose @ joint.origin if downwards else place.pose
+    after = np.eye(4) if downwards else _inverse(joint.origin)
+    if not joint.movable:
+        return Attachment(place.frame, before @ after)
+    leader = model.leader(joint.name)
+    axis = joint.axis if downwards else -joint.axis
+    if leader.joint in joints:
+        prismatic, column = joint.type == "prismatic", joints[leader.joint]
+        frames.append(
+            MovingFrame(
+                place.frame, before, axis, prismatic, column, leader.multiplier, leader.offset
+            )
+        )
+        return Attachment(len(frames) - 1, after)
+    value = leader.multiplier * locked[leader.joint] + leader.offset
+    return Attachment(place.frame, before @ _motion(joint.type, axis, value) @ after)
+
+
+def _motion(kind: str, axis: Array, value: float) -> Array:
+    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation)."""
+    matrix = np.eye(4)
+    if kind == "prismatic":
+        matrix[:3, 3] = value * axis
+        return matrix
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn = math.sin(value) * cross + (1.0 - math.cos(value)) * (cross @ cross)
+    matrix[:3, :3] += turn
+    return matrix
+
+
+def _inverse(pose: Array) -> Array:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse

@@ -1,0 +1,284 @@
+"""Robots described by a URDF."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots.forward_kinematics import TreeKinematics
+from tpgmm_torch.robots.kinematic_tree import reduce
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
+from tpgmm_torch.robots.urdf import UrdfModel, read_urdf
+
+__all__ = ["Kinematics", "Robot", "RobotState"]
+
+
+class Robot(Kinematics):
+    """A robot described by a URDF; made by :meth:`from_urdf`.
+
+    All links come from one pass through the tree, so that arms which
+    share a waist share its columns in the stacked Jacobian. Two robots are equal if their
+    descriptions and settings are; the device does not count.
+    """
+
+    @classmethod
+    def from_urdf(
+        cls,
+        urdf: str | bytes | os.PathLike[str],
+        links: Sequence[str],
+        *,
+        joints: Sequence[str] | None = None,
+        locked: Mapping[str, float] | None = None,
+        coordinates: Sequence[str] = (),
+        base: str | None = None,
+        tools: Mapping[str, Sequence[Any]] | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> Self:
+        """Build the kinematics of some links of a URDF.
+
+        Parameters
+        ----------
+        urdf : path, str or bytes
+            A file, or the text itself (bytes, or a string that begins with ``<``).
+        links : sequence of str
+            Names of the links (or ``tools``) whose poses are wanted.
+        joints : sequence of str, optional
+            Names and order of the joint vector. The default is every movable joint that is
+            neither locked nor mimics another, in document order. The others stand still.
+        locked : mapping of str to float, optional
+            Where joints stand that are not in the joint vector [rad or m], 0 by default.
+        coordinates : sequence of str, default=()
+            Members of the joint vector without kinematics, like a gripper's opening. They
+            follow the joints unless ``joints`` names them.
+        base : str, optional
+            The link in whose frame everything is expressed; it may itself be moved by
+            joints. The default is the root.
+        tools : mapping of str to (str, Frame), optional
+            New links by name, each with its parent link and its pose there; also
+            ``(parent, position, quaternion)``.
+        dtype : torch.dtype, default=torch.float64
+            Or float32.
+        device : torch.device or str, default="cpu"
+
+        Returns
+        -------
+        Robot
+
+        Raises
+        ------
+        DataError
+            If the description cannot be read, or the settings contradict it or one another.
+        UnknownNameError
+            If a link or a joint is not in the URDF.
+
+        Examples
+        --------
+        >>> urdf = '''<robot name="lift"><link name="base"/><link name="hand"/>
+        ... <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/>
+        ... <axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
+        ... </robot>'''
+        >>> robot = Robot.from_urdf(urdf, links=["hand"])
+        >>> robot.state([0.3]).position("hand").tolist()
+        [0.0, 0.0, 0.3]
+        """
+        model = read_urdf(urdf)
+        extra = _names("coordinates", coordinates)
+        fixed = dict(locked or {})
+        if joints is None:
+            joints = [name for name in model.actuated if name not in fixed]
+        columns = _names("joints", joints)
+        columns += tuple(name for name in extra if name not in columns)
+        _check_joints(model, columns, extra, fixed)
+        config = {
+            "urdf": model.text,
+            "links": list(_names("links", links)),
+            "joints": list(columns),
+            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in columns},
+            "coordinates": list(extra),
+            "base": model.root if base is None else base,
+            "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
+            "dtype": dtype_name(dtype),
+        }
+        return cls(model, config, device)
+
+    def __init__(
+        self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
+    ) -> None:
+        self._config = config
+        self._name = model.name
+        self.joint_names = tuple(config["joints"])
+        self.links = tuple(config["links"])
+        column = {name: i for i, name in enumerate(self.joint_names) if name in model.joint}
+        tree = reduce(model, *_wanted(model, config), column, config["locked"])
+        options: dict[str, Any] = {"dtype": dtype_named(config["dtype"]), "device": device}
+        # a robot made while inference mode is on must serve where gradients are wanted, and
+        # the library puts some of its constants on the default device
+        with torch.inference_mode(False), torch.device("cpu"):
+            limits = _limits(model, self.joint_names).to(**options)
+            self.lower, self.upper, self.velocity = limits
+            self.forward_kinematics = TreeKinematics(tree, self.n_joints, **options)
+
+    def state(self, joints: Any) -> RobotState:
+        """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
+
+        Raises
+        ------
+        ShapeError, DataError
+            If there are more or fewer joints than ``joint_names``, or a value is not finite.
+        """
+        joints = self.joint_tensor(joints)
+        batch = joints.shape[:-1]
+        # to a compiler, one robot is a batch as well
+        alone = not torch.compiler.is_compiling() and batch.numel() == 1
+        if len(batch) == (0 if alone else 1):
+            return RobotState(joints, self.links, *self.forward_kinematics(joints))
+        rows = (self.n_joints,) if alone else (batch.numel(), self.n_joints)
+        parts = self.forward_kinematics(joints.reshape(rows))
+        poses = (part.reshape(batch + part.shape[len(rows) - 1 :]) for part in parts)
+        return RobotState(joints, self.links, *poses)
+
+    def to(
+        self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
+    ) -> Self:
+        """The robot of another dtype or on another device; itself if nothing changes."""
+        name = dtype_name(dtype or self.lower.dtype)
+        device = self.lower.device if device is None else torch.device(device)
+        if name == self._config["dtype"] and device == self.lower.device:
+            return self
+        return self.from_config({**self._config, "dtype": name}, device)
+
+    def config(self) -> dict[str, Any]:
+        """Everything that defines the robot but its device, ready for JSON."""
+        return copy.deepcopy(self._config)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
+        """The robot that gave this :meth:`config`."""
+        settings = dict(config)
+        dtype = dtype_named(settings.pop("dtype", None))
+        expected = {"urdf", "links", "joints", "locked", "coordinates", "base", "tools"}
+        text = settings.get("urdf")
+        if set(settings) != expected:
+            raise DataError(
+                f"a robot's configuration has the keys {sorted(expected)} and 'dtype', got "
+                f"{sorted(settings)}"
+            )
+        if not isinstance(text, str) or not text.startswith("<"):
+            raise DataError("a robot's configuration holds the text of its URDF, not a path")
+        return cls.from_urdf(**settings, dtype=dtype, device=device)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and other._config == self._config
+
+    def __hash__(self) -> int:
+        return hash((type(self), json.dumps(self._config, sort_keys=True)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self).from_config, (self._config, str(self.lower.device))
+
+    def __repr__(self) -> str:
+        dtype = "" if self._config["dtype"] == "float64" else f", {self._config['dtype']}"
+        return (
+            f"Robot({self._name!r}, n_joints={self.n_joints}, links={self.links}, "
+            f"base={self._config['base']!r}{dtype})"
+        )
+
+
+def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
+    listed = () if isinstance(names, str) else tuple(names)
+    if isinstance(names, str) or not all(isinstance(name, str) for name in listed):
+        raise DataError(f"{argument} is a sequence of names, got {names!r}")
+    if len(set(listed)) < len(listed):
+        raise DataError(f"{argument} names something twice: {list(listed)}")
+    return listed
+
+
+def _check_joints(
+    model: UrdfModel,
+    columns: Sequence[str],
+    coordinates: Sequence[str],
+    locked: Mapping[str, float],
+) -> None:
+    """Whether each coordinate, joint and locked joint can be what it is said to be."""
+    for name in coordinates:
+        if name in model.joint:
+            raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
+    for name in (*(name for name in columns if name not in coordinates), *locked):
+        joint = model.joint.get(name)
+        if joint is not None and joint.mimic is not None:
+            raise DataError(
+                f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
+                f"choose or lock {model.leader(name).joint!r}"
+            )
+        if name not in model.actuated:
+            where = "the movable joints of the URDF (a coordinate without kinematics, like a "
+            where += "gripper, is named in coordinates)"
+            raise UnknownNameError("joint", name, where, model.actuated)
+    for name, value in locked.items():
+        if name in columns:
+            raise DataError(f"joint {name!r} is both in the joint vector and locked")
+        if not math.isfinite(value):
+            raise DataError(f"joint {name!r} is locked at {value}: expected a finite number")
+
+
+def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
+    """A tool as plain numbers: parent link, position, quaternion."""
+    if isinstance(tool, str) or not 2 <= len(tool) <= 3:
+        raise DataError(
+            f"tool {name!r} is (parent link, Frame) or (parent link, position, quaternion), "
+            f"got {tool!r}"
+        )
+    parent, *pose = tool
+    frame = pose[0] if isinstance(pose[0], Frame) else Frame(*pose)
+    if frame.batch_shape != ():
+        raise ShapeError(
+            f"tool {name!r} has one constant pose in its parent link, got poses of the leading "
+            f"shape {tuple(frame.batch_shape)}"
+        )
+    # digits as given: norms are divided out when the robot is built, and only then
+    orientation = as_tensor(pose[1], name) if len(pose) > 1 else frame.orientation
+    return [parent, frame.position.tolist(), orientation.tolist()]
+
+
+def _wanted(
+    model: UrdfModel, config: Mapping[str, Any]
+) -> tuple[str, list[tuple[str, NDArray[np.float64]]]]:
+    """The base, and for each wanted link a link of the URDF and the pose in it."""
+    places = {link: (link, np.eye(4)) for link in model.links}
+    if config["base"] not in places:
+        raise UnknownNameError("base link", config["base"], "the URDF", model.links)
+    for name, (parent, position, orientation) in config["tools"].items():
+        if name in model.links:
+            raise DataError(f"tool {name!r} has the name of a link of the URDF")
+        if parent not in model.links:
+            raise UnknownNameError("link", parent, f"the URDF (tool {name!r})", model.links)
+        frame = Frame(position, orientation)
+        pose = np.eye(4)
+        pose[:3, :3] = quaternions.to_matrix(frame.orientation).numpy()
+        pose[:3, 3] = frame.position.numpy()
+        places[name] = parent, pose
+    for link in config["links"]:
+        if link not in places:
+            raise UnknownNameError("link", link, "the URDF and the tools", places)
+    return config["base"], [places[link] for link in config["links"]]
+
+
+def _limits(model: UrdfModel, names: Sequence[str]) -> Tensor:
+    """Rows lower, upper, velocity; infinite for coordinates without kinematics."""
+    free = (-math.inf, math.inf, math.inf)
+    joints = [model.joint.get(name) for name in names]
+    rows = [free if j is None else (j.lower, j.upper, j.velocity) for j in joints]
+    return torch.tensor(rows, dtype=torch.float64, device="cpu").reshape(-1, 3).T

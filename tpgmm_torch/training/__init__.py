@@ -1,0 +1,1 @@
+"""From demonstrations to the rows that the mixture is learned from."""
