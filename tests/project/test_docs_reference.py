@@ -61,8 +61,8 @@ def test_the_page_of_the_plugin_has_what_its_users_need():
         "processor_tpgmm.make_tpgmm_pre_post_processors",
         "environments.BottleShakingConfig",
         "environments.AlohaStateConfig",
-        "environments.bottle_shaking.BottleShakingEnv",
-        "environments.aloha_state.AlohaStateEnv",
+        "environments.bottle.shaking.BottleShakingEnv",
+        "environments.aloha.state.AlohaStateEnv",
         "evaluation.compare.compare",
         "evaluation.settings.Settings",
     }
@@ -191,10 +191,19 @@ def test_inventories_can_be_read_by_sphinx(tmp_path):
 # The architecture page
 
 
-def test_the_picture_of_the_layers_has_a_title_for_each():
+def test_the_picture_of_the_rooms_shows_every_room(tmp_path):
     sys.path.insert(0, str(DOCS / "pictures"))
     try:
         architecture = importlib.import_module("architecture")
     finally:
         sys.path.remove(str(DOCS / "pictures"))
-    assert len(architecture.TITLES) == len(architecture.layers())
+    rooms = [room for floor in architecture.floors() for room in floor]
+    core = Path(tpgmm_torch.__file__).parent
+    assert sorted(rooms) == sorted(
+        path.stem
+        for path in core.iterdir()
+        if path.stem not in ("__init__", "__pycache__", "py")
+        and (path.suffix == ".py" or (path / "__init__.py").is_file())
+    )
+    architecture.draw(tmp_path)
+    assert (tmp_path / "rooms.svg").stat().st_size > 1000

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from test_lerobot_writer import FPS, assert_same, demonstration
+from written_sets import FPS, assert_same, demonstration  # this folder is on the path
 
 from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_torch.data.demonstrations import Demonstration

@@ -26,8 +26,8 @@ from tpgmm_datasets import (
     LinkPose,
     iter_lerobot,
     load_lerobot,
-    parquet,
 )
+from tpgmm_datasets.lerobot import parquet
 from tpgmm_torch.exceptions import DependencyError, TPGMMError
 
 
