@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import functools
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
+from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
+from torch import Tensor
 
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch import gaussians, persistence
+from tpgmm_torch.control.compiled import CompiledRegression, check_compiler
+from tpgmm_torch.control.rollout import Synthesis, rollout
+from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
+from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
+from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.large_data.processes import ALONE, Processes
 from tpgmm_torch.large_data.row_file import SpooledRows
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.checkpoints import Checkpoint
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.persistence import load_estimator, save_estimator
-from tpgmm_torch.preparation import Preparation
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.mixture_settings import (
+    block_widths,
+    check_operators,
+    kinematics_for,
+    regularization,
+)
 from tpgmm_torch.training.training_rows import (
     DemonstrationBatches,
     LearningRows,
@@ -32,8 +54,14 @@ from tpgmm_torch.training.training_rows import (
 
 __all__ = ["TaskParameterizedGMM"]
 
+#: Parameters that the estimator and its mixture share.
+MIXTURE_PARAMETERS = (
+    "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
+    "random_state", "warm_start", "verbose", "dtype", "device",
+)  # fmt: skip
 
-class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
+
+class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     """Task-parameterised Gaussian mixture over joint space and task space.
 
     One sample is one demonstration: ``X`` is a list of :class:`Demonstration`, so that
@@ -113,6 +141,8 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
     converged_ : bool
     lower_bound_ : float
         Mean log-likelihood per time step at the end of EM.
+    mixture_ : BlockGaussianMixture
+        Of the local data of all operators side by side.
 
     References
     ----------
@@ -157,6 +187,9 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
         "device": [str],
         "verbose": ["verbose"],
     }
+
+    #: What compiles; None until :meth:`compile` is called.
+    _backend: str | None = None
 
     def __init__(
         self,
@@ -246,7 +279,7 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
             If another of the processes died.
         """
         self._validate_params()
-        operators = self._checked_operators()
+        operators = check_operators(self.operators)
         demonstrations, batches = split_batches(X)
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
@@ -267,23 +300,358 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
             )  # fmt: skip
             return self._learn(gathered, operators, kinematics, checkpoint)
 
-    def _learn(
+    def predict(
+        self, X: Situation | Sequence[Situation], *, candidates: bool = True
+    ) -> list[Trajectory]:
+        """Reproduce the skill: closed kinematic loop, q_{t-1} is the last reference.
+
+        Parameters
+        ----------
+        X : sequence of Situation or Demonstration
+            Situations of equal time grids run as one batch. A demonstration stands for the
+            situation that it was made in.
+        candidates : bool, default=True
+            Whether to return each operator's own estimate too.
+
+        Returns
+        -------
+        list of Trajectory
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError, NotFittedError
+            If a situation does not fit the model.
+        """
+        self._check_fitted()
+        if not isinstance(X, Situation | Demonstration | Iterable):
+            raise DataError(f"predict takes a list of Situation, got {type(X).__name__}")
+        given = [X] if isinstance(X, Situation | Demonstration) else list(X)
+        situations = [self._situation(item) for item in given]
+        return rollout(self.regression(), situations, self.blend, self.keep_limits, candidates)
+
+    def step(
         self,
-        learning: LearningRows,
+        time: float | Tensor,
+        state: RobotState | Any,
+        frames: Mapping[str, Frame] | None = None,
+        *,
+        candidates: bool = False,
+    ) -> Estimate:
+        """One control tick for a batch of robots.
+
+        Parameters
+        ----------
+        time : float or Tensor of the batch shape
+            Now [s].
+        state : RobotState, or array-like of shape (..., n_joints)
+            The last reference q_{t-1}, or what was measured.
+        frames : mapping of str to Frame
+            Object poses now, of shapes that broadcast with the batch.
+        candidates : bool, default=False
+            Whether to return each operator's own estimate too.
+
+        Returns
+        -------
+        Estimate
+
+        Examples
+        --------
+        >>> from tpgmm_torch import TaskParameterizedGMM
+        >>> time = torch.linspace(0, 1, 50, dtype=torch.float64)
+        >>> shown = [Demonstration(time, (time * end)[:, None]) for end in (0.9, 1.0, 1.1)]
+        >>> model = TaskParameterizedGMM(n_components=2).fit(shown)
+        >>> estimate = model.step(0.5, [0.4])
+        >>> round(float(estimate.joints), 2)
+        0.5
+        """
+        self._check_fitted()
+        kinematics, regression = self.kinematics_, self.regression()
+        like = kinematics.lower
+        known = {name: frame.to(like) for name, frame in (frames or {}).items()}
+        now = as_tensor(time, "time").to(like)
+        limits = (like, kinematics.upper) if self.keep_limits else None
+        if not candidates and not isinstance(state, RobotState):
+            return regression.tick(now, state, known, limits)
+        if not isinstance(state, RobotState):
+            state = kinematics.state(state)
+        return regression.step(now, state, known, candidates, limits)
+
+    def compile(self, backend: str = "inductor", n_robots: int = 1) -> Self:
+        """Make :meth:`step`, :meth:`synthesis` and :meth:`predict` one compiled graph.
+
+        Kinematics, operators and fusion of a tick run as one graph, compiled ahead of time by
+        AOTInductor; what they give is the same. There is a graph for one robot and one for
+        any number of robots. The one that is asked for is compiled at once, which takes about
+        a minute: not while a robot waits. Ticks with candidates, with several times or that
+        are differentiated run as before.
+
+        Parameters
+        ----------
+        backend : str, default="inductor"
+            AOTInductor, which needs a C++ compiler; others are those of ``torch.compile``.
+        n_robots : int, default=1
+            How many robots to compile for now, one or several; the other graph is compiled
+            when it is first needed.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        DependencyError
+            If there is no C++ compiler.
+        DataError
+            If the model has operators or a robot of another kind than the graph serves.
+        NotFittedError
+            If the model is not fitted.
+        """
+        self._check_fitted()
+        check_compiler(backend)
+        previous, self._backend = self._backend, backend
+        try:
+            batch = () if n_robots == 1 else (n_robots,)
+            like = self.time_
+            start = like.new_zeros(*batch, self.kinematics_.n_joints)
+            here = Frame(like.new_zeros(*batch, 3))
+            self.step(float(like[0]), start, dict.fromkeys(self.frame_names_, here))
+        except BaseException:
+            self._backend = previous
+            raise
+        return self
+
+    def synthesis(self, joints: Any) -> Synthesis:
+        """The loop of :meth:`predict`, to be stepped by a controller.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints)
+            Start postures.
+
+        Returns
+        -------
+        Synthesis
+            Its ``step(time, frames)`` finds the next ``reference``.
+
+        Raises
+        ------
+        ShapeError, DataError, NotFittedError
+            If the postures do not fit the robot.
+        """
+        self._check_fitted()
+        start = self.kinematics_.joint_tensor(joints)
+        return Synthesis(self.regression(), start, self.blend, self.keep_limits)
+
+    def sample(
+        self,
+        situation: Situation,
+        n_samples: int = 1,
+        random_state: int | np.random.RandomState | None = None,
+    ) -> list[Trajectory]:
+        """Draw joint trajectories around the reproduction.
+
+        Each trajectory keeps one standard normal draw z over time, ``q_t = q_hat_t + L_t z``
+        with ``L_t L_t^T`` the covariance at t: at every instant its law is the reproduction's,
+        and in between it is as smooth as the model.
+
+        Parameters
+        ----------
+        situation : Situation
+        n_samples : int, default=1
+        random_state : int, RandomState instance or None
+
+        Returns
+        -------
+        list of Trajectory
+
+        Raises
+        ------
+        DataError
+            If ``n_samples`` is no positive integer, and as :meth:`predict` does.
+        """
+        if not isinstance(n_samples, Integral) or n_samples < 1:
+            raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
+        [mean] = self.predict([situation], candidates=False)
+        draws = check_random_state(random_state).standard_normal(
+            (n_samples, mean.joints.shape[-1])
+        )
+        factor = gaussians.cholesky(mean.covariance, "the covariance of the reproduction")
+        return [
+            Trajectory(
+                mean.time,
+                self.kinematics_.retract(mean.joints + factor @ torch.from_numpy(z).to(factor)),
+                mean.covariance,
+                (),
+                mean.joint_names,
+            )
+            for z in draws
+        ]
+
+    def score(self, X: Sequence[Demonstration], y: object = None) -> float:
+        """Mean log-likelihood per time step of (new) demonstrations.
+
+        It is the likelihood of the local data, so models with other operators are not
+        comparable: use :func:`tpgmm_torch.metrics.reproduction_scorer` for those.
+        """
+        lengths = [len(demonstration) for demonstration in check_demonstrations(X)]
+        return float(np.average(self.score_samples(X), weights=lengths))
+
+    def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
+        """Mean log-likelihood per time step of each demonstration, shape (n,)."""
+        return np.array([self.mixture_.score(row) for row in self._rows(X)])
+
+    def bic(self, X: Sequence[Demonstration]) -> float:
+        """Bayesian information criterion on demonstrations; lower is better."""
+        rows = np.concatenate(self._rows(X))
+        return float(self.mixture_.bic(rows))
+
+    def aic(self, X: Sequence[Demonstration]) -> float:
+        """Akaike information criterion on demonstrations; lower is better."""
+        rows = np.concatenate(self._rows(X))
+        return float(self.mixture_.aic(rows))
+
+    def regression(self) -> Regression:
+        """The fitted mixture conditioned on time, prepared once: what every tick asks."""
+        self._check_fitted()
+        key = (
+            self.fusion,
+            self.activation,
+            self.epsilon,
+            self.prior_std,
+            self.negligible,
+        )
+        backend = self._backend
+        prepared = getattr(self, "_prepared", None)
+        if prepared is None or prepared[0] != (key, backend) or prepared[1] is not self.means_:
+            mixtures = [
+                LocalMixture.of(mean, covariance)
+                for mean, covariance in zip(self.means_, self.covariances_, strict=True)
+            ]
+            log_weights = self.weights_.log()
+            make: Any = Regression
+            if backend is not None:
+                make = functools.partial(CompiledRegression, backend=backend)
+            fitted = self.kinematics_, self.operators_, mixtures, log_weights
+            regression = make(*fitted, *key)
+            self._prepared = prepared = ((key, backend), self.means_, regression)
+        return prepared[2]
+
+    def unfitted_mixture(
+        self,
+        moments: ColumnMoments,
+        group_size: int,
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+    ) -> BlockGaussianMixture:
+        """The mixture that :meth:`fit` learns from rows of local data.
+
+        Parameters
+        ----------
+        moments : ColumnMoments
+            Of the rows, which set the scale of the regularisation.
+        group_size : int
+            So many consecutive rows share one responsibility.
+        operators : sequence of Operator
+        kinematics : Kinematics
+            What they act on.
+        """
+        settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
+        settings["blocks"] = block_widths(operators, kinematics)
+        settings["group_size"] = group_size
+        settings["reg_covar"] = regularization(
+            moments,
+            operators,
+            kinematics,
+            reg_covar=self.reg_covar,
+            covariance_type=self.covariance_type,
+        )
+        if self.warm_start and hasattr(self, "mixture_"):
+            return self.mixture_.set_params(**settings)
+        return BlockGaussianMixture(**settings)
+
+    def set_mixture(
+        self,
+        mixture: BlockGaussianMixture,
         operators: tuple[Operator, ...],
         kinematics: Kinematics,
-        checkpoint: Checkpoint | None,
+        time: Tensor,
     ) -> Self:
-        """Fit the mixture to rows, and take over what it learned."""
-        moments = ColumnMoments.of_batches(learning.rows, learning.processes)
-        mixture = self._mixture(moments, learning.group_size, operators, kinematics)
-        mixture.fit_rows(
-            learning.rows,
-            moments=moments,
-            checkpoint=checkpoint,
-            processes=learning.processes,
+        """Become the fitted model of a mixture of local data.
+
+        Parameters
+        ----------
+        mixture : BlockGaussianMixture
+            Fitted, with one block for each operator.
+        operators : tuple of Operator
+        kinematics : Kinematics
+            What they act on.
+        time : Tensor of shape (T,)
+            The time grid of a typical demonstration [s].
+
+        Returns
+        -------
+        self
+        """
+        self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
+        self.frame_names_, self.time_ = frame_names(operators, kinematics), time
+        self.weights_, self.means_ = mixture.weights_, mixture.means_
+        self.covariances_ = mixture.covariances_
+        # a mixture of given parameters comes from no EM
+        self.n_iter_ = getattr(mixture, "n_iter_", 0)
+        self.converged_ = getattr(mixture, "converged_", False)
+        self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
+        return self
+
+    @classmethod
+    def from_parameters(
+        cls,
+        weights: Tensor,
+        means: Sequence[Tensor],
+        covariances: Sequence[Tensor],
+        time: Tensor,
+        *,
+        operators: Sequence[Operator] | None = None,
+        robot: Kinematics,
+        **settings: Any,
+    ) -> Self:
+        """A fitted model of known parameters, which are kept as they are.
+
+        Parameters
+        ----------
+        weights, means, covariances, time
+            As in the attributes of that name.
+        operators : sequence of Operator, optional
+        robot : Kinematics
+            What the operators act on; a
+            :class:`~tpgmm_torch.robots.joint_space.JointSpace` where they need no links.
+        **settings
+            Further parameters of the constructor.
+
+        Returns
+        -------
+        TaskParameterizedGMM
+            EM has nothing to report: ``n_iter_`` is 0, ``converged_`` False, ``lower_bound_``
+            NaN.
+
+        Raises
+        ------
+        DataError, ShapeError
+            If they are no mixture, or do not fit the operators.
+        """
+        settings = {"n_components": len(weights)} | settings
+        model = cls(operators=operators, robot=robot, **settings)
+        model._validate_params()
+        if not isinstance(robot, Kinematics):
+            raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
+        checked = check_operators(operators)
+        shared = {name: getattr(model, name) for name in MIXTURE_PARAMETERS}
+        mixture = BlockGaussianMixture.from_parameters(
+            weights, means, covariances, **shared | {"blocks": block_widths(checked, robot)}
         )
-        return self._take(mixture, operators, kinematics, learning.time)
+        # it checked them; what it keeps went through their factors, and was rounded
+        mixture.weights_ = weights
+        mixture.means_, mixture.covariances_ = list(means), list(covariances)
+        return model.set_mixture(mixture, checked, robot.to(time.dtype, model.device), time)
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
@@ -292,10 +660,33 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
 
         Raises
         ------
-        NotFittedError, ModelFileError
+        NotFittedError
+        ModelFileError
+            If something is there that is no model, or an operator or robot cannot be described.
         """
         self._check_fitted()
-        save_estimator(self, path)
+        parameters = {
+            name: value.item() if isinstance(value, np.generic) else value
+            for name, value in self.get_params(deep=False).items()
+            if name not in ("operators", "robot")
+        }
+        if not isinstance(parameters["random_state"], int):
+            parameters["random_state"] = None
+        config = {
+            "parameters": parameters,
+            "operators": [persistence.encode(operator) for operator in self.operators_],
+            "kinematics": persistence.encode(self.kinematics_),
+            "frames": list(self.frame_names_),
+            "n_iter": self.n_iter_,
+            "converged": bool(self.converged_),
+            "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
+        }
+        tensors = {"weights": self.weights_, "time": self.time_}
+        for j, (mean, covariance) in enumerate(
+            zip(self.means_, self.covariances_, strict=True)
+        ):
+            tensors |= {f"means.{j}": mean, f"covariances.{j}": covariance}
+        persistence.write_model(path, config, tensors)
 
     @classmethod
     def load(
@@ -316,8 +707,99 @@ class TaskParameterizedGMM(Preparation, BaseEstimator):  # type: ignore[misc]
         ModelFileError
             If it is truncated, tampered with, of another version, or does not fit together.
         """
-        model: Self = load_estimator(cls, path, custom, device)
+        config, tensors = persistence.read_model(path)
+        try:
+            operators = [persistence.decode(item, custom) for item in config["operators"]]
+            kinematics = persistence.decode(config["kinematics"], custom)
+            for operator in operators:
+                operator.check(kinematics, config["frames"])
+            if len(tensors) != 2 + 2 * len(operators) or not operators:
+                raise ModelFileError(
+                    f"{path} does not fit together: {len(operators)} operators, but the "
+                    f"tensors {sorted(tensors)}"
+                )
+            settings = config["parameters"]
+            settings["device"] = device or settings["device"]
+            here = {name: tensor.to(settings["device"]) for name, tensor in tensors.items()}
+            means, covariances = (
+                [here[f"{kind}.{j}"] for j in range(len(operators))]
+                for kind in ("means", "covariances")
+            )
+            model = cls.from_parameters(
+                here["weights"],
+                means,
+                covariances,
+                here["time"],
+                operators=operators,
+                robot=kinematics,
+                **settings,
+            )
+            model.robot = None if isinstance(kinematics, JointSpace) else kinematics
+            model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
+            known = config["lower_bound"] is not None
+            model.lower_bound_ = config["lower_bound"] if known else math.nan
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, ModelFileError):
+                raise
+            raise ModelFileError(f"{path} does not fit together: {error}") from error
         return model
+
+    def _learn(
+        self,
+        learning: LearningRows,
+        operators: tuple[Operator, ...],
+        kinematics: Kinematics,
+        checkpoint: Checkpoint | None,
+    ) -> Self:
+        """Fit the mixture to rows, and take over what it learned."""
+        moments = ColumnMoments.of_batches(learning.rows, learning.processes)
+        mixture = self.unfitted_mixture(moments, learning.group_size, operators, kinematics)
+        mixture.fit_rows(
+            learning.rows,
+            moments=moments,
+            checkpoint=checkpoint,
+            processes=learning.processes,
+        )
+        return self.set_mixture(mixture, operators, kinematics, learning.time)
+
+    def _kinematics_for(
+        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
+    ) -> Kinematics:
+        dtype = getattr(torch, self.dtype)
+        return kinematics_for(demonstrations, operators, self.robot, dtype, self.device)
+
+    def _situation(self, given: Situation | Demonstration) -> Situation:
+        names, like = self.kinematics_.joint_names, self.time_
+        if isinstance(given, Demonstration):
+            given = Situation.of(given.reordered(names))
+        if not isinstance(given, Situation):
+            raise DataError(f"predict takes Situation objects, got {type(given).__name__}")
+        if len(given.joints) != len(names):
+            raise ShapeError(
+                f"the start posture has {len(given.joints)} joints, the model has "
+                f"{len(names)}: {names}"
+            )
+        for operator in self.operators_:
+            operator.check(self.kinematics_, given.frames)
+        time = self.time_ if given.time is None else given.time.to(like)
+        frames = {name: given.frames[name].to(like) for name in self.frame_names_}
+        return Situation(given.joints.to(like), frames, time)
+
+    def _rows(self, X: Sequence[Demonstration]) -> list[NDArray[np.float64]]:
+        self._check_fitted()
+        demonstrations = check_demonstrations(X)
+        for operator in self.operators_:
+            operator.check(self.kinematics_, demonstrations[0].frames)
+        expected = self.regression().expected
+        rows = local_data(demonstrations, self.operators_, self.kinematics_, expected)
+        return [row.cpu().numpy() for row in rows]
+
+    def _check_fitted(self) -> None:
+        if not hasattr(self, "weights_"):
+            raise NotFittedError(
+                "this TaskParameterizedGMM is not fitted yet: call fit(demonstrations), or "
+                "TaskParameterizedGMM.load(path)"
+            )
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

@@ -13,6 +13,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.metrics import check_scoring
@@ -24,6 +25,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import fit_subsets
+from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.training_rows import rows_in_memory, share_one_grid, typical_time
 
 __all__ = ["cross_validate", "fit_folds"]
@@ -125,8 +127,14 @@ def fit_folds(
     shown = [[demonstrations[index] for index in fold] for fold in chosen]
     models = [clone(estimator) for _ in chosen]
     estimator._validate_params()
-    operators = estimator._checked_operators()
-    kinematics = estimator._kinematics_for(demonstrations, operators)
+    operators = check_operators(estimator.operators)
+    kinematics = kinematics_for(
+        demonstrations,
+        operators,
+        estimator.robot,
+        getattr(torch, estimator.dtype),
+        estimator.device,
+    )
     twice = any(len(set(fold)) < len(fold) for fold in chosen)
     # some folds would have one responsibility per instant, others not
     mixed = (
@@ -149,12 +157,12 @@ def fit_folds(
         members = np.repeat(belongs, [len(d) for d in demonstrations], axis=1)
     moments = [ColumnMoments.of_batches([rows[own]]) for own in members]
     mixtures = [
-        model._mixture(known, len(fold) if size > 1 else 1, operators, kinematics)
+        model.unfitted_mixture(known, len(fold) if size > 1 else 1, operators, kinematics)
         for model, fold, known in zip(models, chosen, moments, strict=True)
     ]
     fit_subsets(mixtures, rows, members, size, moments)
     for model, mixture, own in zip(models, mixtures, shown, strict=True):
-        model._take(mixture, operators, kinematics, typical_time(own).to(learning.time))
+        model.set_mixture(mixture, operators, kinematics, typical_time(own).to(learning.time))
     return models
 
 

@@ -7,20 +7,16 @@ Loading reads numbers and names, never code, and refuses whatever does not fit t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
 from tpgmm_torch.exceptions import ModelFileError
-from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.operators import Canonical, Operator, Stack
-from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
@@ -32,10 +28,7 @@ __all__ = [
     "TENSORS",
     "decode",
     "encode",
-    "load_estimator",
     "read_model",
-    "restore",
-    "save_estimator",
     "write_model",
 ]
 
@@ -164,140 +157,3 @@ def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         If a file is missing, truncated, changed, or of another version.
     """
     return MODEL.read(path)
-
-
-def save_estimator(model: Any, path: str | Path) -> None:
-    """Write a fitted :class:`TaskParameterizedGMM`; its method ``save`` calls this.
-
-    Parameters
-    ----------
-    model : TaskParameterizedGMM
-    path : str or Path
-        The directory.
-
-    Raises
-    ------
-    ModelFileError
-        If something is there that is no model, or an operator or robot cannot be described.
-    """
-    parameters = {
-        name: value.item() if isinstance(value, np.generic) else value
-        for name, value in model.get_params(deep=False).items()
-        if name not in ("operators", "robot")
-    }
-    if not isinstance(parameters["random_state"], int):
-        parameters["random_state"] = None
-    config = {
-        "parameters": parameters,
-        "operators": [encode(operator) for operator in model.operators_],
-        "kinematics": encode(model.kinematics_),
-        "frames": list(model.frame_names_),
-        "n_iter": model.n_iter_,
-        "converged": bool(model.converged_),
-        "lower_bound": None if math.isnan(model.lower_bound_) else float(model.lower_bound_),
-    }
-    tensors = {"weights": model.weights_, "time": model.time_}
-    for j, (mean, covariance) in enumerate(zip(model.means_, model.covariances_, strict=True)):
-        tensors |= {f"means.{j}": mean, f"covariances.{j}": covariance}
-    write_model(path, config, tensors)
-
-
-def restore(
-    model: Any,
-    kinematics: Kinematics,
-    weights: Tensor,
-    means: Sequence[Tensor],
-    covariances: Sequence[Tensor],
-    time: Tensor,
-) -> None:
-    """Make a :class:`TaskParameterizedGMM` a fitted one, from parameters known elsewhere.
-
-    What EM reports is not among them: ``n_iter_`` becomes 0, ``converged_`` False and
-    ``lower_bound_`` NaN.
-
-    Parameters
-    ----------
-    model : TaskParameterizedGMM
-        With its operators; fitted or not.
-    kinematics : Kinematics
-        What the operators act on.
-    weights, means, covariances, time
-        As in the attributes of the model; they are kept as they are.
-
-    Raises
-    ------
-    DataError, ShapeError
-        If they are no mixture, or do not fit the operators.
-    """
-    operators = (Canonical(),) if model.operators is None else tuple(model.operators)
-    mixture = BlockGaussianMixture.from_parameters(
-        weights, means, covariances, **model._mixture_parameters(operators, kinematics)
-    )
-    # it checked them; what it keeps went through their factors, and was rounded
-    mixture.means_, mixture.covariances_ = list(means), list(covariances)
-    mixture.weights_ = weights
-    model.mixture_, model.operators_, model.weights_ = mixture, operators, weights
-    model.means_, model.covariances_ = mixture.means_, mixture.covariances_
-    model.time_ = time
-    model.kinematics_ = kinematics.to(time.dtype, model.device)
-    model.frame_names_ = frame_names(operators, kinematics)
-    model.n_iter_, model.converged_, model.lower_bound_ = 0, False, math.nan
-
-
-def load_estimator(
-    kind: type[Any], path: str | Path, custom: Sequence[type] = (), device: str | None = None
-) -> Any:
-    """Read a fitted :class:`TaskParameterizedGMM`; its method ``load`` calls this.
-
-    Parameters
-    ----------
-    kind : type
-        The class of the model.
-    path : str or Path
-        The directory.
-    custom : sequence of type
-        User-defined operator and robot classes that the model uses.
-    device : str, optional
-        Instead of the one that the model was saved from.
-
-    Returns
-    -------
-    TaskParameterizedGMM
-
-    Raises
-    ------
-    ModelFileError
-        If the files are damaged, or do not fit together.
-    """
-    config, tensors = read_model(path)
-    try:
-        operators = [decode(item, custom) for item in config["operators"]]
-        kinematics = decode(config["kinematics"], custom)
-        robot = None if isinstance(kinematics, JointSpace) else kinematics
-        for operator in operators:
-            operator.check(kinematics, config["frames"])
-        if len(tensors) != 2 + 2 * len(operators) or not operators:
-            raise ModelFileError(
-                f"{path} does not fit together: {len(operators)} operators, but the tensors "
-                f"{sorted(tensors)}"
-            )
-        model = kind(operators=operators, robot=robot, **config["parameters"])
-        model.device = device or model.device
-        model._validate_params()
-        tensors = {name: tensor.to(model.device) for name, tensor in tensors.items()}
-        restore(
-            model,
-            kinematics,
-            tensors["weights"],
-            [tensors[f"means.{j}"] for j in range(len(operators))],
-            [tensors[f"covariances.{j}"] for j in range(len(operators))],
-            tensors["time"],
-        )
-        model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
-        known = config["lower_bound"] is not None
-        model.lower_bound_ = config["lower_bound"] if known else math.nan
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, ModelFileError):
-            raise
-        raise ModelFileError(f"{path} does not fit together: {error}") from error
-    return model

@@ -155,7 +155,7 @@ def plot_local(
         shown.append((motion, {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, **style}))
 
     def expected(_operator: int, time: Tensor) -> Tensor:
-        return model._regression().expected(operator, time)
+        return model.regression().expected(operator, time)
 
     motions = [motion for motion, _ in shown]
     rows = local_data(motions, [chosen], model.kinematics_, expected)

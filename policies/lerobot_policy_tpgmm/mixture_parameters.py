@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from tpgmm_torch import TaskParameterizedGMM, gaussians
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
-from tpgmm_torch.persistence import restore
 
 __all__ = ["MixtureParameters"]
 
@@ -135,14 +134,15 @@ class MixtureParameters(nn.Module):
         self.fitted.fill_(True)
 
     @torch.no_grad()
-    def copy_to(self, model: TaskParameterizedGMM) -> None:
-        """Make a model, fitted or not, the fitted one that these parameters describe.
+    def to_estimator(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
+        """The fitted model that these parameters describe.
 
         Parameters
         ----------
         model : TaskParameterizedGMM
-            With the operators and the robot that the parameters belong to; a
-            :class:`JointSpace` serves as robot where the operators need none.
+            With the settings, the operators and the robot that the parameters belong to; a
+            :class:`~tpgmm_torch.robots.joint_space.JointSpace` serves as robot where the
+            operators need none.
 
         Raises
         ------
@@ -158,12 +158,12 @@ class MixtureParameters(nn.Module):
         ]
         if broken:
             raise DataError(f"the policy's parameters {broken} hold NaN or infinity")
-        kinematics = getattr(model, "kinematics_", model.robot)
-        if kinematics is None:
-            raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
+        settings = model.get_params(deep=False)
         weights, means, covariances = self.tensors()
-        copies = [mean.clone() for mean in means]
-        restore(model, kinematics, weights, copies, covariances, self.time.clone())
+        copies, time = [mean.clone() for mean in means], self.time.clone()
+        return TaskParameterizedGMM.from_parameters(
+            weights, copies, covariances, time, **settings
+        )
 
     @staticmethod
     def _shapes(means: Iterable[Tensor]) -> list[tuple[int, ...]]:

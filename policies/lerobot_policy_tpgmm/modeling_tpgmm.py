@@ -194,8 +194,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         kinematics = self.kinematics.to(device=device)
         model = self.config.estimator(kinematics, list(self.operators))
         model.device = str(device)
-        self.mixture.copy_to(model)
-        return model
+        return self.mixture.to_estimator(model)
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""

@@ -34,8 +34,7 @@ def parameters_of(model: TaskParameterizedGMM) -> MixtureParameters:
 @pytest.mark.parametrize("covariance_type", ["full", "diag", "tied", "spherical"])
 def test_a_model_comes_back_equal(covariance_type):
     model = hands_model(covariance_type=covariance_type).fit(handlings())
-    back = hands_model(covariance_type=covariance_type)
-    parameters_of(model).copy_to(back)
+    back = parameters_of(model).to_estimator(hands_model(covariance_type=covariance_type))
     same(back, model, 1e-14)
     for j, covariance in enumerate(model.covariances_):
         assert torch.equal(back.means_[j], model.means_[j])
@@ -51,15 +50,15 @@ def test_a_model_comes_back_equal(covariance_type):
 
 def test_a_float32_model_comes_back():
     model = canonical(dtype="float32").fit(waves())
-    back = canonical(dtype="float32", robot=JointSpace(("a", "b", "c"), torch.float32))
-    parameters_of(model).copy_to(back)
+    back = parameters_of(model).to_estimator(
+        canonical(dtype="float32", robot=JointSpace(("a", "b", "c"), torch.float32))
+    )
     assert back.weights_.dtype == torch.float32
     same(back, model, 1e-6)
 
 
 def test_a_model_that_was_restored_can_be_saved(tmp_path):
-    back = hands_model()
-    parameters_of(hands()).copy_to(back)
+    back = parameters_of(hands()).to_estimator(hands_model())
     back.save(tmp_path / "model")
     loaded = TaskParameterizedGMM.load(tmp_path / "model")
     same(loaded, back)
@@ -69,7 +68,7 @@ def test_a_model_that_was_restored_can_be_saved(tmp_path):
 def test_the_copies_share_no_memory_with_the_model():
     model, back = canonical().fit(waves()), canonical(robot=JointSpace(("a", "b", "c")))
     made = parameters_of(model)
-    made.copy_to(back)
+    back = made.to_estimator(back)
     before = model.means_[0].clone()
     with torch.no_grad():
         made.means[0].add_(1.0)
@@ -127,7 +126,7 @@ def test_sizes_follow_from_the_arguments():
     assert {name: tuple(value.shape) for name, value in fitted.items()} == sizes
     made.load_state_dict(fitted)
     back = hands_model()
-    made.copy_to(back)
+    back = made.to_estimator(back)
     same(back, hands(), 1e-12)
 
 
@@ -144,11 +143,11 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(NotFittedError, match=r"call fit"):
         MixtureParameters(6, DIMENSIONS, 0).copy_from(hands_model())
     with pytest.raises(NotFittedError, match="the policy is not fitted"):
-        MixtureParameters(6, DIMENSIONS, 0).copy_to(hands_model())
+        MixtureParameters(6, DIMENSIONS, 0).to_estimator(hands_model())
     made = parameters_of(hands())
     with torch.no_grad():
         made.factors[1][0, 0, 0] = torch.nan
     with pytest.raises(DataError, match=r"\['factors.1'\] hold NaN"):
-        made.copy_to(hands_model())
+        made.to_estimator(hands_model())
     with pytest.raises(DataError, match="JointSpace"):
-        parameters_of(canonical().fit(waves())).copy_to(canonical())
+        parameters_of(canonical().fit(waves())).to_estimator(canonical())

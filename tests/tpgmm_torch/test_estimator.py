@@ -1,32 +1,64 @@
 """The estimator: what it learns from demonstrations."""
 
+import copy
+import inspect
+import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError as SklearnNotFittedError
+from sklearn.model_selection import GridSearchCV, KFold, LeaveOneOut, cross_val_score
+from sklearn.pipeline import make_pipeline
+from sklearn.utils._param_validation import InvalidParameterError
+from sklearn.utils.validation import check_is_fitted
 
-from tests.support import skills
+from tests.support import oracles, skills
+from tests.support.mixtures import both_hands
 from tests.support.skills import (
     HANDLING,
     HANDS,
+    JOINT_NAMES,
+    LAST,
     apart,
+    bottle_model,
     canonical,
+    few_bottles,
     handlings,
+    hands,
     hands_model,
     new_handling,
+    pose,
     same,
     small_bottle,
     tensors,
     wave,
     waves,
 )
+from tests.support.worlds import MOVED, OBJECT, OnPoses, OnRobot, moved, upper_body
+from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
     Canonical,
     Demonstration,
+    Frame,
+    RelativePosition,
+    Robot,
     Situation,
+    TaskParameterizedGMM,
 )
-from tpgmm_torch.metrics import joint_rmse
+from tpgmm_torch.alignment import LinearTimeNormalization
+from tpgmm_torch.exceptions import (
+    DataError,
+    DegenerateComponentWarning,
+    NotFittedError,
+    ShapeError,
+    TPGMMError,
+    UnknownNameError,
+)
+from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.local_data import local_data
@@ -227,3 +259,638 @@ def test_coordinates_that_vary_by_rounding_alone_do_not_become_certain():
     model = hands_model(operators=[HANDLING[0], Canonical()]).fit(noisy)
     deviations = model.covariances_[0].diagonal(dim1=1, dim2=2).sqrt()
     assert float(deviations.min()) > 1e-7
+
+
+TIME = torch.linspace(0, 2, 30, dtype=torch.float64)
+
+
+def small_canonical(**options) -> TaskParameterizedGMM:
+    return TaskParameterizedGMM(**{"n_components": 4, "blend": 0.0, **options})
+
+
+def refused(call, error, *parts: str) -> None:
+    """``call`` raises ``error``, a TPGMMError and a builtin, whose message has all parts."""
+    builtin = KeyError if issubclass(error, KeyError) else ValueError
+    assert issubclass(error, TPGMMError) and issubclass(error, builtin)
+    with pytest.raises(error) as caught:
+        call()
+    assert type(caught.value) is error
+    missing = [part for part in parts if part not in str(caught.value)]
+    assert not missing, f"{missing} not in {caught.value}"
+
+
+# Data
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("where", ["time", "joints", "position", "orientation"])
+def test_values_that_are_no_numbers_are_refused(bad, where):
+    parts = {
+        "time": np.linspace(0, 1, 5),
+        "joints": np.zeros((5, 3)),
+        "position": np.zeros(3),
+        "orientation": np.array([1.0, 0, 0, 0]),
+    }
+    parts[where].flat[-1] = bad
+    refused(
+        lambda: Demonstration(
+            parts["time"],
+            parts["joints"],
+            {"cup": Frame(parts["position"], parts["orientation"])},
+        ),
+        DataError,
+        where,
+        str(bad),
+        f"index {[n - 1 for n in parts[where].shape]}",
+    )
+
+
+def test_quaternions_off_unit_norm_are_refused():
+    refused(lambda: Frame([0, 0, 0], [1.1, 0, 0, 0]), DataError, "unit quaternion", "0.1")
+
+
+@pytest.mark.parametrize("times", [[0.0, 1.0, 1.0], [0.0, 2.0, 1.0]])
+def test_time_that_does_not_increase_is_refused(times):
+    refused(lambda: Demonstration(times, np.zeros((3, 2))), DataError, "increase", "index 2")
+
+
+def test_wrong_shapes_are_refused():
+    refused(lambda: Demonstration(TIME, np.zeros((29, 3))), ShapeError, "30", "(29, 3)")
+    refused(lambda: Frame([0.0, 1.0]), ShapeError, "(..., 3)", "(2,)")
+    other = Demonstration(TIME, np.zeros((30, 2)))
+    refused(lambda: small_canonical().fit([*waves(names=None), other]), ShapeError, "has 2", "has 3")
+
+
+@pytest.mark.parametrize("method", ["fit", "score"])
+@pytest.mark.parametrize(
+    ("given", "parts"),
+    [
+        (None, ["list", "NoneType"]),
+        (7, ["list", "int"]),
+        ([], ["empty"]),
+        (waves(1)[0], ["[demonstration]"]),
+        ([waves(1)[0], 3], ["item 1", "int"]),
+        (np.zeros((5, 2)), ["item 0", "ndarray"]),
+        ([Situation([0.0, 0.0, 0.0])], ["item 0", "Situation"]),
+    ],
+    ids=str,
+)
+def test_what_is_no_list_of_demonstrations_is_refused(method, given, parts):
+    model = small_canonical().fit(waves())
+    refused(lambda: getattr(model, method)(given), DataError, *parts)
+
+
+def test_other_joint_names_are_refused():
+    others = [*waves(2), replace(waves(1)[0], joint_names=("a", "b", "z"))]
+    named = "demonstration 2", "('a', 'b', 'z')", "('a', 'b', 'c')"
+    refused(lambda: small_canonical().fit(others), DataError, *named)
+    model = small_canonical().fit(waves())
+    refused(lambda: model.predict(others[2:]), UnknownNameError, "joint 'c'", "'z'")
+
+
+def test_nameless_demonstrations_are_trusted_and_never_hide_an_order():
+    nameless, [first] = waves(2, names=None), waves(1)
+    turned = replace(first, joints=first.joints[:, [2, 1, 0]], joint_names=("c", "b", "a"))
+    mixed = small_canonical().fit([nameless[0], first, turned])
+    assert mixed.kinematics_.joint_names == JOINT_NAMES
+    same = small_canonical().fit([nameless[0], first, first])
+    assert torch.equal(mixed.means_[0], same.means_[0])
+
+
+def test_other_frames_are_refused():
+    strange = replace(handlings(1)[0], frames={"mug": Frame([0, 0, 0])})
+    refused(lambda: hands_model().fit([*handlings(), strange]), DataError, "mug", "cup")
+
+
+# Operators and robots
+
+
+def test_unknown_frames_are_named():
+    model = hands_model(operators=[pose("left", "mug")])
+    refused(lambda: model.fit(handlings()), UnknownNameError, "frame 'mug'", "['cup']")
+
+
+def test_unknown_links_are_named():
+    model = hands_model(operators=[pose("middle", "cup")])
+    refused(
+        lambda: model.fit(handlings()), UnknownNameError, "link 'middle'", "['left', 'right']"
+    )
+    refused(
+        lambda: Robot.from_urdf(upper_body_urdf(), links=("third_hand",)),
+        UnknownNameError,
+        "third_hand",
+        "l_hand",
+    )
+
+
+def test_names_of_links_and_frames_may_not_collide():
+    both = [replace(d, frames={"left": d.frames["cup"]}) for d in handlings()]
+    model = hands_model(operators=[pose("right", "left")])
+    refused(lambda: model.fit(both), UnknownNameError, "'left'", "rename the frame")
+
+
+def test_joints_missing_in_the_urdf_are_named():
+    refused(
+        lambda: Robot.from_urdf(upper_body_urdf(), links=("l_hand",), joints=("tail",)),
+        UnknownNameError,
+        "joint 'tail'",
+        "l_elbow",
+    )
+
+
+def test_demonstrations_of_another_robot_are_refused():
+    model = TaskParameterizedGMM(3, [Canonical()], upper_body())
+    refused(lambda: model.fit(waves(names=None)), ShapeError, "has 3 joints", "has 17")
+    refused(lambda: model.fit(waves()), ShapeError, "has 3 joints", "17", "waist_yaw")
+    demonstration = few_bottles()[0]
+    names = tuple(f"{name}_" for name in demonstration.joint_names)
+    renamed = replace(demonstration, joint_names=names)
+    refused(lambda: model.fit([renamed]), UnknownNameError, "is not in", "waist_yaw_")
+
+
+def test_a_robot_that_is_missing_is_asked_for():
+    model = TaskParameterizedGMM(3, [RelativePosition("left", "cup")])
+    refused(lambda: model.fit(handlings()), DataError, "['left']", "Robot.from_urdf", "Poses(")
+
+
+@pytest.mark.parametrize("operators", [["Canonical"], [Canonical], [Canonical(), None]])
+def test_operators_that_are_none_are_named(operators):
+    refused(
+        lambda: small_canonical(operators=operators).fit(waves()),
+        DataError,
+        "Operator objects",
+        repr(operators[-1]),
+    )
+
+
+BAD = {
+    "n_components": [0, -3, 2.5, "ten", None],
+    "operators": [Canonical(), "Canonical", 3],
+    "robot": ["robot.urdf", 3],
+    "covariance_type": ["block", None],
+    "reg_covar": [-1e-6, "small"],
+    "tol": [-1.0],
+    "max_iter": [0, 1.5],
+    "n_init": [0],
+    "init_params": ["zeros"],
+    "responsibilities": ["shared"],
+    "fusion": ["product"],
+    "activation": ["space"],
+    "epsilon": [-1e-4],
+    "prior_std": [0.0, -1.0],
+    "negligible": [-1e-9, 1.0],
+    "blend": [-0.1],
+    "keep_limits": ["yes", 2],
+    "random_state": ["seed", -1],
+    "warm_start": ["no"],
+    "dtype": ["float16", torch.float32],
+    "device": [3],
+    "verbose": [-1, "loud"],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(name, value) for name, values in BAD.items() for value in values]
+)
+def test_bad_parameters_are_refused_when_fitting(name, value):
+    assert set(BAD) == set(TaskParameterizedGMM().get_params())
+    with pytest.raises(InvalidParameterError, match=f"'{name}' parameter") as caught:
+        small_canonical(**{name: value}).fit(waves())
+    assert isinstance(caught.value, ValueError)
+
+
+# Too little data
+
+
+def test_fewer_points_than_components_are_refused():
+    few = [Demonstration(TIME[:5], wave(TIME[:5]))]
+    refused(lambda: small_canonical(n_components=6).fit(few), DataError, "6", "5")
+
+
+def test_more_components_than_instants_are_reported_or_refused():
+    few = [Demonstration(TIME[:5], wave(TIME[:5], shift)) for shift in (0.0, 0.1, 0.2)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises((DataError, DegenerateComponentWarning)):
+            small_canonical(n_components=9).fit(few)
+
+
+def test_one_instant_is_not_enough():
+    one = [Demonstration(TIME[:1], wave(TIME[:1]))]
+    with pytest.raises(ValueError, match="1 sample"):
+        small_canonical(n_components=1).fit(one)
+
+
+def test_instants_need_a_common_grid():
+    uneven = [*waves(2), *waves(1, length=25)]
+    model = small_canonical(responsibilities="instant")
+    refused(lambda: model.fit(uneven), DataError, "'instant'", "time grid", "align")
+
+
+# Asking a model
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda m: m.predict([Situation([0.0, 0.0, 0.0])]),
+        lambda m: m.step(0.0, [0.0, 0.0, 0.0]),
+        lambda m: m.sample(Situation([0.0, 0.0, 0.0])),
+        lambda m: m.score(waves()),
+        lambda m: m.score_samples(waves()),
+        lambda m: m.bic(waves()),
+        lambda m: m.aic(waves()),
+        lambda m: m.save("nowhere"),
+    ],
+    ids=["predict", "step", "sample", "score", "score_samples", "bic", "aic", "save"],
+)
+def test_an_unfitted_model_says_so(ask):
+    refused(lambda: ask(small_canonical()), NotFittedError, "not fitted yet", "fit(demonstrations)")
+    assert issubclass(NotFittedError, SklearnNotFittedError)
+
+
+def start(**frames: Frame) -> Situation:
+    return Situation(handlings(1)[0].joints[0], frames)
+
+
+def test_situations_without_the_frame_are_refused():
+    refused(lambda: hands().predict([start()]), UnknownNameError, "frame 'cup'", "[]")
+    mug = start(mug=Frame([0, 0, 0]))
+    refused(lambda: hands().predict([mug]), UnknownNameError, "frame 'cup'", "['mug']")
+    refused(lambda: hands().step(0.0, start().joints, {}), UnknownNameError, "'cup'", "'left'")
+
+
+def test_frames_that_move_need_the_model_s_grid():
+    moving = start(cup=Frame(np.zeros((7, 3))))
+    refused(lambda: hands().predict([moving]), ShapeError, "'cup'", "(7,)", "(30,)")
+
+
+def test_start_postures_of_other_robots_are_refused():
+    cup = {"cup": Frame([0, 0, 0])}
+    refused(
+        lambda: hands().predict([Situation(np.zeros(3), cup)]), ShapeError, "3 joints", "14"
+    )
+    refused(lambda: hands().step(0.0, np.zeros(3), cup), ShapeError, "(..., 14)", "(3,)")
+    nan = np.full(17, np.nan)
+    refused(lambda: small_bottle().step(0.0, nan, cup), DataError, "NaN")
+    refused(lambda: Situation(nan, cup), DataError, "start posture", "NaN")
+
+
+@pytest.mark.parametrize("given", [None, 3, [None], [np.zeros(3)], "situation"])
+def test_what_is_no_situation_is_refused(given):
+    model = small_canonical().fit(waves())
+    refused(lambda: model.predict(given), DataError, "Situation")
+
+
+@pytest.mark.parametrize("now", [np.nan, np.inf])
+def test_times_that_are_no_numbers_are_refused(now):
+    model = small_canonical().fit(waves())
+    refused(lambda: model.step(now, np.zeros(3)), DataError, "time", str(now))
+
+
+@pytest.mark.parametrize("n_samples", [0, -1, 2.5, "many"])
+def test_numbers_of_samples_that_are_none_are_refused(n_samples):
+    model = small_canonical().fit(waves())
+    refused(lambda: model.sample(Situation(np.zeros(3)), n_samples), DataError, repr(n_samples))
+
+
+def test_poses_have_all_their_columns():
+    narrow = [replace(d, joints=d.joints[:, :7], joint_names=None) for d in handlings()]
+    refused(lambda: hands_model().fit(narrow), ShapeError, "has 7 joints", "14")
+    assert HANDS.n_joints == 14
+
+
+SETTINGS = {
+    "n_components": 7,
+    "operators": [Canonical()],
+    "robot": HANDS,
+    "covariance_type": "tied",
+    "reg_covar": 1e-3,
+    "tol": 1e-2,
+    "max_iter": 50,
+    "n_init": 2,
+    "init_params": "kmeans",
+    "responsibilities": "point",
+    "fusion": "covariance",
+    "activation": "product",
+    "epsilon": 1e-5,
+    "prior_std": 5.0,
+    "negligible": 1e-8,
+    "blend": 0.5,
+    "keep_limits": False,
+    "random_state": 1,
+    "warm_start": True,
+    "dtype": "float32",
+    "device": "cpu",
+    "verbose": 1,
+}
+
+
+def search(grid, **options) -> GridSearchCV:
+    return GridSearchCV(hands_model(), grid, cv=KFold(2), error_score="raise", **options)
+
+
+def test_the_constructor_only_stores():
+    assert set(SETTINGS) == set(inspect.signature(TaskParameterizedGMM).parameters)
+    model = TaskParameterizedGMM(**SETTINGS)
+    assert set(vars(model)) == set(SETTINGS)
+    assert all(vars(model)[name] is value for name, value in SETTINGS.items())
+    nonsense = {name: object() for name in SETTINGS}
+    assert vars(TaskParameterizedGMM(**nonsense)) == nonsense
+
+
+def test_every_parameter_is_validated():
+    assert set(TaskParameterizedGMM._parameter_constraints) == set(SETTINGS)
+
+
+def test_parameters_are_got_set_and_cloned():
+    model = TaskParameterizedGMM(**SETTINGS)
+    assert model.get_params() == SETTINGS
+    copied = clone(small_bottle())
+    assert copied.get_params() == small_bottle().get_params()
+    assert copied.robot is small_bottle().robot
+    assert not hasattr(copied, "weights_")
+    assert copied.set_params(n_components=3).n_components == 3
+    with pytest.raises(ValueError, match="n_component"):
+        copied.set_params(n_component=3)
+
+
+def test_fitting_changes_no_parameter():
+    model = hands_model()
+    before = dict(model.get_params())
+    model.fit(handlings())
+    assert all(model.get_params()[name] is value for name, value in before.items())
+    check_is_fitted(model)
+
+
+def test_a_model_prints_what_is_not_the_default():
+    assert repr(TaskParameterizedGMM()) == "TaskParameterizedGMM()"
+    text = repr(TaskParameterizedGMM(5, [Canonical()], upper_body()))
+    assert "n_components=5" in text and "Canonical(" in text and "Robot(" in text
+    assert "fusion" not in text
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m))])
+@pytest.mark.parametrize("model", [small_bottle, hands], ids=["robot", "poses"])
+def test_copies_answer_the_same(copied, model):
+    model = model()
+    given = few_bottles()[:1] if model is small_bottle() else handlings()[:1]
+    other = copied(model)
+    [a], [b] = model.predict(given), other.predict(given)
+    assert torch.equal(a.joints, b.joints)
+    assert torch.equal(a.candidates[0].covariance, b.candidates[0].covariance)
+    assert other.score(given) == model.score(given)
+    assert other.operators == model.operators and other.robot == model.robot
+
+
+def test_settings_of_reproduction_take_effect_without_a_new_fit():
+    model = copy.deepcopy(hands())
+    [before] = model.predict(handlings()[:1])
+    [product] = model.set_params(activation="product").predict(handlings()[:1])
+    assert not torch.equal(before.joints, product.joints)
+    [again] = model.set_params(activation="time").predict(handlings()[:1])
+    assert torch.equal(before.joints, again.joints)
+
+
+def test_a_new_fit_replaces_the_old_model():
+    model = copy.deepcopy(hands())
+    model.predict(handlings()[:1])
+    model.set_params(n_components=3).fit(handlings())
+    [a] = model.predict(handlings()[:1])
+    [b] = hands_model(n_components=3).fit(handlings()).predict(handlings()[:1])
+    assert torch.equal(a.joints, b.joints)
+
+
+def test_the_number_of_components_is_searched():
+    found = search({"n_components": np.arange(2, 7, 2)}).fit(handlings())
+    scores = found.cv_results_["mean_test_score"]
+    assert scores.shape == (3,) and np.isfinite(scores).all()
+    assert found.best_params_["n_components"] == (2, 4, 6)[int(scores.argmax())]
+    assert len(found.best_estimator_.weights_) == found.best_params_["n_components"]
+
+
+def test_operators_are_searched_by_the_error_of_reproduction():
+    choices = [[HANDLING[0], HANDLING[1]], [Canonical()]]
+    found = search({"operators": choices}, scoring=reproduction_scorer).fit(handlings())
+    # joints alone cannot follow the cup
+    assert found.best_params_["operators"] == choices[0]
+    about_the_cup, alone = found.cv_results_["mean_test_score"]
+    assert alone < 10 * about_the_cup < 0
+
+
+@pytest.mark.parametrize("scoring", [None, reproduction_scorer])
+def test_demonstrations_are_left_out_one_by_one(scoring):
+    scores = cross_val_score(
+        hands_model(), handlings(), cv=LeaveOneOut(), scoring=scoring, error_score="raise"
+    )
+    assert scores.shape == (4,) and np.isfinite(scores).all()
+    for left_out, score in enumerate(scores):
+        rest = [d for i, d in enumerate(handlings()) if i != left_out]
+        model = hands_model().fit(rest)
+        score_of = scoring or (lambda m, X: m.score(X))
+        assert score == pytest.approx(score_of(model, [handlings()[left_out]]))
+
+
+def test_folds_are_lists_of_demonstrations():
+    scores = cross_val_score(hands_model(), handlings(6), cv=KFold(3), error_score="raise")
+    assert scores.shape == (3,) and np.isfinite(scores).all()
+
+
+def test_a_pipeline_aligns_and_learns():
+    uneven = [*waves(2, length=30), *waves(2, length=45)]
+    model = make_pipeline(LinearTimeNormalization(), TaskParameterizedGMM(4, blend=0.0))
+    model.fit(uneven)
+    assert model[-1].mixture_.group_size == 4
+    [trajectory] = model[-1].predict(uneven[:1])
+    assert trajectory.joints.shape == (30, 3)
+
+
+def test_it_says_that_samples_are_no_rows():
+    tags = TaskParameterizedGMM().__sklearn_tags__()
+    assert tags.input_tags.two_d_array is False
+    assert tags.target_tags.required is False
+
+
+@pytest.mark.parametrize("activation", ["time", "product"])
+@pytest.mark.parametrize("fusion", ["information", "covariance"])
+def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
+    epsilon = 1e-4 if fusion == "covariance" else None
+    model = bottle_model(8, tol=1e-2, fusion=fusion, activation=activation, negligible=0.0)
+    model.fit(few_bottles())
+    demonstration = few_bottles()[1]
+    state = model.kinematics_.state(demonstration.joints[12])
+    at = OnRobot().at(state, {OBJECT: demonstration.frames["bottle"]})
+    mixtures = [
+        oracles.Local(mean.numpy(), covariance.numpy())
+        for mean, covariance in zip(model.means_, model.covariances_, strict=True)
+    ]
+    # the oracle knows no signs of quaternions
+    here = model.operators_[0].coordinates(state, demonstration.frames)
+    for start in (3, 10):
+        assert bool((model.means_[0][:, 1:][:, start : start + 4] @ here[start:][:4] > 0).all())
+    answer = oracles.regress(
+        float(demonstration.time[12]),
+        at.joints,
+        [both_hands(at), oracles.canonical(at)],
+        mixtures,
+        model.weights_.numpy(),
+        activation=activation,
+        epsilon=epsilon,
+    )
+    estimate = model.step(
+        demonstration.time[12], state, {"bottle": demonstration.frames["bottle"]}
+    )
+    assert apart(estimate.joints, torch.from_numpy(answer.mean)) < 1e-5
+    assert apart(estimate.activation, torch.from_numpy(answer.activation)) < 1e-5
+
+
+def test_predict_is_step_after_step():
+    model = small_bottle().__sklearn_clone__().set_params(blend=0.0, keep_limits=False)
+    model.fit(few_bottles())
+    demonstration = few_bottles()[2]
+    [trajectory] = model.predict([demonstration])
+    joints = demonstration.joints[0]
+    for k, now in enumerate(trajectory.time):
+        estimate = model.step(now, joints, demonstration.frames, candidates=True)
+        joints = estimate.joints
+        torch.testing.assert_close(trajectory.joints[k], joints, rtol=0, atol=1e-9)
+        for whole, one in zip(trajectory.candidates, estimate.candidates, strict=True):
+            torch.testing.assert_close(whole.mean[k], one.mean, rtol=0, atol=1e-8)
+
+
+def test_a_batch_of_robots_steps_as_each_of_them():
+    model, batch = small_bottle(), few_bottles()
+    joints = torch.stack([item.joints[9] for item in batch])
+    frames = [item.frames["bottle"] for item in batch]
+    together = Frame(
+        torch.stack([f.position for f in frames]), torch.stack([f.orientation for f in frames])
+    )
+    times = torch.tensor([2.0, 2.5, 3.0, 3.5], dtype=torch.float64)
+    estimate = model.step(times, joints, {"bottle": together}, candidates=True)
+    for i in range(4):
+        single = model.step(times[i], joints[i], {"bottle": frames[i]})
+        torch.testing.assert_close(estimate.joints[i], single.joints, rtol=0, atol=1e-7)
+
+
+def test_one_situation_is_a_list_of_one():
+    [a], [b] = (
+        small_bottle().predict(few_bottles()[0]),
+        small_bottle().predict(few_bottles()[:1]),
+    )
+    assert torch.equal(a.joints, b.joints)
+
+
+def test_a_start_elsewhere_blends_in_without_a_jump():
+    start = torch.tensor([0.4, 0.7, -0.3], dtype=torch.float64)
+    situation = Situation(start, time=torch.linspace(0, LAST, 101))
+    blended = canonical(blend=0.5).fit(waves())
+    [soft] = blended.predict([situation])
+    [hard] = blended.set_params(blend=0.0).predict([situation])
+    torch.testing.assert_close(soft.joints[0], start)
+    assert float(soft.joints[:2].diff(dim=0).abs().max()) < 0.07  # the motion's own is 0.06
+    assert apart(hard.joints[0], start) > 0.25
+    torch.testing.assert_close(soft.joints[26:], hard.joints[26:])
+
+
+def test_references_keep_limits_of_position_and_speed():
+    robot = JointSpace(skills.JOINT_NAMES)
+    robot.lower, robot.upper = torch.tensor([-0.3] * 3), torch.tensor([0.8] * 3)
+    robot.velocity = torch.tensor([2.0, 2.0, 0.3])
+    robot = robot.to(torch.float64)
+    situation = Situation([0.0, 0.8, 0.0], time=torch.linspace(0, LAST, 101))
+    model = canonical(robot=robot).fit(waves())
+    for keep, broken in ((True, False), (False, True)):
+        [trajectory] = model.set_params(keep_limits=keep).predict([situation])
+        speed = (trajectory.joints.diff(dim=0) / trajectory.time.diff()[:, None]).abs()
+        outside = (trajectory.joints < robot.lower - 1e-9) | (
+            trajectory.joints > robot.upper + 1e-9
+        )
+        assert bool(outside.any()) is broken
+        assert bool((speed > robot.velocity + 1e-9).any()) is broken
+
+
+def test_moving_the_world_moves_the_reproduction():
+    world = OnPoses()
+    there = [
+        replace(
+            item,
+            joints=world.moved_answer(item.joints),
+            frames={name: moved(frame) for name, frame in item.frames.items()},
+        )
+        for item in handlings()
+    ]
+    situation, _ = new_handling()
+    elsewhere = Situation(
+        world.moved_answer(situation.joints),
+        {"cup": moved(situation.frames["cup"])},
+        situation.time,
+    )
+    assert apart(MOVED.position, torch.zeros(3)) > 0.5
+    [here], [there] = (
+        hands().predict([situation]),
+        hands_model().fit(there).predict([elsewhere]),
+    )
+    torch.testing.assert_close(there.joints, world.moved_answer(here.joints), rtol=0, atol=1e-6)
+
+
+def test_signs_of_recorded_quaternions_mean_nothing():
+    flipped = [
+        replace(
+            item,
+            joints=OnPoses().flipped_answer(item.joints),
+            frames={n: Frame(f.position, -f.orientation) for n, f in item.frames.items()},
+        )
+        for item in handlings()
+    ]
+    model = hands()
+    np.testing.assert_allclose(
+        model.score_samples(flipped), model.score_samples(handlings()), rtol=1e-9
+    )
+    mixed = hands_model().fit([*handlings()[:2], *flipped[2:]])
+    same(mixed, model, 1e-9)
+    [a], [b] = model.predict(flipped[:1]), model.predict(handlings()[:1])
+    torch.testing.assert_close(OnPoses().flipped_answer(a.joints), b.joints)
+
+
+def test_a_score_is_the_mean_over_all_time_steps():
+    uneven = [*waves(2), *waves(1, length=12)]
+    model = canonical().fit(waves())
+    values = model.score_samples(uneven)
+    assert values.shape == (3,)
+    assert model.score(uneven) == pytest.approx(values @ [30, 30, 12] / 72)
+    rows = torch.cat(local_data(uneven, [Canonical()], model.kinematics_)).numpy()
+    assert model.score(uneven) == pytest.approx(model.mixture_.score(rows))
+    assert model.bic(uneven) == pytest.approx(model.mixture_.bic(rows))
+    assert model.aic(uneven) == pytest.approx(model.mixture_.aic(rows))
+
+
+def test_another_motion_is_less_likely():
+    model, [one] = canonical().fit(waves()), waves(1)
+    other = replace(one, joints=one.joints.flip(0))
+    assert model.score([other]) < model.score([one]) - 10
+
+
+def test_samples_have_the_law_of_the_reproduction_at_every_instant():
+    model = canonical(n_components=4).fit(waves())
+    situation = Situation([0.0, 1.0, 0.0])
+    [mean] = model.predict([situation])
+    n = 4000
+    samples = torch.stack([s.joints for s in model.sample(situation, n, random_state=0)])
+    for at in (0, 11, 29):
+        spread = mean.covariance[at].diagonal().sqrt()
+        error = (samples[:, at].mean(0) - mean.joints[at]) / spread
+        assert float(error.abs().max()) < 5 / np.sqrt(n)
+        covariance = torch.cov(samples[:, at].T)
+        relative = (covariance - mean.covariance[at]) / torch.outer(spread, spread)
+        assert float(relative.abs().max()) < 5 * np.sqrt(2 / n)
+
+
+def test_samples_are_those_of_their_random_state_and_as_smooth_as_the_model():
+    situation, _ = new_handling()
+    a, b, c = (hands().sample(situation, 2, random_state=seed) for seed in (0, 0, 1))
+    assert torch.equal(a[1].joints, b[1].joints)
+    assert not torch.equal(a[0].joints, a[1].joints)
+    assert not torch.equal(a[0].joints, c[0].joints)
+    assert float(a[0].joints.diff(dim=0).abs().max()) < 0.2
+    quaternions = a[0].joints.unflatten(-1, (2, 7))[..., 3:]
+    torch.testing.assert_close(quaternions.norm(dim=-1), torch.ones(30, 2, dtype=torch.float64))

@@ -31,6 +31,7 @@ from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.mixture_settings import regularization
 
 if TYPE_CHECKING:
     from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
@@ -159,7 +160,13 @@ class Learner:
         isotropic = model.covariance_type == "spherical"
         moments = ColumnMoments.of(points)
         units = moments.standardization(widths, isotropic=isotropic)
-        shares = model._regularization(moments, policy.operators, kinematics)
+        shares = regularization(
+            moments,
+            policy.operators,
+            kinematics,
+            reg_covar=model.reg_covar,
+            covariance_type=model.covariance_type,
+        )
         added = torch.from_numpy(shares) * torch.cat(units.scales).square()
         return list(added.to(policy.mixture.time).split(widths))
 

@@ -137,20 +137,20 @@ def test_the_graphs_of_the_default_backend():
     # nor about types
     single = {OBJECT: Frame(cup()[OBJECT].position.float())}
     now, near = torch.tensor(0.4), compiled.kinematics_.joint_tensor([0.2, 0.5])
-    actual = compiled._regression().tick(now, near.float(), single)
+    actual = compiled.regression().tick(now, near.float(), single)
     assert_same(actual, plain.step(0.4, [0.2, 0.5], cup()), atol=1e-7)
     with pytest.raises(ShapeError, match=r"shape \(\.\.\., 2\)"):
         compiled.step(0.4, near[:1], cup())
     assert compiled.step(0.4, turned[:0], cup()).joints.shape == (0, 2)
     grid = turned[:6].reshape(2, 3, 2)
     assert_same(compiled.step(0.4, grid, cup(3)), plain.step(0.4, grid, cup(3)))
-    assert len(compiled._regression()._graphs) == 2
+    assert len(compiled.regression()._graphs) == 2
 
 
 def test_more_components_than_the_graph_knows_run_as_before():
     plain, compiled = (fitted().set_params(negligible=1e-2) for _ in range(2))
     compiled.compile("aot_eager")
-    regression = compiled._regression()
+    regression = compiled.regression()
     assert regression._windows.largest < compiled.n_components
     tables = []
     graph = regression._graphs[torch.Size([2])]
@@ -162,8 +162,8 @@ def test_more_components_than_the_graph_knows_run_as_before():
 
 def test_a_direction_without_variance_is_an_error_and_no_number():
     model = fitted().compile("aot_eager")
-    tables = model._regression()._update.tables
+    tables = model.regression()._update.tables
     tables.tasks.mul_(-1)
-    model._regression()._selected.clear()
+    model.regression()._selected.clear()
     with pytest.raises(DataError, match="covariance of the tasks is not positive definite"):
         model.step(0.5, [0.2, 0.5], cup())

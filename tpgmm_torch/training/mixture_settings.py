@@ -1,0 +1,111 @@
+"""What the estimator's parameters come to, once demonstrations and a robot are given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.em.column_moments import ColumnMoments
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
+
+
+def check_operators(operators: Sequence[Operator] | None) -> tuple[Operator, ...]:
+    """The operators; ``(Canonical(),)`` where none are given.
+
+    Raises
+    ------
+    DataError
+        If there are none, or something else is among them.
+    """
+    checked = (Canonical(),) if operators is None else tuple(operators)
+    if not checked:
+        raise DataError("operators is empty: give at least one, for example [Canonical()]")
+    for operator in checked:
+        if not isinstance(operator, Operator):
+            raise DataError(f"operators holds Operator objects, got {operator!r}")
+    return checked
+
+
+def kinematics_for(
+    demonstrations: Sequence[Demonstration],
+    operators: Sequence[Operator],
+    robot: Kinematics | None,
+    dtype: torch.dtype,
+    device: str,
+) -> Kinematics:
+    """What the operators act on, checked to have what they need.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        At least one; they name the joints where there is no robot.
+    operators : sequence of Operator
+    robot : Kinematics, optional
+        Without it the joints alone, a :class:`~tpgmm_torch.robots.joint_space.JointSpace`.
+    dtype, device
+        Where it shall compute.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the operators need links or frames that are not there.
+    """
+    needed = sorted({link for operator in operators for link in operator.links()})
+    if robot is not None:
+        kinematics = robot.to(dtype, device)
+    elif needed:
+        raise DataError(
+            f"the operators need the pose of {needed}: pass robot=Robot.from_urdf(...), or "
+            "robot=Poses(...) for recorded poses without a robot"
+        )
+    else:
+        default = tuple(f"joint_{index}" for index in range(demonstrations[0].n_joints))
+        names = next((d.joint_names for d in demonstrations if d.joint_names), default)
+        kinematics = JointSpace(names, dtype, device)
+    for operator in operators:
+        operator.check(kinematics, demonstrations[0].frames)
+    return kinematics
+
+
+def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
+    """1 + D_j of each operator: time, and its local coordinates."""
+    return tuple(1 + operator.dimension(kinematics) for operator in operators)
+
+
+def regularization(
+    moments: ColumnMoments,
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    *,
+    reg_covar: float,
+    covariance_type: str,
+) -> NDArray[np.float64]:
+    """``reg_covar`` and the operators' tolerances, as shares of each column's variance.
+
+    Parameters
+    ----------
+    moments : ColumnMoments
+        Of the rows that a mixture is learned from.
+    operators : sequence of Operator
+    kinematics : Kinematics
+    reg_covar, covariance_type
+        Parameters of :class:`~tpgmm_torch.TaskParameterizedGMM`.
+
+    Returns
+    -------
+    array of shape (sum of 1 + D_j,)
+    """
+    units = moments.standardization(
+        block_widths(operators, kinematics), isotropic=covariance_type == "spherical"
+    )
+    tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
+    return reg_covar + (np.concatenate(tolerances) / torch.cat(units.scales).numpy()) ** 2
