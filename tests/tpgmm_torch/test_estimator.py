@@ -264,7 +264,7 @@ def test_coordinates_that_vary_by_rounding_alone_do_not_become_certain():
 TIME = torch.linspace(0, 2, 30, dtype=torch.float64)
 
 
-def small_canonical(**options) -> TaskParameterizedGMM:
+def joints_only(**options) -> TaskParameterizedGMM:
     return TaskParameterizedGMM(**{"n_components": 4, "blend": 0.0, **options})
 
 
@@ -318,7 +318,9 @@ def test_wrong_shapes_are_refused():
     refused(lambda: Demonstration(TIME, np.zeros((29, 3))), ShapeError, "30", "(29, 3)")
     refused(lambda: Frame([0.0, 1.0]), ShapeError, "(..., 3)", "(2,)")
     other = Demonstration(TIME, np.zeros((30, 2)))
-    refused(lambda: small_canonical().fit([*waves(names=None), other]), ShapeError, "has 2", "has 3")
+    refused(
+        lambda: joints_only().fit([*waves(names=None), other]), ShapeError, "has 2", "has 3"
+    )
 
 
 @pytest.mark.parametrize("method", ["fit", "score"])
@@ -336,24 +338,24 @@ def test_wrong_shapes_are_refused():
     ids=str,
 )
 def test_what_is_no_list_of_demonstrations_is_refused(method, given, parts):
-    model = small_canonical().fit(waves())
+    model = joints_only().fit(waves())
     refused(lambda: getattr(model, method)(given), DataError, *parts)
 
 
 def test_other_joint_names_are_refused():
     others = [*waves(2), replace(waves(1)[0], joint_names=("a", "b", "z"))]
     named = "demonstration 2", "('a', 'b', 'z')", "('a', 'b', 'c')"
-    refused(lambda: small_canonical().fit(others), DataError, *named)
-    model = small_canonical().fit(waves())
+    refused(lambda: joints_only().fit(others), DataError, *named)
+    model = joints_only().fit(waves())
     refused(lambda: model.predict(others[2:]), UnknownNameError, "joint 'c'", "'z'")
 
 
 def test_nameless_demonstrations_are_trusted_and_never_hide_an_order():
     nameless, [first] = waves(2, names=None), waves(1)
     turned = replace(first, joints=first.joints[:, [2, 1, 0]], joint_names=("c", "b", "a"))
-    mixed = small_canonical().fit([nameless[0], first, turned])
+    mixed = joints_only().fit([nameless[0], first, turned])
     assert mixed.kinematics_.joint_names == JOINT_NAMES
-    same = small_canonical().fit([nameless[0], first, first])
+    same = joints_only().fit([nameless[0], first, first])
     assert torch.equal(mixed.means_[0], same.means_[0])
 
 
@@ -416,7 +418,7 @@ def test_a_robot_that_is_missing_is_asked_for():
 @pytest.mark.parametrize("operators", [["Canonical"], [Canonical], [Canonical(), None]])
 def test_operators_that_are_none_are_named(operators):
     refused(
-        lambda: small_canonical(operators=operators).fit(waves()),
+        lambda: joints_only(operators=operators).fit(waves()),
         DataError,
         "Operator objects",
         repr(operators[-1]),
@@ -455,7 +457,7 @@ BAD = {
 def test_bad_parameters_are_refused_when_fitting(name, value):
     assert set(BAD) == set(TaskParameterizedGMM().get_params())
     with pytest.raises(InvalidParameterError, match=f"'{name}' parameter") as caught:
-        small_canonical(**{name: value}).fit(waves())
+        joints_only(**{name: value}).fit(waves())
     assert isinstance(caught.value, ValueError)
 
 
@@ -464,7 +466,7 @@ def test_bad_parameters_are_refused_when_fitting(name, value):
 
 def test_fewer_points_than_components_are_refused():
     few = [Demonstration(TIME[:5], wave(TIME[:5]))]
-    refused(lambda: small_canonical(n_components=6).fit(few), DataError, "6", "5")
+    refused(lambda: joints_only(n_components=6).fit(few), DataError, "6", "5")
 
 
 def test_more_components_than_instants_are_reported_or_refused():
@@ -472,18 +474,18 @@ def test_more_components_than_instants_are_reported_or_refused():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises((DataError, DegenerateComponentWarning)):
-            small_canonical(n_components=9).fit(few)
+            joints_only(n_components=9).fit(few)
 
 
 def test_one_instant_is_not_enough():
     one = [Demonstration(TIME[:1], wave(TIME[:1]))]
     with pytest.raises(ValueError, match="1 sample"):
-        small_canonical(n_components=1).fit(one)
+        joints_only(n_components=1).fit(one)
 
 
 def test_instants_need_a_common_grid():
     uneven = [*waves(2), *waves(1, length=25)]
-    model = small_canonical(responsibilities="instant")
+    model = joints_only(responsibilities="instant")
     refused(lambda: model.fit(uneven), DataError, "'instant'", "time grid", "align")
 
 
@@ -505,7 +507,7 @@ def test_instants_need_a_common_grid():
     ids=["predict", "step", "sample", "score", "score_samples", "bic", "aic", "save"],
 )
 def test_an_unfitted_model_says_so(ask):
-    refused(lambda: ask(small_canonical()), NotFittedError, "not fitted yet", "fit(demonstrations)")
+    refused(lambda: ask(joints_only()), NotFittedError, "not fitted yet", "fit(demonstrations)")
     assert issubclass(NotFittedError, SklearnNotFittedError)
 
 
@@ -538,19 +540,19 @@ def test_start_postures_of_other_robots_are_refused():
 
 @pytest.mark.parametrize("given", [None, 3, [None], [np.zeros(3)], "situation"])
 def test_what_is_no_situation_is_refused(given):
-    model = small_canonical().fit(waves())
+    model = joints_only().fit(waves())
     refused(lambda: model.predict(given), DataError, "Situation")
 
 
 @pytest.mark.parametrize("now", [np.nan, np.inf])
 def test_times_that_are_no_numbers_are_refused(now):
-    model = small_canonical().fit(waves())
+    model = joints_only().fit(waves())
     refused(lambda: model.step(now, np.zeros(3)), DataError, "time", str(now))
 
 
 @pytest.mark.parametrize("n_samples", [0, -1, 2.5, "many"])
 def test_numbers_of_samples_that_are_none_are_refused(n_samples):
-    model = small_canonical().fit(waves())
+    model = joints_only().fit(waves())
     refused(lambda: model.sample(Situation(np.zeros(3)), n_samples), DataError, repr(n_samples))
 
 
