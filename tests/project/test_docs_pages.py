@@ -26,6 +26,7 @@ PAGES = [
     path
     for path in (
         ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
         *sorted(ROOT.glob("policies/*.md")),
         *sorted(ROOT.glob("docs/**/*.md")),
     )

@@ -11,6 +11,7 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -186,3 +187,19 @@ def test_everything_that_the_tests_need_is_installed():
 def test_the_build_back_end_and_its_tools_are_among_the_test_requirements():
     needed = {canonicalize_name(requirement.name) for requirement in requirements("test")}
     assert {"build", "hatchling", "packaging"} <= needed
+
+
+# The hosted workflow
+
+
+def test_the_hosted_workflow_runs_what_ci_runs_on_every_supported_python():
+    workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))
+    check = workflow["jobs"]["check"]
+    assert check["strategy"]["matrix"]["python"] == ["3.12", "3.13"]
+    assert [step["run"] for step in check["steps"] if "run" in step] == [".ci/run"]
+    supported = re.search(
+        r"\((\d+), (\d+)\) <= .* < \((\d+), (\d+)\)", (ROOT / "Makefile").read_text()
+    )
+    assert supported.groups() == ("3", "12", "3", "14")
+    commands = "\n".join(step.get("run", "") for step in workflow["jobs"]["wheels"]["steps"])
+    assert "make dist" in commands and "tpgmm --version" in commands
