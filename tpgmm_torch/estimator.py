@@ -21,8 +21,9 @@ from torch import Tensor
 from tpgmm_torch import gaussians, persistence
 from tpgmm_torch.control.compiled import CompiledRegression, check_compiler
 from tpgmm_torch.control.rollout import Synthesis, rollout
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
@@ -112,8 +112,8 @@ def plot_components(
     from matplotlib.patches import Ellipse
 
     plane = [0, 1 + column]
-    means = _array(model.means_[operator][:, plane])
-    covariances = _array(model.covariances_[operator][:, plane][:, :, plane])
+    means = as_array(model.means_[operator][:, plane])
+    covariances = as_array(model.covariances_[operator][:, plane][:, :, plane])
     for mean, covariance in zip(means, covariances, strict=True):
         variances, directions = np.linalg.eigh(covariance)
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
@@ -160,7 +160,7 @@ def plot_local(
     motions = [motion for motion, _ in shown]
     rows = local_data(motions, [chosen], model.kinematics_, expected)
     for row, (_, style) in zip(rows, shown, strict=True):
-        axes.plot(_array(row[:, 0]), _array(row[:, 1 + column]), **style)
+        axes.plot(as_array(row[:, 0]), as_array(row[:, 1 + column]), **style)
     plot_components(axes, model, operator, column)
 
 
@@ -180,19 +180,15 @@ def plot_candidates(
         Names of the operators.
     """
     column = trajectory.joint_names.index(joint)
-    time = _array(trajectory.time)
+    time = as_array(trajectory.time)
     for j, candidate in enumerate(trajectory.candidates):
-        mean = _array(candidate.mean[:, column])
-        spread = np.sqrt(_array(candidate.covariance[:, column, column]).clip(min=0))
+        mean = as_array(candidate.mean[:, column])
+        spread = np.sqrt(as_array(candidate.covariance[:, column, column]).clip(min=0))
         color = OPERATORS[j % len(OPERATORS)]
         label = labels[j] if j < len(labels) else f"operator {j + 1}"
         axes.fill_between(
             time, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0
         )
         axes.plot(time, mean, color=color, linewidth=1.6, label=label)
-    axes.plot(time, _array(trajectory.joints[:, column]), "k", linewidth=1.2, label="TP-GMM")
+    axes.plot(time, as_array(trajectory.joints[:, column]), "k", linewidth=1.2, label="TP-GMM")
     axes.set_ylabel(f"{joint} [rad]")
-
-
-def _array(tensor: Tensor) -> NDArray[np.float64]:
-    return tensor.detach().cpu().numpy()

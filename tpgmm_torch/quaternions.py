@@ -20,6 +20,7 @@ __all__ = [
     "continuous",
     "exp",
     "from_matrix",
+    "hemisphere_sign",
     "identity",
     "left_matrix",
     "log",
@@ -75,6 +76,7 @@ def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
         turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
         pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
         return {
+            "one": torch.ones((), dtype=dtype),
             "conjugate": conjugate,
             "left": left,
             "right": right,
@@ -201,6 +203,23 @@ def normalize(q: Tensor) -> Tensor:
     return q / norm
 
 
+def hemisphere_sign(inner: Tensor) -> Tensor:
+    """The sign that brings a quaternion into the hemisphere of a reference.
+
+    Parameters
+    ----------
+    inner : Tensor
+        Inner products of quaternions with their references; the real parts, where the
+        reference is no rotation.
+
+    Returns
+    -------
+    Tensor of the shape of ``inner``
+        1, or -1 where the inner product is negative.
+    """
+    return torch.copysign(_constant("one", inner.dtype, inner.device), inner)
+
+
 def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:
     """Choose the sign of each quaternion so that it lies on the side of ``reference``.
 
@@ -213,8 +232,7 @@ def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:
     Tensor of shape (..., 4)
         ``q`` or ``-q``, whichever has a non-negative inner product with ``reference``.
     """
-    inner = (q * reference).sum(-1, keepdim=True)
-    return torch.where(inner < 0, -q, q)
+    return q * hemisphere_sign((q * reference).sum(-1, keepdim=True))
 
 
 def continuous(q: Tensor, dim: int = -2) -> Tensor:
@@ -234,8 +252,7 @@ def continuous(q: Tensor, dim: int = -2) -> Tensor:
     """
     q = q.movedim(dim, -2)
     if q.shape[-2] > 1:
-        inner = (q[..., 1:, :] * q[..., :-1, :]).sum(-1, keepdim=True)
-        flips = torch.where(inner < 0, -torch.ones_like(inner), torch.ones_like(inner))
+        flips = hemisphere_sign((q[..., 1:, :] * q[..., :-1, :]).sum(-1, keepdim=True))
         signs = torch.cat((torch.ones_like(flips[..., :1, :]), flips.cumprod(dim=-2)), dim=-2)
         q = q * signs
     return q.movedim(-2, dim)
@@ -281,7 +298,7 @@ def log(q: Tensor) -> Tensor:
     -------
     Tensor of shape (..., 3)
     """
-    q = torch.where(q[..., :1] < 0, -q, q)
+    q = q * hemisphere_sign(q[..., :1])
     real, vector = q[..., :1], q[..., 1:]
     square = (vector * vector).sum(-1, keepdim=True)
     small = square < 1e-12
@@ -372,4 +389,4 @@ def from_matrix(matrix: Tensor) -> Tensor:
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True).unsqueeze(-1)
     q = outer.gather(-1, largest.expand(*outer.shape[:-1], 1)).squeeze(-1)
     norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)
-    return q / torch.copysign(norm, q.narrow(-1, 0, 1))
+    return q / norm * hemisphere_sign(q[..., :1])

@@ -8,25 +8,23 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator, TransformerMixin
 from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.features import quaternion_columns
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, NotFittedError
 
 __all__ = ["Alignment", "retime", "seconds", "steps_at"]
 
-Array = NDArray[np.floating[Any]]
-
 
 def seconds(demonstration: Demonstration) -> Array:
     """The time of a demonstration as an array of shape (T,)."""
-    return demonstration.time.detach().cpu().double().numpy()
+    return as_array(demonstration.time)
 
 
 def steps_at(demonstration: Demonstration, instants: Array) -> Tensor:
@@ -66,7 +64,7 @@ def retime(
     fraction = path - lower
     if interpolation == "cubic":
         own = seconds(demonstration)
-        spline = CubicSpline(own, demonstration.joints.detach().cpu().double().numpy())
+        spline = CubicSpline(own, as_array(demonstration.joints))
         instants = np.interp(path.numpy(), np.arange(len(own)), own)
         joints = torch.from_numpy(spline(instants)).to(demonstration.joints)
     else:

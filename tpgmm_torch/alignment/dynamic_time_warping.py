@@ -12,7 +12,6 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
@@ -25,12 +24,11 @@ from tpgmm_torch.alignment.warping_paths import (
     warping_map,
     warping_path,
 )
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["DynamicTimeWarping", "LinearTimeNormalization"]
-
-Array = NDArray[np.floating[Any]]
 
 #: Warping runs on at most this many steps; its memory and time grow with their square.
 LARGEST_GRID = 2000

@@ -9,16 +9,14 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.warping_paths import moving_average, resample
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 __all__ = ["AlignmentFeatures", "quaternion_columns"]
-
-Array = NDArray[np.floating[Any]]
 
 #: Half the length of the kernel that smooths joints before they are differentiated [s].
 VELOCITY_SMOOTHING = 0.1
@@ -183,7 +181,7 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     inside = {column for block in quaternion for column in block}
     others = [column for column in range(demonstration.n_joints) if column not in inside]
     turns = [quaternions.to_matrix(joints[:, block]).flatten(1) for block in quaternion]
-    values = _numpy(torch.cat((joints[:, others], *turns), dim=1))
+    values = as_array(torch.cat((joints[:, others], *turns), dim=1))
     groups = {"joints": values, "directions": _directions(values, demonstration)}
     if robot is None:
         return groups
@@ -192,14 +190,16 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     state = robot.state(ordered.joints.detach())
     for link in robot.links:
         position = state.position(link)
-        groups[link] = _numpy(position)
+        groups[link] = as_array(position)
         for name, frame in demonstration.frames.items():
-            groups[f"{link} in {name}"] = _numpy(frame.to(position).inverse_transform(position))
+            groups[f"{link} in {name}"] = as_array(
+                frame.to(position).inverse_transform(position)
+            )
     return groups
 
 
 def _directions(values: Array, demonstration: Demonstration) -> Array:
-    time = _numpy(demonstration.time)
+    time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
     smooth = moving_average(resample(values, time, even), round(VELOCITY_SMOOTHING / step))
@@ -208,7 +208,3 @@ def _directions(values: Array, demonstration: Demonstration) -> Array:
     norm = np.sqrt(squared + STANDSTILL**2 * squared.mean())
     # a demonstration that stands still has no direction
     return np.divide(rates, norm, out=np.zeros_like(rates), where=norm > 0)
-
-
-def _numpy(tensor: Tensor) -> Array:
-    return tensor.detach().cpu().double().numpy()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DependencyError
 
 __all__ = [
@@ -23,7 +24,7 @@ __all__ = [
     "warping_path",
 ]
 
-Array = NDArray[np.floating[Any]]
+Floats = NDArray[np.floating[Any]]
 
 #: A warp never runs slower than this, relative to its mean: events have one instant each.
 SLOWEST = 1e-3
@@ -45,7 +46,7 @@ def _dtaidistance() -> Any:
     return dtw_ndim
 
 
-def resample(values: Array, time: Array, grid: Array) -> Array:
+def resample(values: Array, time: Floats, grid: Floats) -> Array:
     """Interpolate the columns of ``values`` (T, D), known at ``time`` (T,), on a ``grid``."""
     return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
 

@@ -14,7 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 __all__ = ["Demonstration", "Situation", "check_demonstrations"]

@@ -1,74 +1,23 @@
-"""Poses of objects, and how numbers that a user gives become tensors.
-
-SI units and radians; quaternions (w, x, y, z). Everything given as numpy array, list or
-tensor is copied once into tensors, by default of float64; nothing is modified in place.
-"""
+"""Poses of objects: in metres, with unit quaternions (w, x, y, z)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.gaussians import FEW
 
-__all__ = ["UNIT_NORM_TOLERANCE", "Frame", "as_tensor"]
+__all__ = ["UNIT_NORM_TOLERANCE", "Frame"]
 
 #: Quaternions whose norm is off by more than this are refused; below, they are rounded data
 #: (float32 recordings, a few printed digits) and brought to unit norm.
 UNIT_NORM_TOLERANCE = 1e-3
-
-
-def as_tensor(values: Any, name: str) -> Tensor:
-    """Convert what a user gives into a finite floating tensor, without sharing memory.
-
-    Parameters
-    ----------
-    values : array-like or Tensor
-        Floating tensors keep dtype, device and gradient; everything else becomes float64.
-    name : str
-        How the error message calls it.
-
-    Returns
-    -------
-    Tensor
-
-    Raises
-    ------
-    DataError
-        If it is not numeric, or holds NaN or infinity (the message says where).
-    """
-    if isinstance(values, float) and math.isfinite(values):
-        return torch.scalar_tensor(values, dtype=torch.float64)
-    if isinstance(values, Tensor) and not values.is_complex():
-        tensor = (values if values.is_floating_point() else values.double()).clone()
-    else:
-        try:
-            array = np.asarray(values)
-            if array.dtype.kind not in "biufO":
-                raise TypeError(f"their type is {array.dtype}")
-            tensor = torch.from_numpy(array.astype(np.float64))
-        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-            raise DataError(f"{name} must be an array of numbers: {error}") from error
-    # every tick asks: a sum is quickly had, and is not finite if a number is not
-    few = tensor.numel() <= FEW
-    if math.isfinite(sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()):
-        return tensor
-    finite = torch.isfinite(tensor)
-    if not bool(finite.all()):
-        first = torch.nonzero(~finite)[0].tolist()
-        raise DataError(
-            f"{name} holds {int((~finite).sum())} value(s) that are NaN or infinite, "
-            f"the first is {tensor[tuple(first)].item()} at index {first}"
-        )
-    return tensor
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import Tensor
 
-from tpgmm_torch.data.frames import as_tensor
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.em.block_gaussians import Parameters, Standardization
 from tpgmm_torch.exceptions import DataError, ShapeError
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.robots.kinematic_tree import MovingTree
 
 __all__ = ["TreeKinematics"]
@@ -31,8 +31,6 @@ MANY = 16
 
 #: ... and from which it is worth two runs to leave out the rows that are not wanted.
 PLENTY = 128
-
-Array = NDArray[np.float64]
 
 
 class TreeKinematics:
@@ -140,7 +138,6 @@ class TreeKinematics:
         self._turns, self._slides = both(mask * ~slide), None
         if slide.any():
             self._slides = both(mask * slide)
-        self._one = constant(1.0)
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Poses and Jacobians in the base frame.
@@ -170,7 +167,7 @@ class TreeKinematics:
         columns, links = self._turns[3].shape[:2]
         position = position.view(links, 3, *batch)
         quaternion = quaternion.view(links, 4, *batch)
-        quaternion = quaternion * torch.copysign(self._one, quaternion.narrow(1, 0, 1))
+        quaternion = quaternion * quaternions.hemisphere_sign(quaternion[:, :1])
         origin, axis = (x.view(columns, 1, 3, *batch) for x in (origin, axis))
         turning = axis * self._turns[axis.ndim]  # (C, L, 3[, B])
         linear = _cross(turning, position - origin)

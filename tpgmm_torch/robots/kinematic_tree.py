@@ -11,14 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfJoint, UrdfModel
 
 __all__ = ["Attachment", "MovingFrame", "MovingTree", "reduce"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import as_tensor
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 __all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]

@@ -11,11 +11,11 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.arrays import Array, as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
@@ -253,9 +253,7 @@ def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
     return [parent, frame.position.tolist(), orientation.tolist()]
 
 
-def _wanted(
-    model: UrdfModel, config: Mapping[str, Any]
-) -> tuple[str, list[tuple[str, NDArray[np.float64]]]]:
+def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tuple[str, Array]]]:
     """The base, and for each wanted link a link of the URDF and the pose in it."""
     places = {link: (link, np.eye(4)) for link in model.links}
     if config["base"] not in places:

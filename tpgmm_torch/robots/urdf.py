@@ -15,13 +15,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["Mimic", "UrdfJoint", "UrdfModel", "placement", "read_urdf"]
-
-Array = NDArray[np.float64]
 
 MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
 #: Joints of more than one degree of freedom: read, but no :class:`Robot` can be moved by them.

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
@@ -22,8 +23,6 @@ from tpgmm_torch.viewing.ellipsoids import ellipsoids
 from tpgmm_torch.viewing.solids import add_solid, unit_sphere
 
 __all__ = ["COLORS", "MotionScene"]
-
-Array = NDArray[np.float64]
 
 COLORS = {
     "demonstrations": (120, 120, 120),
@@ -109,17 +108,17 @@ class MotionScene:
         steps = _steps(trajectory.time.cpu(), self._fps)
         state = self._body.state(trajectory.joints.cpu()[steps])
         covariance = trajectory.covariance.cpu().to(state.joints)[steps]
-        self.time = _array(trajectory.time)[steps]
+        self.time = as_array(trajectory.time)[steps]
         self._link_poses = _poses(state.positions, state.orientations)  # (F, L, 7)
         self._frame_poses = {name: _poses_at(f, steps) for name, f in situation.frames.items()}
         if not self._links:
             self._set_up()
         few = np.linspace(0, len(steps) - 1, min(ELLIPSOIDS, len(steps))).astype(int)
         for link in self._of_interest:
-            path = _array(state.position(link))
+            path = as_array(state.position(link))
             self._draw_paths("reproduction", link, [path], thickness=3.5)
             half_axes, turns = ellipsoids(state[few], covariance[few], link)
-            self._draw_ellipsoids(link, path[few], _array(half_axes), _array(turns))
+            self._draw_ellipsoids(link, path[few], as_array(half_axes), as_array(turns))
         self._replace_frames()
         self.move_to(0)
         return trajectory
@@ -142,7 +141,7 @@ class MotionScene:
         """Everything that is the same in all situations."""
         links = range(len(self._of_interest))  # the first of the body's
         self._demonstrated = [
-            _array(self._body.state(one.joints).positions)[:, links]
+            as_array(self._body.state(one.joints).positions)[:, links]
             for one in self._demonstrations
         ]
         action = [self._link_poses[:, links, :3], *self._demonstrated]
@@ -277,7 +276,7 @@ def _spread(length: int, most: int) -> NDArray[np.int64]:
 
 
 def _poses(positions: Tensor, orientations: Tensor) -> Array:
-    return _array(torch.cat((positions, orientations), dim=-1))
+    return as_array(torch.cat((positions, orientations), dim=-1))
 
 
 def _poses_at(frame: Frame, steps: Tensor) -> Array:
@@ -293,7 +292,3 @@ def _place(handle: Any, pose: Array) -> None:
 def _node(name: str) -> str:
     """A name as one step of a path in the scene."""
     return name.replace("/", "_")
-
-
-def _array(tensor: Tensor) -> Array:
-    return tensor.detach().cpu().double().numpy()

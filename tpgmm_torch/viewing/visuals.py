@@ -15,14 +15,13 @@ from typing import Literal
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import UrdfModel, placement
 
 __all__ = ["Color", "Shape", "link_shapes"]
 
-Array = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 DEFAULT_COLOR: Color = (125, 145, 165)

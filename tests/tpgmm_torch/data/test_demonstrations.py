@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.frames import Frame, as_tensor
+from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
 
 HALF = math.sqrt(0.5)

@@ -1,0 +1,71 @@
+"""How numbers that a user gives become tensors, and tensors arrays of numpy.
+
+Everything given as numpy array, list or tensor is copied once, by default to float64; nothing
+is modified in place.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.gaussians import FEW
+
+__all__ = ["Array", "as_array", "as_tensor"]
+
+Array = NDArray[np.float64]
+
+
+def as_tensor(values: Any, name: str) -> Tensor:
+    """Convert what a user gives into a finite floating tensor, without sharing memory.
+
+    Parameters
+    ----------
+    values : array-like or Tensor
+        Floating tensors keep dtype, device and gradient; everything else becomes float64.
+    name : str
+        How the error message calls it.
+
+    Returns
+    -------
+    Tensor
+
+    Raises
+    ------
+    DataError
+        If it is not numeric, or holds NaN or infinity (the message says where).
+    """
+    if isinstance(values, float) and math.isfinite(values):
+        return torch.scalar_tensor(values, dtype=torch.float64)
+    if isinstance(values, Tensor) and not values.is_complex():
+        tensor = (values if values.is_floating_point() else values.double()).clone()
+    else:
+        try:
+            array = np.asarray(values)
+            if array.dtype.kind not in "biufO":
+                raise TypeError(f"their type is {array.dtype}")
+            tensor = torch.from_numpy(array.astype(np.float64))
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+            raise DataError(f"{name} must be an array of numbers: {error}") from error
+    # every tick asks: a sum is quickly had, and is not finite if a number is not
+    few = tensor.numel() <= FEW
+    if math.isfinite(sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()):
+        return tensor
+    finite = torch.isfinite(tensor)
+    if not bool(finite.all()):
+        first = torch.nonzero(~finite)[0].tolist()
+        raise DataError(
+            f"{name} holds {int((~finite).sum())} value(s) that are NaN or infinite, "
+            f"the first is {tensor[tuple(first)].item()} at index {first}"
+        )
+    return tensor
+
+
+def as_array(tensor: Tensor) -> Array:
+    """The values of a ``tensor``, without its gradient, as an array of float64."""
+    array: Array = tensor.detach().cpu().double().numpy()
+    return array
