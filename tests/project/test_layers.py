@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[2]
 ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
         ("exceptions",),
-        ("quaternions", "gaussians", "storage"),
+        ("atomic", "quaternions", "gaussians"),
+        ("storage",),
         ("data", "em"),
         ("robots", "alignment", "large_data"),
         ("operators", "mixture"),

@@ -1,0 +1,180 @@
+"""Files and folders replaced in one step, whatever happens on the way."""
+
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tpgmm_torch import atomic
+from tpgmm_torch.atomic import replacing
+
+#: A process that saves, and dies at the n-th thing that it asks of the system, for every n;
+#: prints what is there then.
+DYING = """
+import itertools, os, sys
+from pathlib import Path
+from atomic import replacing
+
+kind, path = sys.argv[1], Path(sys.argv[2])
+
+def save(text):
+    with replacing(path, keep=kind == "kept") as new:
+        if kind == "file":
+            new.write_text(text)
+            return
+        new.mkdir()
+        (new / "settings").write_text(text)
+        (new / "weights").write_text(text)
+
+def die_at(nth):
+    count = itertools.count()
+    sys.addaudithook(lambda *_: os._exit(7) if next(count) == nth else None)
+
+code, nth = 7, 0
+while code == 7:
+    save("old")
+    pid = os.fork()
+    if not pid:
+        die_at(nth)
+        save("new")
+        os._exit(0)
+    code, nth = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), nth + 1
+    files = [path] if kind == "file" else sorted(path.iterdir())
+    print(code, *(file.read_text() for file in files))
+"""
+#: What may be there: the old or the new, of all files.
+WHOLE = {
+    "file": ["old", "new"],
+    "folder": ["old old", "new new"],
+    "kept": ["mine old old", "mine new new"],
+}
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def save(path: Path, text: str, *, keep: bool = False) -> None:
+    with replacing(path, keep=keep) as new:
+        new.mkdir()
+        (new / "settings").write_text(text)
+        (new / "weights").write_text(text)
+
+
+@pytest.fixture(params=["in one step", "in two"])
+def exchange(request, monkeypatch):
+    if request.param == "in two":
+        monkeypatch.setattr(atomic, "_swap", lambda one, other: False)
+
+
+def test_a_file_is_replaced_and_its_folders_are_made(tmp_path):
+    path = tmp_path / "a" / "b" / "notes.txt"
+    for text in ("old", "new"):
+        with replacing(path) as new:
+            assert new.name == path.name  # what asks for its suffix is answered
+            new.write_text(text)
+        assert path.read_text() == text
+        assert names(path.parent) == ["notes.txt"]
+
+
+@pytest.mark.usefixtures("exchange")
+def test_a_folder_is_replaced_as_a_whole(tmp_path):
+    for text in ("old", "new"):
+        save(tmp_path / "saved", text)
+        (tmp_path / "saved" / text).mkdir()
+    assert names(tmp_path) == ["saved"]
+    assert names(tmp_path / "saved") == ["new", "settings", "weights"]
+    assert (tmp_path / "saved" / "weights").read_text() == "new"
+
+
+@pytest.mark.usefixtures("exchange")
+def test_other_files_of_a_folder_may_stay(tmp_path):
+    path = tmp_path / "saved"
+    save(path, "old")
+    (path / "a" / "empty").mkdir(parents=True)
+    (path / "a" / "mine").write_text("mine")
+    (path / "link").symlink_to("nowhere")
+    save(path, "new", keep=True)
+    assert names(path) == ["a", "link", "settings", "weights"]
+    assert names(path / "a") == ["empty", "mine"]
+    assert (path / "a" / "mine").read_text() == "mine"
+    assert (path / "link").readlink() == Path("nowhere")
+    assert (path / "settings").read_text() == (path / "weights").read_text() == "new"
+
+
+def test_files_that_stay_are_copied_where_links_cannot_be(tmp_path, monkeypatch):
+    save(tmp_path / "saved", "old")
+    (tmp_path / "saved" / "mine").write_text("mine")
+
+    def refuse(*arguments, **options):
+        raise PermissionError
+
+    monkeypatch.setattr(os, "link", refuse)
+    save(tmp_path / "saved", "new", keep=True)
+    assert (tmp_path / "saved" / "mine").read_text() == "mine"
+    assert (tmp_path / "saved" / "weights").read_text() == "new"
+
+
+@pytest.mark.usefixtures("exchange")
+@pytest.mark.parametrize("failing", ["mkdir", "write_text", "rename", "fsync"])
+@pytest.mark.parametrize("nth", [1, 2])
+def test_what_fails_leaves_the_old(tmp_path, monkeypatch, failing, nth):
+    path, calls = tmp_path / "saved", []
+    save(path, "old")
+    owner = os if failing == "fsync" else Path
+    original = getattr(owner, failing)
+
+    def fail(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == nth:
+            raise KeyboardInterrupt
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(owner, failing, fail)
+    try:
+        save(path, "new")
+        failed = False
+    except KeyboardInterrupt:
+        failed = True
+    monkeypatch.undo()
+    assert failed == (len(calls) >= nth)
+    assert names(tmp_path) == ["saved"]
+    assert {file.read_text() for file in path.iterdir()} == {"old" if failed else "new"}
+
+
+@pytest.mark.parametrize("kind", WHOLE)
+def test_what_dies_on_the_way_leaves_the_old_or_the_new(tmp_path, kind):
+    path = tmp_path / "saved"
+    if kind == "kept":
+        path.mkdir()
+        (path / "mine").write_text("mine")
+    done = subprocess.run(
+        [sys.executable, "-c", DYING, kind, str(path)],
+        env=os.environ | {"PYTHONPATH": str(Path(atomic.__file__).parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    old, new = WHOLE[kind]
+    *died, last = done.stdout.splitlines()
+    assert last == f"0 {new}"
+    assert len(died) > 10
+    turn = died.index(f"7 {new}")
+    assert died == [f"7 {old}"] * turn + [f"7 {new}"] * (len(died) - turn)
+
+
+def test_permissions_are_those_of_any_other_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    with replacing(tmp_path / "new file") as new:
+        new.write_text("")
+    save(tmp_path / "new folder", "new")
+    for kind in ("file", "folder"):
+        modes = {
+            stat.S_IMODE((tmp_path / name).stat().st_mode) for name in (kind, f"new {kind}")
+        }
+        assert len(modes) == 1
