@@ -1,16 +1,13 @@
 """Folders of two files: JSON for words and settings, safetensors for numbers.
 
-A folder is written beside its destination and moved there in one step, so an interrupted save
-leaves the old one or none. Reading takes numbers and names, never code, and refuses whatever
-was cut off or changed.
+An interrupted save leaves the old folder or the new one, never a mixture. Reading takes
+numbers and names, never code, and refuses whatever was cut off or changed.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shutil
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +17,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["Folder"]
@@ -72,6 +70,7 @@ class Folder:
         config : mapping
             JSON values.
         tensors : mapping of str to Tensor
+            On any device.
 
         Raises
         ------
@@ -98,21 +97,10 @@ class Folder:
             raise ModelFileError(
                 f"the {self.kind} cannot be described in JSON: {error}"
             ) from error
-        path.parent.mkdir(parents=True, exist_ok=True)
-        staging = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-        try:
-            (staging / "new").mkdir()
-            (staging / "new" / CONFIG).write_text(json.dumps(full, indent=1, allow_nan=False))
-            (staging / "new" / self.tensors).write_bytes(blob)
-            if path.exists():
-                path.rename(staging / "old")
-            (staging / "new").rename(path)
-        except BaseException:
-            if (staging / "old").exists() and not path.exists():
-                (staging / "old").rename(path)
-            raise
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
+        with replacing(path) as new:
+            new.mkdir()
+            (new / CONFIG).write_text(json.dumps(full, indent=1, allow_nan=False))
+            (new / self.tensors).write_bytes(blob)
 
     def _replaceable(self, path: Path) -> bool:
         """Whether nothing but one of this kind, or nothing at all, is lost by replacing it."""

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import uuid
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -31,14 +28,13 @@ from tpgmm_datasets.lerobot.statistics import (
     episode_statistics,
     merge_statistics,
 )
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
 __all__ = ["save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-#: Files that change when a set grows; all others are taken over as they are.
-REWRITTEN = {"meta/info.json", "meta/stats.json", "meta/tasks.parquet"}
 #: Episodes whose metadata are written at a time.
 FLUSH_EPISODES = 100
 
@@ -105,8 +101,7 @@ def save_lerobot(
 
     Notes
     -----
-    All is written into a folder beside ``path``, which then takes its place: an interrupted
-    write leaves the old set, or none where there was none.
+    An interrupted write leaves the old set, or none where there was none.
 
     Examples
     --------
@@ -134,7 +129,7 @@ def save_lerobot(
         raise DatasetError(
             f"{path} exists; remove it, or pass append=True to add episodes to that set"
         )
-    new = {
+    declared = {
         "codebase_version": "v3.0",
         "robot_type": robot_type,
         "fps": int(fps),
@@ -146,16 +141,9 @@ def save_lerobot(
         "video_path": None,
     }
     old = open_layout(path) if path.exists() else None
-    info = new if old is None else _extended(old, new)
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
-    try:
-        partial.mkdir(parents=True)
-        if old is not None:
-            _take_over(path, partial)
-        _Writer(partial, info, old).write(demonstrations, tasks, commanded)
-        _put_in_place(partial, path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    info = declared if old is None else _extended(old, declared)
+    with replacing(path, keep=True) as new:  # the files of old episodes stay as they are
+        _Writer(new, info, old).write(demonstrations, tasks, commanded)
     return path
 
 
@@ -210,33 +198,6 @@ def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
     return info
 
 
-def _take_over(path: Path, partial: Path) -> None:
-    """Link the files that stay as they are; they are never written again."""
-    for source in path.rglob("*"):
-        file = source.relative_to(path)
-        if source.is_file() and file.as_posix() not in REWRITTEN:
-            target = partial / file
-            target.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(source, target)
-            except OSError:
-                shutil.copy2(source, target)
-
-
-def _put_in_place(partial: Path, path: Path) -> None:
-    if not path.exists():
-        partial.rename(path)
-        return
-    previous = path.with_name(f".{path.name}.{uuid.uuid4().hex}.previous")
-    path.rename(previous)
-    try:
-        partial.rename(path)
-    except BaseException:
-        previous.rename(path)
-        raise
-    shutil.rmtree(previous, ignore_errors=True)
-
-
 class _Writer:
     """Write episodes after those of the set ``old``, if there is one."""
 
@@ -249,8 +210,9 @@ class _Writer:
         self.pending: list[dict[str, Any]] = []
         limits = int(info["data_files_size_in_mb"] * 1e6), info["chunks_size"]
         declared = json.dumps({"fps": info["fps"], "features": info["features"]})
-        self.data = FileSeries(root, info["data_path"], *limits, metadata=declared)
-        self.meta = FileSeries(root, EPISODES_PATH, *limits)
+        before = root if old is None else old.root
+        self.data = FileSeries(root, info["data_path"], *limits, before, declared)
+        self.meta = FileSeries(root, EPISODES_PATH, *limits, before)
 
     def write(
         self,

@@ -212,16 +212,13 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
         assert_same(load_lerobot(root)[0], old[0], 1e-6)
 
 
-def test_a_failed_exchange_brings_the_old_set_back(tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_old_set(tmp_path, monkeypatch):
     root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
-    rename = Path.rename
 
-    def failing(path, target):
-        if path.suffix == ".partial":
-            raise OSError("no space left on device")
-        return rename(path, target)
+    def failing(file):
+        raise OSError("no space left on device")
 
-    monkeypatch.setattr(Path, "rename", failing)
+    monkeypatch.setattr(os, "fsync", failing)
     with pytest.raises(OSError, match="no space"):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=True)
     assert [path.name for path in tmp_path.iterdir()] == ["set"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -126,10 +125,10 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
 def _write(
     trajectories: Sequence[Trajectory], situations: Sequence[Situation], out: Path
 ) -> None:
-    """Write beside the destination and move there in one step."""
     import numpy as np
 
     from tpgmm_datasets import demonstrations_to_frame
+    from tpgmm_torch.atomic import replacing
     from tpgmm_torch.data.demonstrations import Demonstration
 
     table = demonstrations_to_frame(
@@ -138,19 +137,16 @@ def _write(
             for t, s in zip(trajectories, situations, strict=True)
         ]
     )
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}-", dir=out.parent) as folder:
-        staged = Path(folder) / out.name
+    with replacing(out) as new:
         if out.suffix == ".parquet":
-            table.to_parquet(staged)
+            table.to_parquet(new)
         elif out.suffix == ".csv":
-            table.set_axis(table.columns.get_level_values("name"), axis=1).to_csv(staged)
+            table.set_axis(table.columns.get_level_values("name"), axis=1).to_csv(new)
         else:
             np.savez(
-                staged,
+                new,
                 episode=table.index.get_level_values("episode").to_numpy(),
                 time=table.index.get_level_values("time").to_numpy(),
                 joints=table["joint"].to_numpy(),
                 joint_names=np.array(trajectories[0].joint_names),
             )
-        staged.replace(out)

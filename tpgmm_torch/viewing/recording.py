@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import io
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -74,7 +74,8 @@ def write_motion(
             scene.move_to(picture)
             recording.insert_sleep(float(pause))
         page = recording.as_html()
-    _write(Path(path), _entitled(page, title, bool(demonstrations)))
+    with replacing(path) as new:
+        new.write_text(_entitled(page, title, bool(demonstrations)), encoding="utf-8")
     return trajectory
 
 
@@ -139,12 +140,3 @@ def _entitled(page: str, title: str, with_demonstrations: bool) -> str:
     before, body, after = page.rpartition("</body>")
     page = before + legend + body + after
     return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
-
-
-def _write(path: Path, text: str) -> None:
-    """Write beside the destination and move there in one step."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
-        staged = Path(folder) / path.name
-        staged.write_text(text, encoding="utf-8")
-        staged.replace(path)

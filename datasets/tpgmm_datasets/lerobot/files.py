@@ -16,7 +16,7 @@ METADATA_KEY = b"tpgmm_datasets"
 
 
 class FileSeries:
-    """Append tables to ``template`` with increasing numbers, after the files that exist.
+    """Append tables to ``template`` with increasing numbers, after those of a set that grows.
 
     Parameters
     ----------
@@ -28,6 +28,8 @@ class FileSeries:
         A file is closed before it grows beyond this, if it holds anything.
     chunk_files : int
         Number of files in a folder.
+    before : Path
+        Folder of the set as it was; ``root`` for a new one.
     metadata : str, optional
         Kept in each file under :data:`METADATA_KEY`.
     """
@@ -38,13 +40,14 @@ class FileSeries:
         template: str,
         file_bytes: int,
         chunk_files: int,
+        before: Path,
         metadata: str | None = None,
     ) -> None:
         self.root, self.template = root, template
         self.file_bytes, self.chunk_files = file_bytes, chunk_files
         self.metadata = None if metadata is None else {METADATA_KEY: metadata.encode()}
         self.place = (0, 0)
-        while self._path().exists():
+        while (before / self._path().relative_to(root)).exists():
             self._advance()
         self.writer: pq.ParquetWriter | None = None
 
