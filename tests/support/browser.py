@@ -146,3 +146,29 @@ def _address(browser: subprocess.Popen, profile: Path) -> str:
                 return pages[0]["webSocketDebuggerUrl"]
         time.sleep(0.1)
     raise AssertionError(f"the browser did not start (exit code {browser.poll()})")
+
+
+def red(picture) -> int:
+    """How many pixels have the reproduced path's colour."""
+    r, g, b = np.moveaxis(picture, -1, 0)
+    return int(((r > 0.6) & (g < 0.4) & (b < 0.4)).sum())
+
+
+def blue_grey(picture) -> int:
+    """How many pixels have the robot's colour, in light and in shade."""
+    r, _, b = np.moveaxis(picture, -1, 0)
+    return int(((b > r + 0.04) & (b < 0.85) & (r > 0.15)).sum())
+
+
+def yellow(picture) -> int:
+    """How many pixels have the colour of a handle under the mouse."""
+    r, g, b = np.moveaxis(picture, -1, 0)
+    return int(((r > 0.85) & (g > 0.85) & (b < 0.6)).sum())
+
+
+def draws(page) -> None:
+    """Wait until the robot and the path are in the canvas."""
+    end = time.monotonic() + PATIENCE
+    while blue_grey(picture := page.screenshot()) < 1000 or red(picture) < 30:
+        found = f"{blue_grey(picture)} pixels of the robot, {red(picture)} of the path"
+        assert time.monotonic() < end, found

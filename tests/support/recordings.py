@@ -8,6 +8,9 @@ import msgspec
 import numpy as np
 import zstandard
 
+#: Pictures per second of the recorded pages.
+FPS = 2.0
+
 
 class Recording:
     """The messages in a page: what was added to the scene, and where it was at which time."""

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.support import skills
+from tests.support.own_operators import PlanarArm
 from tests.support.skills import (
     HANDLING,
     HANDS,
@@ -21,7 +22,6 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
-from tests.tpgmm_torch.operators.test_own_operators import PlanarArm
 from tpgmm_torch import Canonical, Demonstration, RelativePosition, TaskParameterizedGMM
 from tpgmm_torch.exceptions import ModelFileError, NotFittedError
 from tpgmm_torch.persistence import CONFIG, TENSORS, decode, encode

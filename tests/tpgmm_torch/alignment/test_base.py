@@ -1,25 +1,20 @@
-"""Laws of playing demonstrations on another clock, and of linear time normalisation."""
+"""Playing demonstrations on another clock, and what all alignments share."""
 
 import numpy as np
 import pytest
 import torch
+from sklearn.base import clone
 
-from tpgmm_torch import quaternions
-from tpgmm_torch.alignment import LinearTimeNormalization
+from tests.support.motions import DEMONSTRATIONS, turning
+from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import (
+    DataError,
+    NotFittedError,
+    ShapeError,
+    UnknownNameError,
+)
 from tpgmm_torch.robots.tracked_poses import Poses
-
-
-def turning(time, phase):
-    """One rotating frame and one hand pose, both a function of the phase in [0, 1]."""
-    angle = torch.from_numpy(2.5 * phase)
-    turn = quaternions.exp(angle[:, None] * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64))
-    place = np.stack((np.sin(3 * phase), phase, phase**2), 1)
-    poses = torch.cat((torch.from_numpy(place), turn), 1)
-    return Demonstration(
-        time, poses, {"moving": Frame(place, turn)}, Poses(["hand"]).joint_names
-    )
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "cubic"])
@@ -37,15 +32,26 @@ def test_moving_frames_and_recorded_poses_turn_along_great_arcs(interpolation):
     assert error < (1e-3 if interpolation == "cubic" else 2e-2)
 
 
-@pytest.mark.parametrize("duration, expected", [("mean", 2.0), ("median", 1.5), (1.0, 1.0)])
-def test_linear_normalization_scales_durations_and_events(duration, expected):
-    family = [
-        Demonstration(
-            np.linspace(5, 5 + t, 31), np.arange(31.0)[:, None], events={"half": 5 + t / 2}
+@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
+def test_n_steps_sets_the_grid(transformer):
+    aligned = clone(transformer).set_params(n_steps=57).fit_transform(DEMONSTRATIONS[:2])
+    assert [len(d) for d in aligned] == [57, 57]
+    torch.testing.assert_close(aligned[0].time.diff(), aligned[0].time.diff()[:1].expand(56))
+
+
+@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
+def test_errors_say_what_is_wrong_with_the_input(transformer):
+    with pytest.raises(NotFittedError, match="call fit"):
+        clone(transformer).transform(DEMONSTRATIONS)
+    for wrong in (DEMONSTRATIONS[0], [], [1], 5):
+        with pytest.raises(DataError, match="expected"):
+            clone(transformer).fit_transform(wrong)
+    with pytest.raises(DataError, match="one time step"):
+        clone(transformer).fit([Demonstration([0.0], [[1.0]])])
+    fitted = clone(transformer).fit(DEMONSTRATIONS[:2])
+    with pytest.raises(UnknownNameError, match="'a' is not in the demonstration"):
+        fitted.transform([Demonstration([0.0, 1.0], np.eye(2), joint_names=("x", "y"))])
+    with pytest.raises(ShapeError, match="the robot has 7"):
+        clone(transformer).set_params(robot=Poses(["hand"])).fit_transform(
+            [Demonstration([0.0, 1.0], np.eye(2))]
         )
-        for t in (1.0, 1.5, 3.5)
-    ]
-    for aligned in LinearTimeNormalization(duration).fit_transform(family):
-        assert (float(aligned.time[0]), aligned.duration) == pytest.approx((0, expected))
-        assert aligned.events["half"] == pytest.approx(expected / 2)
-        assert aligned.joints[:, 0].tolist() == pytest.approx(list(range(31)))

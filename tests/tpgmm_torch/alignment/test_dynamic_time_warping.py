@@ -1,8 +1,7 @@
-"""Laws of the alignment in time, on generated demonstrations whose true phase is known."""
+"""Laws of dynamic time warping, on demonstrations whose true phase is known."""
 
 import pickle
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,76 +11,25 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 from sklearn.pipeline import Pipeline
 
-from tpgmm_torch import quaternions
+from tests.support.motions import (
+    DEMONSTRATIONS,
+    EVENTS,
+    NOMINAL,
+    PHASES,
+    Arm,
+    generate,
+    motion,
+    random_clock,
+    turning,
+)
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import (
     DataError,
     DependencyError,
-    NotFittedError,
-    ShapeError,
     UnknownNameError,
 )
 from tpgmm_torch.robots.tracked_poses import Poses
-
-NOMINAL = 13.0
-EVENTS = {"grasped": 3.0, "shake": 8.0, "rest": 12.0}
-
-
-def ease(s, start, end):
-    u = np.clip((s - start) / (end - start), 0, 1)
-    return u**3 * (10 - 15 * u + 6 * u**2)
-
-
-def motion(s, start, goal):
-    """Reach until 3, hold until 5, bring until 8, shake two joints at 1 Hz until 12."""
-    joints = start + np.outer(ease(s, 0, 3), goal) - np.outer(ease(s, 5, 8), 0.6 * goal)
-    envelope = ease(s, 8, 8.6) * (1 - ease(s, 11.4, 12))
-    joints[:, 2:4] += (0.25 * envelope * np.sin(2 * np.pi * (s - 8)))[:, None]
-    return joints
-
-
-def random_clock(rng, duration, rate=100.0, strength=0.15):
-    """Time and the nominal phase s(t) reached: smooth, increasing, both ends fixed."""
-    time = np.arange(round(duration * rate) + 1) / rate
-    u = time / time[-1]
-    speed = np.ones_like(u)
-    for k in (1, 2, 3):
-        speed += strength * rng.uniform(-1, 1) * np.cos(np.pi * k * u + rng.uniform(0, 6))
-    phase = np.concatenate(([0], np.cumsum((speed[1:] + speed[:-1]) / 2)))
-    return time, NOMINAL * phase / phase[-1]
-
-
-def generate(n=10, seed=0, rate=100.0):
-    """Demonstrations and the true phase at each of their time steps."""
-    rng = np.random.default_rng(seed)
-    goal = np.array([0.8, -0.5, 0.6, 0.7, 1.0])
-    demonstrations, phases = [], []
-    for scale in rng.permutation(np.linspace(0.85, 1.15, n)):
-        time, phase = random_clock(rng, NOMINAL * scale, rate)
-        own = goal + rng.uniform(-0.1, 0.1, 5)
-        joints = motion(phase, rng.uniform(-0.05, 0.05, 5), own)
-        events = {name: np.interp(s, phase, time) for name, s in EVENTS.items()}
-        frames = {"bottle": Frame(rng.uniform(-0.2, 0.2, 3))}
-        demonstrations.append(Demonstration(time, joints, frames, tuple("abcde"), events))
-        phases.append(phase)
-    return demonstrations, phases
-
-
-DEMONSTRATIONS, PHASES = generate()
-
-
-class Arm:
-    """What the alignment needs of a robot, and nothing else: two links of a planar arm."""
-
-    links = ("elbow", "hand")
-
-    def state(self, joints):
-        turn = joints[:, 0] + joints[:, 2]
-        elbow = torch.stack((joints[:, 0].cos(), joints[:, 0].sin(), 0 * turn), 1)
-        hand = elbow + torch.stack((turn.cos(), turn.sin(), joints[:, 4]), 1)
-        return SimpleNamespace(position=lambda link: {"elbow": elbow, "hand": hand}[link])
 
 
 def spread_of_shake(paths):
@@ -215,17 +163,6 @@ def test_the_medoid_is_the_one_in_the_middle():
     assert DynamicTimeWarping().fit(family).reference_index_ == 2
 
 
-def turning(time, phase):
-    """One rotating frame and one hand pose, both a function of the phase in [0, 1]."""
-    angle = torch.from_numpy(2.5 * phase)
-    turn = quaternions.exp(angle[:, None] * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64))
-    place = np.stack((np.sin(3 * phase), phase, phase**2), 1)
-    poses = torch.cat((torch.from_numpy(place), turn), 1)
-    return Demonstration(
-        time, poses, {"moving": Frame(place, turn)}, Poses(["hand"]).joint_names
-    )
-
-
 def test_the_sign_of_recorded_quaternions_does_not_matter():
     time = np.linspace(0, 2, 120)
     one, other = turning(time, time / 2), turning(time, (time / 2) ** 1.2)
@@ -247,19 +184,6 @@ def test_units_do_not_decide_but_weights_do():
     noise = [Demonstration(d.time, rng.normal(size=(len(d), 5)), d.frames) for d in family]
     with_weight = DynamicTimeWarping(weights={"directions": 0}).fit(noise)
     assert with_weight.feature_names_ == ("joints",)
-
-
-def test_features_are_named_and_constant_ones_left_out():
-    transformer = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
-    assert transformer.feature_names_ == ("joints", "directions", "elbow", "hand")
-    chosen = ["hand in bottle", "joints"]
-    transformer = DynamicTimeWarping(0, features=chosen, robot=Arm()).fit(DEMONSTRATIONS[:2])
-    assert transformer.feature_names_ == tuple(chosen)
-    still = [
-        Demonstration(d.time, d.joints * torch.tensor([0.0, 1, 0, 1, 1]), d.frames)
-        for d in DEMONSTRATIONS[:2]
-    ]
-    assert "elbow" not in DynamicTimeWarping(0, robot=Arm()).fit(still).feature_names_
 
 
 def test_an_open_end_matches_the_best_prefix():
@@ -307,13 +231,6 @@ def test_one_demonstration_alone_stays_itself(reference):
     torch.testing.assert_close(aligned.joints, own.joints, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
-def test_n_steps_sets_the_grid(transformer):
-    aligned = clone(transformer).set_params(n_steps=57).fit_transform(DEMONSTRATIONS[:2])
-    assert [len(d) for d in aligned] == [57, 57]
-    torch.testing.assert_close(aligned[0].time.diff(), aligned[0].time.diff()[:1].expand(56))
-
-
 def test_float32_and_uneven_sampling_are_kept():
     own = DEMONSTRATIONS[0]
     keep = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(own))[:700]))
@@ -345,24 +262,6 @@ def test_it_is_a_transformer_of_scikit_learn():
     assert fitted.transform(situations) == situations
 
 
-@pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
-def test_errors_say_what_is_wrong_with_the_input(transformer):
-    with pytest.raises(NotFittedError, match="call fit"):
-        clone(transformer).transform(DEMONSTRATIONS)
-    for wrong in (DEMONSTRATIONS[0], [], [1], 5):
-        with pytest.raises(DataError, match="expected"):
-            clone(transformer).fit_transform(wrong)
-    with pytest.raises(DataError, match="one time step"):
-        clone(transformer).fit([Demonstration([0.0], [[1.0]])])
-    fitted = clone(transformer).fit(DEMONSTRATIONS[:2])
-    with pytest.raises(UnknownNameError, match="'a' is not in the demonstration"):
-        fitted.transform([Demonstration([0.0, 1.0], np.eye(2), joint_names=("x", "y"))])
-    with pytest.raises(ShapeError, match="the robot has 7"):
-        clone(transformer).set_params(robot=Poses(["hand"])).fit_transform(
-            [Demonstration([0.0, 1.0], np.eye(2))]
-        )
-
-
 @pytest.mark.parametrize(
     "parameters, error, message",
     [
@@ -377,20 +276,6 @@ def test_errors_say_what_is_wrong_with_the_input(transformer):
 def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
     with pytest.raises(error, match=message):
         DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2])
-
-
-def test_nothing_to_align_by_is_an_error():
-    still = Demonstration(np.arange(5.0), np.ones((5, 2)))
-    with pytest.raises(DataError, match="nothing to align by"):
-        DynamicTimeWarping().fit([still, still])
-
-
-def test_frames_unknown_to_fit_are_an_error():
-    fitted = DynamicTimeWarping(0, features=["elbow in bottle"], robot=Arm())
-    fitted.fit(DEMONSTRATIONS[:2])
-    bare = Demonstration(DEMONSTRATIONS[0].time, DEMONSTRATIONS[0].joints, None, tuple("abcde"))
-    with pytest.raises(UnknownNameError, match="'elbow in bottle'"):
-        fitted.transform([bare])
 
 
 def test_without_dtaidistance_the_error_names_the_extra(monkeypatch):

@@ -1,4 +1,4 @@
-"""The extension point: operators and kinematics of a user's own, through the regression."""
+"""What all operators share: names, errors, values; and operators of a user's own."""
 
 from dataclasses import dataclass
 
@@ -14,104 +14,130 @@ from tests.support.mixtures import (
     local_mixture,
     random_local,
 )
-from tpgmm_torch import Canonical, Kinematics, Linearization, Operator, RobotState, Stack
-from tpgmm_torch.exceptions import DataError
+from tests.support.own_operators import (
+    CONSTANT,
+    NullSpace,
+    NullSpaceRows,
+    PlanarArm,
+    PlanarPosition,
+    Q,
+    planar_jacobian,
+)
+from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Demonstration,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.regression.regression import Regression
 
-Q = torch.tensor([0.3, 0.8, -0.6], dtype=torch.float64)
+WORLDS = pytest.mark.parametrize("world", [OnRobot(), OnPoses()], ids=["robot", "poses"])
+
+
+@WORLDS
+@pytest.mark.parametrize("kind", [RelativePosition, RelativeOrientation])
+def test_a_link_is_seen_from_another_like_from_an_object_but_moves_with_it(kind, world: World):
+    state, _ = world.scene(3)
+    there = {OBJECT: Frame(state.position(RIGHT), state.orientation(RIGHT))}
+    link, thing = kind(LEFT, RIGHT), kind(LEFT, OBJECT)
+    expected = thing.coordinates(state, there)
+    torch.testing.assert_close(link.coordinates(state, {}), expected, rtol=0, atol=1e-14)
+    assert not torch.allclose(link.linear(state, {}), thing.linear(state, there), atol=1e-2)
+
+
+def test_operators_of_other_parameters_differ():
+    operators = [
+        Canonical(),
+        AbsolutePosition(LEFT),
+        AbsolutePosition(RIGHT),
+        AbsoluteOrientation(LEFT),
+        AbsoluteOrientation(LEFT, gain=1.0),
+        RelativePosition(LEFT, OBJECT),
+        RelativePosition(LEFT, RIGHT),
+        RelativeOrientation(LEFT, OBJECT),
+        Stack(Canonical()),
+        Stack(AbsolutePosition(LEFT), AbsolutePosition(RIGHT)),
+        Stack(AbsolutePosition(RIGHT), AbsolutePosition(LEFT)),
+    ]
+    assert len(set(operators)) == len(operators)
+
+
+LINKED = [
+    AbsolutePosition("elbow"),
+    AbsoluteOrientation("elbow"),
+    RelativePosition("elbow", OBJECT),
+    RelativeOrientation("elbow", OBJECT),
+    Stack(AbsolutePosition(LEFT), AbsolutePosition("elbow")),
+]
+
+
+@WORLDS
+@pytest.mark.parametrize("operator", LINKED, ids=repr)
+def test_an_unknown_link_is_named_with_those_that_exist(operator, world: World):
+    state, frames = world.scene()
+    listed = r"link 'elbow' is not in the .*\['l_hand', 'r_hand'\]"
+    with pytest.raises(UnknownNameError, match=listed):
+        operator.check(world.kinematics, frames)
+    for call in (operator.linearize, operator.coordinates):
+        with pytest.raises(UnknownNameError, match=listed):
+            call(state, frames)
+
+
+FRAMED = [
+    RelativePosition(LEFT, "cup"),
+    RelativeOrientation(LEFT, "cup"),
+    Stack(RelativePosition(LEFT, OBJECT), RelativePosition(LEFT, "cup")),
+]
+
+
+@WORLDS
+@pytest.mark.parametrize("operator", FRAMED, ids=repr)
+def test_an_unknown_frame_is_named_with_those_that_exist(operator, world: World):
+    state, frames = world.scene()
+    with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['object'"):
+        operator.check(world.kinematics, frames)
+    for call in (operator.linearize, operator.coordinates):
+        with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['l_hand', 'obj"):
+            call(state, frames)
+
+
+def test_links_and_frames_that_exist_pass():
+    world = OnRobot()
+    _, frames = world.scene()
+    for operator in (
+        Canonical(),
+        RelativePosition(LEFT, OBJECT),
+        RelativeOrientation(LEFT, RIGHT),
+    ):
+        operator.check(world.kinematics, frames)
+
+
+@WORLDS
+def test_a_frame_with_the_name_of_a_link_is_refused(world: World):
+    _, frames = world.scene()
+    with pytest.raises(UnknownNameError, match=r"'r_hand'.* it is a link .*rename the frame"):
+        RelativePosition(LEFT, RIGHT).check(world.kinematics, {RIGHT: frames[OBJECT]})
+
+
+def test_coordinates_of_another_size_than_announced_are_refused():
+    class Liar(AbsolutePosition):
+        def dimension(self, kinematics):
+            return 2
+
+    poses = OnPoses()
+    joints = poses.joints(np.random.default_rng(0), 5)
+    with pytest.raises(ShapeError, match=r"has 2 coordinates.*\(5, 3\) for 5 time steps"):
+        Liar(LEFT).local(Demonstration(torch.arange(5.0), joints), poses.kinematics)
+
+
 NOW = torch.tensor(0.9, dtype=torch.float64)
-
-
-class PlanarArm(Kinematics):
-    """Three hinges about z, links of half a metre."""
-
-    joint_names, links = ("shoulder", "elbow", "wrist"), ("tip",)
-    upper = torch.full((3,), torch.pi, dtype=torch.float64)
-    lower, velocity = -upper, upper
-
-    def state(self, joints):
-        q = self.joint_tensor(joints)
-        angles = q.cumsum(-1)
-        segments = 0.5 * torch.stack((angles.cos(), angles.sin(), 0 * angles), dim=-1)
-        outward = segments.flip(-2).cumsum(-2).flip(-2)  # from each hinge to the tip
-        axis = torch.tensor([0.0, 0.0, 1.0], dtype=q.dtype).expand_as(outward)
-        twists = torch.cat((torch.linalg.cross(axis, outward), axis), dim=-1)
-        half = 0.5 * angles[..., -1:]
-        turn = torch.cat((half.cos(), 0 * half, 0 * half, half.sin()), dim=-1)
-        positions = segments.sum(-2, keepdim=True)
-        orientations, jacobians = turn[..., None, :], twists.mT[..., None, :, :]
-        return RobotState(q, self.links, positions, orientations, jacobians)
-
-
-def planar_jacobian(state: RobotState) -> Tensor:
-    return state.linear_jacobian("tip")[..., :2, :]
-
-
-@dataclass(frozen=True)
-class PlanarPosition(Operator):
-    """Where the tip is in the plane."""
-
-    def dimension(self, kinematics):
-        return 2
-
-    def linearize(self, state, frames):
-        return Linearization(planar_jacobian(state), None, -self.coordinates(state, frames))
-
-    def coordinates(self, state, frames):
-        return state.position("tip")[..., :2]
-
-
-@dataclass(frozen=True)
-class NullSpace(Operator):
-    """``A = I - J^+ J``, ``b = J^+ J q``: the posture, where the tip does not feel it."""
-
-    def dimension(self, kinematics):
-        return kinematics.n_joints
-
-    def linearize(self, state, frames):
-        jacobian = planar_jacobian(state)
-        seen = torch.linalg.pinv(jacobian) @ jacobian
-        free = torch.eye(3, dtype=seen.dtype) - seen
-        offset = (seen @ state.joints[..., None])[..., 0]
-        return Linearization(None, free, offset - state.joints)
-
-    def coordinates(self, state, frames):
-        return state.joints
-
-
-@dataclass(frozen=True)
-class NullSpaceRows(NullSpace):
-    """The same with an orthonormal basis N of the null space: ``N dq = N mu - N q_prev``.
-
-    It has full row rank, as the information form needs.
-    """
-
-    def linearize(self, state, frames):
-        across = torch.linalg.cross(*planar_jacobian(state).unbind(-2))
-        basis = (across / across.norm(dim=-1, keepdim=True))[..., None, :]
-        return Linearization(basis, basis, -(basis @ state.joints[..., None])[..., 0])
-
-
-@dataclass(frozen=True)
-class Constant(Operator):
-    """An operator known by its ``A`` and ``b``, Definition 1 of the paper."""
-
-    rows: tuple[tuple[float, ...], ...]
-    shift: tuple[float, ...]
-
-    def dimension(self, kinematics):
-        return len(self.rows[0])
-
-    def linearize(self, state, frames):
-        shift = torch.tensor(self.shift, dtype=state.joints.dtype)
-        matrix = torch.tensor(self.rows, dtype=state.joints.dtype)
-        return Linearization(None, matrix, shift - state.joints)
-
-    def coordinates(self, state, frames):
-        raise NotImplementedError("its local data come from elsewhere")
-
-
-CONSTANT = Constant(((1.0, 0.5), (0.0, 2.0), (0.0, 0.0)), (0.1, 0.2, 0.3))
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,41 @@
-"""An operator's tolerance: agreement finer than that is not taken at its word."""
+"""The joints themselves as local coordinates, and their tolerance."""
 
 import pytest
 import torch
 
+from tests.support import oracles
+from tests.support.operator_battery import OperatorLaws, OrientationLaws
 from tests.support.skills import bottle_demonstrations, bottle_model, generator, waves
+from tests.support.worlds import OnPoses, OnRobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_torch import AbsolutePosition, Canonical, Stack, TaskParameterizedGMM
+from tpgmm_torch import (
+    Canonical,
+    Stack,
+    TaskParameterizedGMM,
+)
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.joint_space import JointSpace
+
+
+class CanonicalLaws(OperatorLaws):
+    operator = Canonical()
+
+    def row(self, at):
+        return oracles.canonical(at)
+
+
+class TestCanonicalOnRobot(OnRobot, CanonicalLaws):
+    pass
+
+
+class TestCanonicalOnPoses(OnPoses, CanonicalLaws, OrientationLaws):
+    pass
+
+
+def test_the_size_of_the_canonical_operator_is_that_of_a_robot():
+    assert Stack(Canonical(), Canonical()).dimension(JointSpace(["a", "b"])) == 4
+    with pytest.raises(DataError, match="as many coordinates as the robot has joints"):
+        Canonical().dimension(None)
 
 
 @pytest.mark.parametrize("covariance_type", ["full", "diag", "tied", "spherical"])
@@ -33,11 +63,6 @@ def test_it_is_an_absolute_variance_whatever_the_spread_of_the_data():
         model = TaskParameterizedGMM(1, [Canonical(tolerance)]).fit(waves())
         added.append(model.covariances_[0][0].diagonal()[1:])
     torch.testing.assert_close(added[1] - added[0], torch.full((3,), 0.03**2).double())
-
-
-def test_a_stack_has_the_tolerances_of_its_members():
-    stack = Stack(AbsolutePosition("l_hand"), Canonical(0.01))
-    assert stack.tolerances(generator().robot) == (0.0,) * 3 + (0.01,) * 17
 
 
 def test_with_ten_demonstrations_it_keeps_the_joints_from_contradicting_the_task():

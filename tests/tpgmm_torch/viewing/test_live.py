@@ -1,65 +1,36 @@
-"""``tpgmm view`` in a real browser: it draws, it plays, and it needs no network."""
+"""A motion in the browser while the program runs."""
 
+import re
 import time
+from dataclasses import replace
 
 import numpy as np
-import pytest
+import torch
 
 from tests.support import browser, skills
-from tpgmm_torch import Situation
-from tpgmm_torch.viewing import LiveView, write_motion
+from tests.support.browser import draws, yellow
+from tpgmm_torch import Frame, Situation
+from tpgmm_torch.viewing import LiveView
 
 
-def red(picture) -> int:
-    """How many pixels have the reproduced path's colour."""
-    r, g, b = np.moveaxis(picture, -1, 0)
-    return int(((r > 0.6) & (g < 0.4) & (b < 0.4)).sum())
-
-
-def blue_grey(picture) -> int:
-    """How many pixels have the robot's colour, in light and in shade."""
-    r, _, b = np.moveaxis(picture, -1, 0)
-    return int(((b > r + 0.04) & (b < 0.85) & (r > 0.15)).sum())
-
-
-def yellow(picture) -> int:
-    """How many pixels have the colour of a handle under the mouse."""
-    r, g, b = np.moveaxis(picture, -1, 0)
-    return int(((r > 0.85) & (g > 0.85) & (b < 0.6)).sum())
-
-
-def draws(page) -> None:
-    """Wait until the robot and the path are in the canvas."""
-    end = time.monotonic() + browser.PATIENCE
-    while blue_grey(picture := page.screenshot()) < 1000 or red(picture) < 30:
-        found = f"{blue_grey(picture)} pixels of the robot, {red(picture)} of the path"
-        assert time.monotonic() < end, found
-
-
-@pytest.fixture
-def motion(tmp_path):
-    demonstrations = skills.few_bottles()
-    situation = Situation(demonstrations[1].joints[0], demonstrations[1].frames)
-    path = tmp_path / "motion.html"
-    write_motion(path, skills.small_bottle(), situation, demonstrations, fps=5)
-    return path
-
-
-def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
-    with browser.page(600, 600) as page:
-        page.open(motion.as_uri())
-        page.evaluate("document.getElementById('legend').style.display = 'none'")
-        draws(page)
-        page.evaluate("document.getElementById('legend').style.display = ''")
-        clock = "Number(document.querySelector('input').value)"
-        before = page.evaluate(clock)
-        page.wait_for(f"{clock} != {before}")
-        assert page.evaluate("document.querySelectorAll('canvas').length") >= 1
-        for word in ("reproduction", "demonstrations"):
-            assert page.evaluate(f"document.body.innerText.includes({word!r})")
-        outside = [url for url in page.requests if not url.startswith(("data:", "blob:"))]
-        assert outside == [motion.as_uri()]
-        assert page.complaints == []
+def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
+    model, [situation, other] = skills.hands(), [skills.new_handling(seed=s)[0] for s in (7, 8)]
+    with LiveView(model, [situation, other], skills.handlings(), port=0) as view:
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+", view.url)
+        [expected] = model.predict([situation])
+        torch.testing.assert_close(view.trajectory.joints, expected.joints)
+        cup = Frame([0.2, 0.1, 0.3], situation.frames["cup"].orientation)
+        view.move_frame("cup", cup)
+        [expected] = model.predict([replace(situation, frames={"cup": cup})])
+        torch.testing.assert_close(view.trajectory.joints, expected.joints)
+        view.show(1)
+        [expected] = model.predict([other])
+        torch.testing.assert_close(view.trajectory.joints, expected.joints)
+        start = time.monotonic()
+        view.run(0.3)
+        assert 0.3 <= time.monotonic() - start < 5
+        assert 0.1 < view.clock <= 2.0
+    assert capsys.readouterr().out == ""
 
 
 def seen_at(page, camera, point) -> np.ndarray:

@@ -1,0 +1,125 @@
+"""Operators stacked before the pseudo-inverse, eqs (16), (17)."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support import oracles
+from tests.support.operator_battery import OrientationLaws, RelativeLaws
+from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, upper_body
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Poses,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.exceptions import DataError
+
+
+class BothHandsLaws(RelativeLaws, OrientationLaws):
+    """The paper's first operator, eqs (16), (17)."""
+
+    operator = Stack(
+        RelativePosition(LEFT, OBJECT),
+        RelativeOrientation(LEFT, OBJECT),
+        RelativePosition(RIGHT, OBJECT),
+        RelativeOrientation(RIGHT, OBJECT),
+    )
+
+    def row(self, at):
+        return oracles.stack(
+            oracles.relative_position(at, LEFT, OBJECT),
+            oracles.relative_orientation(at, LEFT, OBJECT),
+            oracles.relative_position(at, RIGHT, OBJECT),
+            oracles.relative_orientation(at, RIGHT, OBJECT),
+        )
+
+
+class TestBothHandsOnRobot(OnRobot, BothHandsLaws):
+    def test_equals_the_printed_blocks(self):
+        state, frames = self.scene()
+        expected = oracles.equations_16_17(self.at(state, frames), LEFT, RIGHT, OBJECT)
+        linear = self.operator.linear(state, frames)
+        offset = self.operator.offset(state, frames)
+        np.testing.assert_allclose(linear.numpy(), expected[0], rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(offset.numpy(), expected[1], rtol=1e-11, atol=1e-11)
+
+    def test_differs_from_its_members_projected_alone_as_they_share_the_waist(self):
+        state, frames = self.scene()
+        together = self.operator.linear(state, frames)
+        alone = [operator.linear(state, frames) for operator in self.operator.operators]
+        assert (together - torch.cat(alone, dim=-1)).abs().max() > 0.1
+
+
+class TestBothHandsOnPoses(OnPoses, BothHandsLaws):
+    pass
+
+
+class MixedStackLaws(OrientationLaws):
+    """All kinds at once, more rows than joints."""
+
+    operator = Stack(
+        Canonical(),
+        AbsoluteOrientation(LEFT),
+        Stack(AbsolutePosition(RIGHT), RelativeOrientation(LEFT, RIGHT)),
+        RelativePosition(RIGHT, LEFT),
+    )
+
+    def row(self, at):
+        return oracles.stack(
+            oracles.canonical(at),
+            oracles.absolute_orientation(at, LEFT),
+            oracles.absolute_position(at, RIGHT),
+            oracles.relative_orientation(at, LEFT, RIGHT),
+            oracles.relative_position(at, RIGHT, LEFT),
+        )
+
+
+class TestMixedStackOnRobot(OnRobot, MixedStackLaws):
+    pass
+
+
+class TestMixedStackOnPoses(OnPoses, MixedStackLaws):
+    pass
+
+
+def test_poses_reach_a_pose_seen_from_an_object_in_one_step_however_far():
+    operator = TestBothHandsOnPoses()
+    state, frames = operator.scene(3)
+    far, _ = operator.scene(3, seed=7)
+    wanted = operator.operator.coordinates(far, frames)
+    answer = operator.kinematics.state(operator.candidate(wanted, state, frames))
+    torch.testing.assert_close(answer.positions, far.positions)
+    inner = (answer.orientations * far.orientations).sum(-1)
+    torch.testing.assert_close(inner.abs(), torch.ones_like(inner))
+
+
+def test_a_stack_needs_operators():
+    with pytest.raises(DataError, match="at least one operator"):
+        Stack()
+    with pytest.raises(DataError, match="takes operators, got str"):
+        Stack(Canonical(), LEFT)
+    with pytest.raises(DataError, match="takes operators, got list"):
+        Stack([Canonical()])
+
+
+def test_the_canonical_operator_alone_determines_every_joint():
+    assert Canonical().determines_joints
+    assert Stack(AbsolutePosition(LEFT), Canonical()).determines_joints
+    assert not BothHandsLaws.operator.determines_joints
+
+
+def test_a_stack_knows_what_its_members_need():
+    operator = BothHandsLaws.operator
+    assert operator.links() == (LEFT, RIGHT)
+    assert operator.references() == (OBJECT,)
+    assert operator.quaternion_starts(None) == (3, 10)
+    assert Stack(Canonical(), operator).quaternion_starts(Poses()) == (3, 10, 17, 24)
+
+
+def test_a_stack_has_the_tolerances_of_its_members():
+    stack = Stack(AbsolutePosition("l_hand"), Canonical(0.01))
+    assert stack.tolerances(upper_body()) == (0.0,) * 3 + (0.01,) * 17
