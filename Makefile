@@ -11,12 +11,13 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint
 PACKAGES_bench := .[bench]
 PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
+PACKAGES_mutation := .[mutation]
 PACKAGES_test := .[test] ./policies[test]
 
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare bench test lint types docs check dist constraints clean
+.PHONY: help demo compare bench test mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -34,6 +35,9 @@ bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_A
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)
 
 lint: $(VENV)/.installed-test ## Check style and formatting
 	$(BIN)/ruff check
