@@ -38,7 +38,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     Parameters
     ----------
-    config : TPGMMConfig
     dataset_stats : dict, optional
         Not used.
     dataset_meta : LeRobotDatasetMetadata, optional
@@ -102,7 +101,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             config.default_environment_state,
             environment.shape[0] if environment else None,
         )
-        self._learner = None if dataset_meta is None else Learner(self, dataset_meta)
+        self._learner: Learner | None = dataset_meta and Learner(
+            config,
+            self.kinematics,
+            self.operators,
+            self.mixture,
+            self.joints,
+            self.frames,
+            dataset_meta,
+        )
         self.reset()
 
     @staticmethod
@@ -289,7 +296,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "training needs the data set's meta data: make_policy(config, ds_meta=...) "
                 "passes them, or TPGMMPolicy(config, dataset_meta=dataset.meta)"
             )
-        return self._learner.loss(batch), None
+        return self._learner.loss(batch, self.training), None
 
     def train(self, mode: bool = True) -> Self:
         """Switch between training and use; what was collected in training is fitted by then."""

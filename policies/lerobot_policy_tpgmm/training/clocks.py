@@ -25,7 +25,6 @@ def alignment(
     Parameters
     ----------
     method : {"dtw", "barycenter", "linear", "none"}
-    kinematics : Kinematics
     features : sequence of str, optional
         What dynamic time warping compares, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`.

@@ -23,12 +23,7 @@ OFF_GRID = 0.1
 
 
 def episode_ranges(dataset_meta: Any) -> dict[int, range]:
-    """The global indices of the frames of each episode of a LeRobot data set.
-
-    Parameters
-    ----------
-    dataset_meta : LeRobotDatasetMetadata
-    """
+    """The global indices of the frames of each episode of a LeRobot data set."""
     names = ("episode_index", "dataset_from_index", "dataset_to_index")
     columns = [dataset_meta.episodes[name] for name in names]
     return {

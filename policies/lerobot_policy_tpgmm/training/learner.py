@@ -10,13 +10,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, distributed
 
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
+from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.training.clocks import Clock, alignment
 from lerobot_policy_tpgmm.training.epoch_recorder import EpochRecorder, episode_ranges, located
 from lerobot_policy_tpgmm.training.losses import (
@@ -26,15 +29,12 @@ from lerobot_policy_tpgmm.training.losses import (
     local_points,
     regression,
 )
-from tpgmm_torch import Demonstration, Kinematics
+from tpgmm_torch import Demonstration, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
-
-if TYPE_CHECKING:
-    from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 
 __all__ = ["Learner"]
 
@@ -42,34 +42,60 @@ log = logging.getLogger(__name__)
 
 
 class Learner:
-    """What a policy does with batches.
+    """Collects demonstrations, learns them by EM, and gives losses of batches afterwards.
 
     Parameters
     ----------
-    policy : TPGMMPolicy
+    config : TPGMMConfig
+        Of the policy that is trained; a fit writes ``n_steps``.
+    kinematics : Kinematics
+    operators : sequence of Operator
+    mixture : MixtureParameters
+        What is learned.
+    joints : JointFeatures
+    frames : FrameFeatures
+        Where observations hold the joints and the frames.
     dataset_meta : LeRobotDatasetMetadata
         Of the data set that the batches come from.
+
+    Attributes
+    ----------
+    clock : Clock or None
+        Of the episodes of the data set; None before they are collected.
+    regularization : list of Tensor of shape (1 + D_j,), or None
+        What EM adds to the diagonals of the covariances of the collected demonstrations.
     """
 
-    def __init__(self, policy: TPGMMPolicy, dataset_meta: Any) -> None:
-        self._policy = policy
+    def __init__(
+        self,
+        config: TPGMMConfig,
+        kinematics: Kinematics,
+        operators: Sequence[Operator],
+        mixture: MixtureParameters,
+        joints: JointFeatures,
+        frames: FrameFeatures,
+        dataset_meta: Any,
+    ) -> None:
+        self._config, self._mixture = config, mixture
+        self._kinematics, self._operators = kinematics, tuple(operators)
+        self._joints, self._frames = joints, frames
         self._fps = float(dataset_meta.fps)
         self._ranges = episode_ranges(dataset_meta)
-        self._lengths = {number: len(frames) for number, frames in self._ranges.items()}
         self._recorder: EpochRecorder | None = EpochRecorder(self._ranges, self._fps)
         self._learned: set[int] = set()
         self._first: dict[int, dict[str, Tensor]] = {}
-        self._clock: Clock | None = None
-        self._regularization: list[Tensor] | None = None
-        self._kinematics = policy.kinematics
+        self.clock: Clock | None = None
+        self.regularization: list[Tensor] | None = None
 
-    def loss(self, batch: Mapping[str, Any]) -> Tensor:
+    def loss(self, batch: Mapping[str, Any], training: bool) -> Tensor:
         """The loss of a batch.
 
         Parameters
         ----------
         batch : mapping of str to Tensor
             As LeRobot's data loader gives it, behind the preprocessor.
+        training : bool
+            Whether the batch is to be learned from; a held-out one is not.
 
         Returns
         -------
@@ -83,7 +109,7 @@ class Learner:
         NotFittedError
             If a held-out batch comes before the end of the first epoch.
         """
-        recorder, training = self._recorder, self._policy.training
+        recorder = self._recorder
         if training:
             check_one_process()
         if training and recorder is not None:
@@ -91,18 +117,18 @@ class Learner:
             if not (again and recorder.complete):
                 # no gradient, not a zero one: an optimizer's momentum must not move anything
                 return torch.zeros((), requires_grad=True)
-            self._finish()
-        if not self._policy.mixture.fitted:
+            self._finish(recorder)
+        if not self._mixture.fitted:
             raise NotFittedError(
                 f"there is nothing to evaluate before the first epoch is over: {recorder}. "
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
-        return self._gradient_loss(batch)
+        return self._gradient_loss(batch, training)
 
     def end_epoch(self) -> None:
         """Fit, if all frames are there; a loop that evaluates or saves may stop right then."""
         if self._recorder is not None and self._recorder.complete:
-            self._finish()
+            self._finish(self._recorder)
 
     def check_saveable(self) -> None:
         """Refuse to save a policy that has nothing learned.
@@ -113,28 +139,26 @@ class Learner:
             With the number of steps that are needed.
         """
         self.end_epoch()
-        if not self._policy.mixture.fitted:
+        if not self._mixture.fitted:
             raise DataError(
                 f"there is nothing to save before the first epoch is over: {self._recorder}. "
                 "Train for more --steps, with a larger --batch_size, or save less often "
                 "(--save_freq)"
             )
 
-    def _finish(self) -> None:
+    def _finish(self, recorder: EpochRecorder) -> None:
         """Align what was recorded, and learn it unless the policy is fitted already."""
-        policy, recorder = self._policy, self._recorder
-        assert recorder is not None
-        config, mixture = policy.config, policy.mixture
+        config, mixture = self._config, self._mixture
         numbers = sorted(recorder.episodes)
         columns = {number: recorder.episodes[number].columns for number in numbers}
         demonstrations = [self._demonstration(columns[number]) for number in numbers]
-        kinematics = policy.kinematics.to(device="cpu")
+        kinematics = self._kinematics.to(device="cpu")
         aligner = alignment(config.alignment, kinematics, config.alignment_features)
         aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
         steps = sum(map(len, demonstrations))
         message = f"{steps} frames of {len(numbers)} episodes collected"
         if not mixture.fitted:
-            model = config.estimator(kinematics, list(policy.operators)).fit(aligned)
+            model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
             config.n_steps = len(mixture.time)
             message += (
@@ -142,66 +166,63 @@ class Learner:
                 f"of EM: log-likelihood {model.score(aligned):.3f} per step"
             )
         log.info(message)
-        self._clock = self._aligned_clock(aligner, numbers)
+        self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in columns[number].items()}
-        self._regularization = self._regularize(aligned, kinematics)
+        self.regularization = self._regularization(aligned, kinematics)
         self._learned, self._recorder = set(numbers), None
 
-    def _regularize(
+    def _regularization(
         self, demonstrations: Sequence[Demonstration], kinematics: Kinematics
     ) -> list[Tensor]:
         """What EM adds to the diagonals of the covariances of these demonstrations."""
-        policy = self._policy
-        rows = local_data(demonstrations, policy.operators, kinematics)
-        points = torch.cat(rows).numpy()
-        model = policy.config.estimator(kinematics, policy.operators)
-        widths = [mean.shape[1] for mean in policy.mixture.means]
-        isotropic = model.covariance_type == "spherical"
-        moments = ColumnMoments.of(points)
-        units = moments.standardization(widths, isotropic=isotropic)
+        config = self._config
+        rows = local_data(demonstrations, self._operators, kinematics)
+        moments = ColumnMoments.of(torch.cat(rows).numpy())
         shares = regularization(
             moments,
-            policy.operators,
+            self._operators,
             kinematics,
-            reg_covar=model.reg_covar,
-            covariance_type=model.covariance_type,
+            reg_covar=config.reg_covar,
+            covariance_type=config.covariance_type,
         )
-        added = torch.from_numpy(shares) * torch.cat(units.scales).square()
-        return list(added.to(policy.mixture.time).split(widths))
+        widths = [mean.shape[1] for mean in self._mixture.means]
+        isotropic = config.covariance_type == "spherical"
+        scales = torch.cat(moments.standardization(widths, isotropic=isotropic).scales)
+        added = torch.from_numpy(shares) * scales.square()
+        return list(added.to(self._mixture.time).split(widths))
 
     def _demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:
-        policy = self._policy
-        rows = {key: column.to(policy.mixture.time.device) for key, column in columns.items()}
-        joints = policy.joints.joints(rows[OBS_STATE]).cpu()
-        follow = policy.config.follow_frames
-        frames = policy.frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
+        rows = {key: column.to(self._mixture.time.device) for key, column in columns.items()}
+        joints = self._joints.joints(rows[OBS_STATE]).cpu()
+        follow = self._config.follow_frames
+        frames = self._frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
         return Demonstration(
             torch.arange(len(joints), dtype=torch.float64) / self._fps,
             joints,
             {name: (f if follow else f[0]).to("cpu") for name, f in frames.items()},
-            policy.kinematics.joint_names,
+            self._kinematics.joint_names,
         )
 
     def _aligned_clock(self, aligner: Alignment | None, numbers: Sequence[int]) -> Clock:
         """Paths of the learned episodes, on the time grid of the mixture."""
-        if self._policy.config.alignment == "none":
-            return Clock(self._lengths, None, {}, self._fps)
-        grid = self._policy.mixture.time.detach().cpu().double().numpy()
+        lengths = {number: len(frames) for number, frames in self._ranges.items()}
+        if self._config.alignment == "none":
+            return Clock(lengths, None, {}, self._fps)
+        grid = self._mixture.time.detach().cpu().double().numpy()
         paths = {}
         if aligner is not None:
             # a policy that was fitted before has its own grid
-            own = aligner.time_.numpy()
-            instants = np.interp(grid, grid[[0, -1]], own[[0, -1]])
+            time = aligner.time_.numpy()
+            instants = np.interp(grid, grid[[0, -1]], time[[0, -1]])
             for number, path in zip(numbers, aligner.paths_, strict=True):
-                paths[number] = np.interp(instants, own, path.numpy())
-        return Clock(self._lengths, grid, paths, self._fps)
+                paths[number] = np.interp(instants, time, path.numpy())
+        return Clock(lengths, grid, paths, self._fps)
 
-    def _gradient_loss(self, batch: Mapping[str, Any]) -> Tensor:
-        policy = self._policy
-        config, mixture = policy.config, policy.mixture
+    def _gradient_loss(self, batch: Mapping[str, Any], training: bool) -> Tensor:
+        config, mixture = self._config, self._mixture
         numbers, steps = located(batch, self._ranges)
-        if policy.training and not self._learned.issuperset(numbers.tolist()):
+        if training and not self._learned.issuperset(numbers.tolist()):
             new = sorted({*numbers.tolist()} - self._learned)
             raise DataError(
                 f"episodes {new} came after the first epoch was over: shuffle the frames of "
@@ -210,14 +231,14 @@ class Learner:
         if self._kinematics.lower.device != mixture.time.device:
             self._kinematics = self._kinematics.to(device=mixture.time.device)
         samples = self._samples(batch, numbers, steps)
-        model = regression(config, self._kinematics, policy.operators, mixture)
+        model = regression(config, self._kinematics, self._operators, mixture)
         if config.loss == "likelihood":
             # held-out frames are scored, not learned
-            kept = self._regularization if policy.training else None
-            loss = likelihood_loss(mixture, local_points(model, samples), kept)
+            added = self.regularization if training else None
+            loss = likelihood_loss(mixture, local_points(model, samples), added)
         else:
-            wanted = policy.joints.targets(batch[ACTION])
-            loss = imitation_loss(model, samples, wanted, policy.joints.order)
+            targets = self._joints.targets(batch[ACTION])
+            loss = imitation_loss(model, samples, targets, self._joints.order)
         if not loss.isfinite():
             raise DataError(
                 f"the {config.loss} loss is {loss.item()}: the steps are too large, lower "
@@ -226,13 +247,11 @@ class Learner:
         return loss
 
     def _samples(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> Samples:
-        policy = self._policy
-        like = policy.mixture.time
-        joints = policy.joints.joints(batch[OBS_STATE]).to(like)
-        poses = policy.frames.frames(self._situations(batch, numbers, steps))
-        clock = self._clock
-        if clock is None:  # of a policy that was fitted before, and is only evaluated
-            clock = self._aligned_clock(None, ())
+        like = self._mixture.time
+        joints = self._joints.joints(batch[OBS_STATE]).to(like)
+        poses = self._frames.frames(self._situations(batch, numbers, steps))
+        # a policy that was fitted before, and is only evaluated, has collected none
+        clock = self._aligned_clock(None, ()) if self.clock is None else self.clock
         return Samples(
             clock(numbers, steps).to(like),
             clock(numbers, steps + 1).to(like),
@@ -243,9 +262,9 @@ class Learner:
     def _situations(
         self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor
     ) -> dict[str, Tensor]:
-        """What the frames are read from: the beginning of the episode, where that is known."""
+        """What the frames are read from: the beginning of the episode, where it has come."""
         rows = {key: batch[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in batch}
-        if self._policy.config.follow_frames:
+        if self._config.follow_frames:
             return rows
         for place in torch.nonzero(steps == 0).flatten().tolist():
             number = int(numbers[place])
@@ -253,8 +272,8 @@ class Learner:
         return {
             key: torch.stack(
                 [
-                    self._first.get(number, {}).get(key, own).to(own)
-                    for number, own in zip(numbers.tolist(), row, strict=True)
+                    self._first.get(number, {}).get(key, present).to(present)
+                    for number, present in zip(numbers.tolist(), row, strict=True)
                 ]
             )
             for key, row in rows.items()

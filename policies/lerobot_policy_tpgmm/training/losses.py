@@ -49,15 +49,7 @@ def regression(
     operators: Sequence[Operator],
     mixture: MixtureParameters,
 ) -> Regression:
-    """The regression of a policy, with parameters that carry gradients.
-
-    Parameters
-    ----------
-    config : TPGMMConfig
-    kinematics : Kinematics
-    operators : sequence of Operator
-    mixture : MixtureParameters
-    """
+    """The regression of a policy, with parameters that carry gradients."""
     local = []
     for mean, triangle in zip(mixture.means, mixture.triangles(), strict=True):
         # time stands first, so conditioning on it leaves the other rows of the factor
@@ -85,7 +77,6 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
     ----------
     model : Regression
         Quaternions are brought to the side that it expects at their time.
-    samples : Samples
     """
     points = []
     for j, operator in enumerate(model.operators):
@@ -113,7 +104,6 @@ def likelihood_loss(
 
     Parameters
     ----------
-    mixture : MixtureParameters
     points : sequence of Tensor of shape (B, 1 + D_j)
         From :func:`local_points`.
     regularization : sequence of Tensor of shape (1 + D_j,), optional
@@ -142,7 +132,6 @@ def imitation_loss(
 
     Parameters
     ----------
-    model : Regression
     samples : Samples
         Their states are q_{t-1}.
     wanted : Tensor of shape (B, n)

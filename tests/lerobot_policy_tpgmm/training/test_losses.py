@@ -86,7 +86,7 @@ def test_the_solution_of_em_is_stationary(waves, monkeypatch):
     slopes = gradient(policy, whole(waves))
     assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
     # for the likelihood alone, regularised covariances are too large
-    monkeypatch.setattr(policy._learner, "_regularization", None)
+    monkeypatch.setattr(policy._learner, "regularization", None)
     slopes = gradient(policy, whole(waves))
     factors = slopes.pop("mixture.factors.0")
     assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
@@ -208,7 +208,7 @@ def test_clocks():
 
 def test_aligned_frames_stand_where_the_alignment_put_them(waves):
     policy = trained(waves, **WAVES)
-    clock = policy._learner._clock
+    clock = policy._learner.clock
     demonstrations = load_lerobot(waves.root)
     aligner = DynamicTimeWarping().fit(demonstrations)
     for number, (one, path) in enumerate(zip(demonstrations, aligner.paths_, strict=True)):
