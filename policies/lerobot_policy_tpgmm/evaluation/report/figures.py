@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
-from lerobot_policy_tpgmm.evaluation.report.intervals import wilson
+from lerobot_policy_tpgmm.evaluation.report.tables import wilson
 
 __all__ = ["draw_curves", "draw_errors", "draw_success"]
 
@@ -69,7 +69,6 @@ def draw_success(episodes: pd.DataFrame, path: Path) -> None:
     ----------
     episodes : DataFrame
         Of one condition; episodes of several training seeds are taken together.
-    path : Path
     """
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
@@ -105,7 +104,6 @@ def draw_errors(
         Columns, with their heading.
     criteria : mapping
         Bounds of a success.
-    path : Path
     """
     shown = [key for key in figures if key in episodes]
     figure = Figure(figsize=(3.2 * len(shown) + 1.5, 3.4), layout="constrained")
@@ -140,7 +138,6 @@ def draw_curves(trainings: Iterable[Mapping[str, Any]], path: Path) -> None:
     ----------
     trainings : iterable of mapping
         ``policy``, ``demonstrations``, ``seed`` and ``curve``.
-    path : Path
     """
     trainings = list(trainings)
     policies = list(dict.fromkeys(item["policy"] for item in trainings))

@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_policy_tpgmm.evaluation.cells import Cell
-from lerobot_policy_tpgmm.evaluation.report.sections import Sections
-from lerobot_policy_tpgmm.evaluation.report.tables import cell_table, episode_table, write_table
+import pandas as pd
+
+from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, Cell
+from lerobot_policy_tpgmm.evaluation.report.figures import (
+    draw_curves,
+    draw_errors,
+    draw_success,
+)
+from lerobot_policy_tpgmm.evaluation.report.tables import (
+    cell_table,
+    episode_table,
+    wilson,
+    write_table,
+)
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 
 __all__ = ["write_report"]
+
+#: What each policy is, in the order of the report.
+DESCRIPTIONS = {
+    "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
+    "and the joints",
+    "tpgmm-position-only": "the same without the orientation of the hands",
+    "act": "LeRobot's Action Chunking Transformer on joints and object poses",
+    "act-phase": "the same, informed of the time and learning from episodes on a common clock",
+    "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
+    "diffusion-phase": "the same, informed of the time and learning from episodes on a common "
+    "clock",
+    "nearest": "replays the demonstration whose objects stood nearest: the naive floor",
+}
 
 
 def write_report(
@@ -27,7 +53,6 @@ def write_report(
     ----------
     out : Path
         The folder.
-    settings : Settings
     results : sequence of mapping
         Of all finished cells.
     failures : mapping
@@ -41,31 +66,349 @@ def write_report(
         The report.
     """
     out.mkdir(parents=True, exist_ok=True)
-    path = out / "report.md"
-    lines = [f"# What demonstrations buy: {settings.env}", ""]
+    paragraphs = [f"# What demonstrations buy: {settings.env}"]
     if results:
         cells, episodes = cell_table(results), episode_table(results)
         write_table(cells, out / "cells")
         write_table(episodes, out / "episodes_evaluated")
-        lines += Sections(out, settings, results, cells, episodes).text()
-    lines += _failed(failures)
-    lines += _commands(out / "commands.txt", command)
+        paragraphs += _Sections(out, settings, results, cells, episodes)
+    if failures:
+        reasons = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
+        paragraphs += ["## Cells that failed", "\n".join(reasons)]
+    commands = _commands(out / "commands.txt", command)
+    if commands:
+        paragraphs += ["## Commands", "\n".join(("```", *commands, "```"))]
+    path = out / "report.md"
     partial = path.with_name(".report.md.partial")
-    partial.write_text("\n".join(lines), encoding="utf-8")
+    partial.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
     partial.replace(path)
     return path
 
 
-def _failed(failures: Mapping[Cell, str]) -> list[str]:
-    if not failures:
-        return []
-    lines = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
-    return ["## Cells that failed", "", *lines, ""]
-
-
 def _commands(path: Path, command: str) -> list[str]:
-    known = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    if command and command not in known:
-        known.append(command)
-        path.write_text("\n".join(known) + "\n", encoding="utf-8")
-    return ["## Commands", "", "```", *known, "```", ""] if known else []
+    """All that were called, this one last."""
+    commands = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    if command and command not in commands:
+        commands.append(command)
+        path.write_text("\n".join(commands) + "\n", encoding="utf-8")
+    return commands
+
+
+class _Sections:
+    """Text and pictures of a comparison: its paragraphs, in Markdown.
+
+    Parameters
+    ----------
+    out : Path
+        Where pictures go, in the folder ``figures``.
+    results : sequence of mapping
+        Of all finished cells.
+    cells, episodes : DataFrame
+        The same as tables.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        settings: Settings,
+        results: Sequence[Mapping[str, Any]],
+        cells: pd.DataFrame,
+        episodes: pd.DataFrame,
+    ) -> None:
+        self.out, self.settings, self.results = out, settings, results
+        self.cells, self.episodes = cells, episodes
+        self.nominal = episodes[episodes.condition == NOMINAL]
+        self.benchmark = settings.benchmark()
+        self.policies = [name for name in DESCRIPTIONS if name in set(cells.policy)]
+        self.counts = sorted(set(cells.demonstrations))
+        self.trainings = {
+            (r["cell"]["policy"], r["cell"]["demonstrations"], r["cell"]["seed"]): r["training"]
+            for r in results
+        }
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._introduction()
+        yield from self._success()
+        if len(self.nominal):
+            yield from self._criteria()
+            yield from self._errors()
+        yield from self._baselines()
+        yield from self._cost()
+        yield "## What to keep in mind"
+        yield "\n".join(f"- {text}" for text in self._remarks())
+        yield from self._settings()
+
+    def _introduction(self) -> Iterator[str]:
+        seeds, counts = self.settings.seeds, _listed(self.counts)
+        yield (
+            f"Every policy learned from the same first {counts} recorded episodes of "
+            f"`{self.benchmark.env}` (the LeRobot data set `episodes/training`) and was rolled "
+            f"out, through LeRobot's own rollout, in the same {len(seeds)} situations that no "
+            f"episode shows (seeds {seeds[0]} to {seeds[-1]})."
+        )
+        yield "\n".join(f"- **{name}**: {DESCRIPTIONS[name]}" for name in self.policies)
+
+    def _success(self) -> Iterator[str]:
+        yield "## Success"
+        yield "Successful episodes, and the 95 % interval of their share (Wilson)."
+        disturbed = set(self.cells.condition) - {NOMINAL}
+        for condition in (NOMINAL, *sorted(disturbed, key=lambda name: name.count("+"))):
+            part = self.episodes[self.episodes.condition == condition]
+            if part.empty:
+                continue
+            yield f"Condition: {self._described(condition)}."
+            # policies down, numbers of demonstrations across
+            yield _table(
+                ["policy", *(f"{count} demonstrations" for count in self.counts)],
+                [
+                    [policy, *(_rate(rows[rows.demonstrations == n]) for n in self.counts)]
+                    for policy, rows in self._by_policy(part)
+                ],
+            )
+            if part.policy.nunique() > 1:
+                name = f"success_{condition.replace('+', '_')}.png"
+                draw_success(part, self._picture(name))
+                yield f"![Success over demonstrations](figures/{name})"
+
+    def _described(self, condition: str) -> str:
+        if condition == NOMINAL:
+            return "nominal, without disturbances"
+        names = condition.split("+")
+        options = {k: v for name in names for k, v in self.benchmark.disturbances[name].items()}
+        return f"{' and '.join(names)} (`{json.dumps(options)}`)"
+
+    def _criteria(self) -> Iterator[str]:
+        """Which part of the skill fails."""
+        criteria = self.benchmark.criteria
+        if not criteria.keys() <= set(self.nominal.columns):
+            return
+        most = self.nominal.demonstrations.max()
+        yield "## What succeeds and what fails"
+        yield f"Share of the episodes that meet each criterion, {most} demonstrations."
+        table = []
+        for policy, rows in self._by_policy(self.nominal[self.nominal.demonstrations == most]):
+            met = [rows[key].between(*bounds).mean() for key, bounds in criteria.items()]
+            table.append([policy, *(f"{100 * share:.0f} %" for share in met)])
+        yield _table(["policy", *map(self._criterion, criteria)], table)
+
+    def _criterion(self, key: str) -> str:
+        heading, _ = self.benchmark.figures[key]
+        low, high = self.benchmark.criteria[key]
+        return f"{heading} ≤ {high:g}" if math.isfinite(high) else f"{heading} ≥ {low:g}"
+
+    def _errors(self) -> Iterator[str]:
+        figures = {k: v for k, v in self.benchmark.figures.items() if k in self.nominal}
+        yield "## Errors"
+        yield "Median / 95th percentile over the episodes, nominal condition."
+        table = []
+        for count, part in self.nominal.groupby("demonstrations"):
+            for policy, rows in self._by_policy(part):
+                spreads = [_spread(rows[key], digits) for key, (_, digits) in figures.items()]
+                table.append([count, policy, *spreads])
+        headings = (heading for heading, _ in figures.values())
+        yield _table(["demonstrations", "policy", *headings], table)
+        draw_errors(self.nominal, figures, self.benchmark.criteria, self._picture("errors.png"))
+        yield "Dotted: what a success allows."
+        yield "![Median and quartiles of the errors](figures/errors.png)"
+
+    def _baselines(self) -> Iterator[str]:
+        trained = {key: item for key, item in self.trainings.items() if item["curve"]}
+        if not trained:
+            return
+        recipes = {policy: item["recipe"] for (policy, _, _), item in trained.items()}
+        yield "## How the baselines were trained"
+        yield (
+            f"Every {next(iter(recipes.values()))['check_every']} steps the moving average of "
+            f"the weights is tried on {self.settings.validation} held-out episodes that no "
+            "policy learns from: the error of the actions is the mean distance between "
+            "predicted and demonstrated joint references over the steps that are executed "
+            "before the next prediction. When it has not fallen by 1 % for some checks, the "
+            "learning rate falls to a third (it also does towards the end of the budget); when "
+            f"that no longer helps, or {self.settings.budget / 60:g} minutes of one processor "
+            "are used up, training ends. The weights of the least error are the ones evaluated."
+        )
+        rows = []
+        for key, item in trained.items():
+            curve = item["curve"]
+            best = min(curve, key=lambda point: point["validation_error"])
+            minutes, error = curve[-1]["seconds"] / 60, 1e3 * best["validation_error"]
+            steps, at = curve[-1]["step"], best["step"]
+            rows.append([*key, steps, f"{minutes:.1f}", f"{error:.2f}", at, item["outcome"]])
+        columns = ("steps", "minutes", "least error [mrad]", "at step", "why it ended")
+        yield _table(["policy", "demonstrations", "seed", *columns], rows)
+        draw_curves(
+            [
+                {"policy": p, "demonstrations": n, "seed": s, "curve": item["curve"]}
+                for (p, n, s), item in trained.items()
+            ],
+            self._picture("learning_curves.png"),
+        )
+        yield "![Learning curves](figures/learning_curves.png)"
+        yield "Recipes:"
+        yield "\n".join(f"- {name}: `{json.dumps(item)}`" for name, item in recipes.items())
+
+    def _cost(self) -> Iterator[str]:
+        yield "## What it costs"
+        yield (
+            "With the most demonstrations. An action is everything from the raw observation to "
+            "the joint references for one robot, on one thread; policies that predict chunks "
+            "compute one every so many steps and take its actions from memory in between."
+        )
+        columns = (
+            "policy",
+            "training [s]",
+            "parameters",
+            "on disk [MB]",
+            "rate [Hz]",
+            "step, median / 99 % [ms]",
+            "steps per chunk",
+            "chunk, median / 99 % [ms]",
+        )
+        rows = self.cells.sort_values("demonstrations").groupby("policy").tail(1)
+        yield _table(
+            columns,
+            [
+                [
+                    row.policy,
+                    f"{row.training_seconds:.0f}",
+                    f"{row.parameters:,}".replace(",", " "),
+                    f"{row.bytes / 1e6:.1f}",
+                    row.fps,
+                    f"{row.step_median_ms:.2f} / {row.step_p99_ms:.2f}",
+                    f"{row.chunk_size:.0f}",
+                    f"{row.chunk_median_ms:.2f} / {row.chunk_p99_ms:.2f}",
+                ]
+                for _, part in self._by_policy(rows)
+                for row in part.itertuples()
+            ],
+        )
+
+    def _remarks(self) -> Iterator[str]:
+        """What the data say about themselves."""
+        summary = self.out / "episodes" / "summary.json"
+        if summary.exists():
+            successes = json.loads(summary.read_text(encoding="utf-8"))["successes"]
+            yield (
+                f"By the environment's own criteria {sum(successes)} of the {len(successes)} "
+                "recorded demonstrations succeed."
+            )
+        trials = self.settings.episodes
+        low, high = wilson(trials // 2, trials)
+        yield (
+            f"With {trials} episodes a rate around one half is known to "
+            f"{50 * (high - low):.0f} percentage points, either way."
+        )
+        seeds = self.cells.seed.nunique()
+        if seeds == 1:
+            yield (
+                "Each policy was trained with one seed: the intervals say how much the choice "
+                "of situations matters, not how much another training would differ."
+            )
+        else:
+            yield (
+                f"Episodes of {seeds} training seeds are taken together; the intervals treat "
+                "them as independent."
+            )
+        yield from self._rivals()
+        ended = [
+            f"{policy} ({count}: the error fell by {100 * _late_gain(item['curve']):.0f} %)"
+            for (policy, count, _), item in self.trainings.items()
+            if "budget" in item["outcome"]
+        ]
+        if ended:
+            yield (
+                f"The budget ended the training of {', '.join(ended)}; in brackets what the "
+                "last third of the steps brought. Where that is much, more time may help."
+            )
+        processors = {result["machine"]["processors"] for result in self.results}
+        yield (
+            "Latencies were measured while other cells ran beside, on a machine of "
+            f"{_listed(processors)} processors; compare them with one another, not with a "
+            "robot's computer."
+        )
+
+    def _rivals(self) -> Iterator[str]:
+        """TP-GMM and the best of the others, for each number of demonstrations."""
+        for count, rows in self.nominal.groupby("demonstrations"):
+            rates = rows.groupby("policy").success.agg(["sum", "count", "mean"])
+            others = rates[~rates.index.str.startswith("tpgmm")]
+            if "tpgmm" not in rates.index or others.empty:
+                continue
+            best = str(others["mean"].idxmax())
+            ours, theirs = (
+                wilson(int(rates["sum"][name]), int(rates["count"][name]))
+                for name in ("tpgmm", best)
+            )
+            disjoint = ours[0] > theirs[1] or theirs[0] > ours[1]
+            yield (
+                f"From {count} demonstrations tpgmm succeeds in "
+                f"{100 * rates['mean']['tpgmm']:.0f} % and {best}, the best of the others, in "
+                f"{100 * rates['mean'][best]:.0f} %; their intervals "
+                f"{'do not overlap' if disjoint else 'overlap'}."
+            )
+
+    def _settings(self) -> Iterator[str]:
+        yield "## Settings"
+        settings = {**self.results[0]["settings"], "options": dict(self.settings.options)}
+        rows = [[key.replace("_", " "), f"`{json.dumps(v)}`"] for key, v in settings.items()]
+        rows.append(["training seeds", _listed(set(self.cells.seed))])
+        for name in ("versions", "machine"):
+            distinct = sorted({json.dumps(item[name]) for item in self.results})
+            rows += [[name, f"`{text}`"] for text in distinct]
+        yield _table(["setting", "value"], rows)
+        yield (
+            "`cells.csv` has a row for each cell, `episodes_evaluated.csv` one for each "
+            "episode (both also as parquet). `policies/` holds what was trained; all but "
+            "`nearest` run in LeRobot's own evaluation, at the rate of the table above:"
+        )
+        trials = self.settings.episodes
+        yield (
+            "```\nlerobot-eval --policy.path=policies/NAME --policy.device=cpu "
+            f"--env.type={self.benchmark.env} --env.fps=RATE "
+            f"--eval.n_episodes={trials} --eval.batch_size={trials} "
+            f"--eval.use_async_envs=false --seed={self.settings.seeds[0]}\n```"
+        )
+
+    def _by_policy(self, table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+        """The rows of each policy that has some, in the order of the report."""
+        for policy in self.policies:
+            rows = table[table.policy == policy]
+            if len(rows):
+                yield policy, rows
+
+    def _picture(self, name: str) -> Path:
+        folder = self.out / "figures"
+        folder.mkdir(exist_ok=True)
+        return folder / name
+
+
+def _rate(rows: pd.DataFrame) -> str:
+    """Successes with their interval; a dash where there are no episodes."""
+    successes, trials = int(rows.success.sum()), len(rows)
+    if not trials:
+        return "-"
+    low, high = wilson(successes, trials)
+    share = 100 * successes / trials
+    return f"{successes}/{trials} = {share:.0f} % ({100 * low:.0f} to {100 * high:.0f} %)"
+
+
+def _spread(values: pd.Series[Any], digits: int) -> str:
+    # not interpolated: a figure may be infinite
+    late = values.quantile(0.95, interpolation="higher")
+    return f"{values.median():.{digits}f} / {late:.{digits}f}"
+
+
+def _late_gain(curve: Sequence[Mapping[str, float]]) -> float:
+    """By which share the least error fell in the last third of a training."""
+    errors = [point["validation_error"] for point in curve]
+    return 1 - min(errors) / min(errors[: max(1, 2 * len(errors) // 3)])
+
+
+def _listed(values: Iterable[int]) -> str:
+    return ", ".join(map(str, sorted(values)))
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = (head, ["---"] * len(head), *rows)
+    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)

@@ -9,13 +9,22 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
-from lerobot_policy_tpgmm.evaluation.report.intervals import wilson
-
-__all__ = ["cell_table", "episode_table", "write_table"]
+__all__ = ["cell_table", "episode_table", "wilson", "write_table"]
 
 #: What identifies a cell, in the order of the columns.
 KEYS = ("env", "policy", "demonstrations", "seed", "condition")
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """The 95 % score interval of a proportion (Wilson, JASA 22, 1927).
+
+    Unlike the normal approximation it stays within [0, 1] and is not empty where all trials
+    succeed or none.
+    """
+    interval = binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def cell_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
@@ -48,7 +57,7 @@ def _row(result: Mapping[str, Any]) -> dict[str, Any]:
         "success_low": low,
         "success_high": high,
     }
-    for key in episodes[0].keys() - {"seed", "success"}:
+    for key in (name for name in episodes[0] if name not in ("seed", "success")):
         values = [episode[key] for episode in episodes]
         row[f"{key}_median"] = float(np.median(values))
         # not interpolated: a figure may be infinite
@@ -94,7 +103,6 @@ def write_table(table: pd.DataFrame, path: Path) -> None:
 
     Parameters
     ----------
-    table : DataFrame
     path : Path
         Without suffix.
     """
