@@ -227,11 +227,6 @@ class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
     def describe(self, kinematics: Kinematics, operators: Any) -> None:
         """Write robot and operators into the configuration, complete in themselves.
 
-        Parameters
-        ----------
-        kinematics : Kinematics
-        operators : sequence of Operator
-
         Raises
         ------
         ModelFileError
@@ -243,13 +238,7 @@ class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
         self.decoded_operators()
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
-        """An unfitted estimator of these hyper-parameters.
-
-        Parameters
-        ----------
-        kinematics : Kinematics or None
-        operators : sequence of Operator
-        """
+        """An unfitted estimator of these hyper-parameters."""
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
         return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
 

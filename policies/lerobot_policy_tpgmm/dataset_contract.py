@@ -28,11 +28,6 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
 
     What is given stays; robot and operators become descriptions that need no file.
 
-    Parameters
-    ----------
-    config : TPGMMConfig
-    dataset : LeRobotDatasetMetadata
-
     Raises
     ------
     DataError, ModelFileError, UnknownNameError
@@ -69,11 +64,6 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
 
 def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
     """Whether a fitted policy and a data set are about the same signals.
-
-    Parameters
-    ----------
-    config : TPGMMConfig
-    dataset : LeRobotDatasetMetadata
 
     Raises
     ------

@@ -20,7 +20,6 @@ def write_pretrained(model: TaskParameterizedGMM, path: Path, signals: Signals) 
     ----------
     model : TaskParameterizedGMM
         Fitted.
-    path : Path
     signals : Signals
         Of the data set that the model was fitted to.
 

@@ -30,7 +30,6 @@ class MixtureParameters(nn.Module):
         D_j, the number of local coordinates of each operator, time not counted.
     n_steps : int
         T, the length of the time grid; 0 before a fit.
-    dtype : torch.dtype, default=torch.float64
 
     Attributes
     ----------
@@ -95,10 +94,6 @@ class MixtureParameters(nn.Module):
 
         The time grid becomes the model's, whatever its length: who calls this writes the
         length into the configuration.
-
-        Parameters
-        ----------
-        model : TaskParameterizedGMM
 
         Raises
         ------

@@ -127,7 +127,6 @@ class FrameFeatures:
         The frames that the model needs.
     places : mapping of str to sequence of int or str, optional
         As ``frames`` in :class:`TPGMMConfig`.
-    environment_names, state_names : sequence of str, optional
     default : sequence of float, optional
         A whole ``observation.environment_state``.
     n_environment : int, optional

@@ -26,7 +26,6 @@ def write_files(config: TPGMMConfig, tensors: Mapping[str, Tensor], directory: P
 
     Parameters
     ----------
-    config : TPGMMConfig
     tensors : mapping of str to Tensor
         The policy's ``state_dict``.
     directory : Path
@@ -48,7 +47,6 @@ def read_tensors(file: str, expected: Mapping[str, Tensor]) -> dict[str, Tensor]
 
     Parameters
     ----------
-    file : str
     expected : mapping of str to Tensor
         The ``state_dict`` that they are for.
 

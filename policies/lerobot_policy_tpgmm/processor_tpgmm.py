@@ -21,7 +21,6 @@ def make_tpgmm_pre_post_processors(
 
     Parameters
     ----------
-    config : TPGMMConfig
     dataset_stats : dict, optional
         Not used: nothing is normalised.
 

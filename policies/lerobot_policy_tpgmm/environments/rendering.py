@@ -58,7 +58,6 @@ class Renderer:
 
     Parameters
     ----------
-    model : mujoco.MjModel
     width, height : int
         Of the picture.
     camera : str
@@ -87,10 +86,6 @@ class Renderer:
 
     def __call__(self, data: mujoco.MjData) -> NDArray[np.uint8]:
         """Draw.
-
-        Parameters
-        ----------
-        data : mujoco.MjData
 
         Returns
         -------

@@ -76,10 +76,8 @@ class Benchmark(ABC):
 
         Parameters
         ----------
-        folder : Path
         training, validation : int
             How many episodes.
-        seed : int
 
         Returns
         -------
@@ -249,7 +247,6 @@ def benchmark(
 
     Parameters
     ----------
-    name : str
     rate, options
         As for :class:`Benchmark`.
 

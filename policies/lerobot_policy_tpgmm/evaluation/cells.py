@@ -55,13 +55,7 @@ class Cell:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file in one step: it is there as a whole, or as it was.
-
-    Parameters
-    ----------
-    path : Path
-    content : mapping
-    """
+    """Write a JSON file in one step: it is there as a whole, or as it was."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -72,23 +66,13 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 class Results:
-    """The finished cells in a folder, one file each.
-
-    Parameters
-    ----------
-    folder : Path
-    """
+    """The finished cells in a folder, one file each."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def path(self, cell: Cell) -> Path:
-        """Where the result of a cell is.
-
-        Parameters
-        ----------
-        cell : Cell
-        """
+        """Where the result of a cell is."""
         return self.folder / f"{cell.key}.json"
 
     def write(self, cell: Cell, result: Mapping[str, Any]) -> None:
@@ -96,7 +80,6 @@ class Results:
 
         Parameters
         ----------
-        cell : Cell
         result : mapping
             What JSON can hold.
         """
@@ -105,10 +88,6 @@ class Results:
 
     def read(self, cell: Cell) -> dict[str, Any] | None:
         """The result of a cell; None if there is none.
-
-        Parameters
-        ----------
-        cell : Cell
 
         Raises
         ------

@@ -54,11 +54,9 @@ def compare(
 
     Parameters
     ----------
-    settings : Settings
     out : Path
         The folder: ``episodes/`` (two LeRobot data sets), ``policies/`` (pretrained
         directories), ``cells/`` (one JSON file each), tables, figures and ``report.md``.
-    policies : sequence of str
     demonstrations : sequence of int
         Numbers of demonstrations.
     seeds : sequence of int

@@ -42,7 +42,6 @@ def record(folder: Path, settings: Settings, n: int) -> None:
     ----------
     folder : Path
         Of the comparison.
-    settings : Settings
     n : int
         How many episodes are needed for training.
     """
@@ -65,7 +64,6 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
     ----------
     folder : Path
         Of the comparison.
-    settings : Settings
     cells : sequence of Cell
         Of one training.
     """

@@ -36,7 +36,6 @@ class Runner:
 
     Parameters
     ----------
-    policy : PreTrainedPolicy
     preprocessor, postprocessor
         LeRobot's pipelines.
     """
@@ -47,12 +46,7 @@ class Runner:
 
     @classmethod
     def load(cls, directory: Path) -> Runner:
-        """Read a pretrained directory as LeRobot does.
-
-        Parameters
-        ----------
-        directory : Path
-        """
+        """Read a pretrained directory as LeRobot does."""
         config = PreTrainedConfig.from_pretrained(directory)
         kind = (
             NearestPolicy
@@ -120,8 +114,6 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
 
     Parameters
     ----------
-    runner : Runner
-    config : EnvConfig
     seeds : sequence of int
         Of the episodes.
 
@@ -162,11 +154,6 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
 
 def latency(runner: Runner, config: EnvConfig) -> dict[str, float]:
     """How long an action takes for one robot, from the raw observation on.
-
-    Parameters
-    ----------
-    runner : Runner
-    config : EnvConfig
 
     Returns
     -------

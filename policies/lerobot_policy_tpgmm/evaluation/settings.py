@@ -84,10 +84,6 @@ class Settings:
     def keep(self, path: Path) -> None:
         """Write to a file, or check that it says the same.
 
-        Parameters
-        ----------
-        path : Path
-
         Raises
         ------
         DataError

@@ -155,7 +155,6 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
 
         Parameters
         ----------
-        seed : int, optional
         options : mapping, optional
             ``environment_state``, the objects' poses, and ``joints``, the arms' posture.
             Others are ignored: LeRobot gives one of its own.

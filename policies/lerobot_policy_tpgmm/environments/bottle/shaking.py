@@ -176,7 +176,6 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
 
         Parameters
         ----------
-        seed : int, optional
         options : dict, optional
             ``"bottle"``: its initial position and orientation, shape (7,); ``"joints"``: the
             start posture, shape (17,). Other keys are for others, and ignored.

@@ -50,7 +50,6 @@ class Recipe:
         Steps per second of the policy.
     phase : bool
         Whether it is informed of the time; episodes should then run on a common clock.
-    batch_size : int
     jitter : float
         Standard deviation of the noise that is added to states in training, in units of the
         normalised state: else the posture betrays which demonstration it is from.
@@ -162,7 +161,6 @@ def train(
 
     Parameters
     ----------
-    recipe : Recipe
     training, validation : Episodes
         Of one rate, a multiple of the recipe's.
     seed : int

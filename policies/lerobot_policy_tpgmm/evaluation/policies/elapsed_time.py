@@ -80,12 +80,7 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """The environment state grows by the time.
-
-        Parameters
-        ----------
-        features : dict
-        """
+        """The environment state grows by the time."""
         observed = dict(features[PipelineFeatureType.OBSERVATION])
         given = observed[ENVIRONMENT]
         size = given.shape[-1] + len(time_features(torch.zeros(())))

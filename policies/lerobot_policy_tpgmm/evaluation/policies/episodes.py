@@ -77,7 +77,6 @@ class Episodes:
 
         Parameters
         ----------
-        fps : int
         parts : sequence of (Tensor, Tensor, Tensor)
             State, environment and action of each.
         """
@@ -97,10 +96,6 @@ class Episodes:
 
     def first(self, n: int) -> Episodes:
         """The first ``n`` episodes.
-
-        Parameters
-        ----------
-        n : int
 
         Raises
         ------
@@ -136,10 +131,6 @@ class Episodes:
         """These and other episodes, warped in time onto the most typical of these.
 
         The warping is TP-GMM's own: on how the joint references move.
-
-        Parameters
-        ----------
-        *others : Episodes
         """
         warping = DynamicTimeWarping(features=["directions"])
         aligned = [warping.fit_transform(self._demonstrations())]

@@ -72,7 +72,6 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     Parameters
     ----------
-    config : NearestConfig
     **unused
         What else LeRobot passes.
     """
@@ -92,12 +91,7 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @classmethod
     def fit(cls, episodes: Episodes) -> NearestPolicy:
-        """Keep the episodes.
-
-        Parameters
-        ----------
-        episodes : Episodes
-        """
+        """Keep the episodes."""
         parts = list(episodes)
         longest = max(len(action) for _, _, action in parts)
         config = NearestConfig(
@@ -129,12 +123,7 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next action of the demonstrations chosen at the first step; then the last one.
-
-        Parameters
-        ----------
-        batch : dict of str to Tensor
-        """
+        """The next action of the demonstrations chosen at the first step; then the last one."""
         if self._chosen is None:
             self._chosen = self._distance(batch[ENVIRONMENT]).argmin(dim=1)
         step = min(self._step, self.config.n_steps - 1)
@@ -151,20 +140,11 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return (apart + turn.square()).sum(-1)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """One action as a chunk.
-
-        Parameters
-        ----------
-        batch : dict of str to Tensor
-        """
+        """One action as a chunk."""
         return self.select_action(batch)[:, None]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
         """There is no loss.
-
-        Parameters
-        ----------
-        batch : dict of str to Tensor
 
         Raises
         ------

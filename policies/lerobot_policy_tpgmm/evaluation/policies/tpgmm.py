@@ -25,7 +25,6 @@ def fit_tpgmm(
 
     Parameters
     ----------
-    benchmark : Benchmark
     dataset : Path
         A LeRobot data set.
     n : int

@@ -26,7 +26,6 @@ class Windows:
 
     Parameters
     ----------
-    episodes : Episodes
     stride : int
         Rows of the recording for each step of the policy.
     observed : sequence of int or None
