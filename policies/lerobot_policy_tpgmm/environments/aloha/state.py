@@ -15,15 +15,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lerobot_policy_tpgmm.environments.aloha.robot import ARM_JOINTS, JOINTS, OBJECTS, SIDES
-from lerobot_policy_tpgmm.environments.rendering import Renderer
-from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from lerobot_policy_tpgmm.environments.base import Observation, StateEnv, finite_vector
+from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
 __all__ = ["AlohaStateEnv"]
-
-Array = NDArray[np.float64]
 
 DESCRIPTIONS = {
     "transfer_cube": "pick up the cube with the right arm and hand it over to the left arm",
@@ -39,7 +37,7 @@ CAMERA = "angle"
 POSE_LOCK = threading.Lock()
 
 
-class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
+class AlohaStateEnv(StateEnv):
     """Transfer a cube, or insert a peg, with two ViperX arms.
 
     Observations are ``agent_pos``, the 14 joints in the order of ``joint_names`` (arms
@@ -89,7 +87,6 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
     references that jump can make gym-aloha's stiff servos unstable, which ends the episode.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
     joint_names = JOINTS
 
     def __init__(
@@ -128,15 +125,8 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
                 "episode_length has to be at least 1 and yaw_range between 0 and pi, got "
                 f"{steps!r} and {yaw_range!r}"
             )
-        if render_mode not in (None, "rgb_array"):
-            raise DataError(f"render_mode is None or 'rgb_array', got {render_mode!r}")
-        self.fps, self.episode_length, self.yaw_range = fps, steps, yaw_range
-        self.track, self.stop_at_success, self.render_mode = track, stop_at_success, render_mode
-        self.metadata = {**type(self).metadata, "render_fps": fps}
-        self._render_size = render_width, render_height
-        self._renderer: Renderer | None = None
-        self._picture: NDArray[np.uint8] | None = None
-        self._max_episode_steps = steps  # the name that LeRobot looks for
+        super().__init__(fps, steps, CAMERA, render_mode, (render_width, render_height))
+        self.yaw_range, self.track, self.stop_at_success = yaw_range, track, stop_at_success
         self._substeps = rate // fps
         self.action_space = _actions(self._physics.model)
         self.observation_space = gym.spaces.Dict(
@@ -150,7 +140,7 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[dict[str, Array], dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Place arms and objects.
 
         Parameters
@@ -170,10 +160,12 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         """
         super().reset(seed=seed)
         given = options or {}
-        joints = _checked("joints", given["joints"], len(JOINTS)) if "joints" in given else None
+        joints = (
+            finite_vector("joints", given["joints"], len(JOINTS)) if "joints" in given else None
+        )
         poses = self._sample(seed)  # also where poses are given: further draws stay the same
         if "environment_state" in given:
-            poses = _checked("environment_state", given["environment_state"], len(poses))
+            poses = finite_vector("environment_state", given["environment_state"], len(poses))
             norms = np.linalg.norm(poses.reshape(-1, 7)[:, 3:], axis=1)
             if np.abs(norms - 1).max() > 1e-4:
                 raise DataError(
@@ -196,7 +188,7 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         self._lowest = self._height()
         return self._observation(), self._info()
 
-    def step(self, action: Array) -> tuple[dict[str, Array], float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Drive the joints to references for one control period.
 
         Parameters
@@ -213,7 +205,7 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         DataError
             If it has another shape or is not finite.
         """
-        self._rules.before_step(_checked("action", action, len(JOINTS)), self._physics)
+        self._rules.before_step(finite_vector("action", action, len(JOINTS)), self._physics)
         self._steps += 1
         try:
             self._physics.step(self._substeps)
@@ -228,29 +220,10 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         truncated = self._steps >= self.episode_length
         return self._observation(), float(reward), solved, truncated, self._info()
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """A picture, at most 25 new ones per simulated second.
+    def _simulation(self) -> tuple[Any, Any]:
+        return self._physics.model.ptr, self._physics.data.ptr
 
-        Returns
-        -------
-        ndarray of shape (height, width, 3)
-            None without a render mode; small and black where nothing can be drawn.
-        """
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            self._renderer = Renderer(self._physics.model.ptr, *self._render_size, CAMERA)
-        if self._picture is None or self._steps % max(1, round(self.fps / 25)) == 0:
-            self._picture = self._renderer(self._physics.data.ptr)
-        return self._picture
-
-    def close(self) -> None:
-        """Free what drawing needs."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
-    def _sample(self, seed: int | None) -> Array:
+    def _sample(self, seed: int | None) -> NDArray[np.float64]:
         """gym-aloha's poses for a seed, turned about the vertical."""
         drawn = int(self.np_random.integers(2**32)) if seed is None else seed % 2**32
         poses = np.ravel(self._draw(drawn))
@@ -264,7 +237,7 @@ class AlohaStateEnv(gym.Env[dict[str, Array], Array]):
         """Of the cube or the peg [m]."""
         return float(self._rules.get_env_state(self._physics)[2])
 
-    def _observation(self) -> dict[str, Array]:
+    def _observation(self) -> Observation:
         poses = self._initial
         if self.track:
             poses = self._rules.get_env_state(self._physics)
@@ -307,12 +280,3 @@ def _actions(model: Any) -> gym.spaces.Box:
     gripper = np.broadcast_to((0.0, 1.0), (len(SIDES), 1, 2))
     low, high = np.concatenate((limits, gripper), axis=1).reshape(-1, 2).astype(np.float32).T
     return gym.spaces.Box(low, high, dtype=np.float32)
-
-
-def _checked(name: str, values: Any, width: int) -> Array:
-    array = np.array(values, dtype=np.float64)
-    if array.shape != (width,):
-        raise ShapeError(f"{name} has shape ({width},), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise DataError(f"{name} holds values that are NaN or infinite: {array}")
-    return array

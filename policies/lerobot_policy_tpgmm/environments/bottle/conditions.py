@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
+from lerobot_policy_tpgmm.environments.base import finite_vector
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.exceptions import DataError
 
 __all__ = ["Conditions", "skill"]
 
@@ -77,12 +78,17 @@ class Conditions:
         """
         bottle = skill().bottle_poses(1, rng)[0]
         names = skill().robot.joint_names
+        strong = [i for i, name in enumerate(names) if any(part in name for part in PUSHED)]
         return cls(
             bottle=np.concatenate((bottle.position, bottle.orientation)),
             joints=skill().start_postures(1, rng)[0].numpy(),
             mass=rng.uniform(*MASS),
             delay=int(rng.integers(*DELAY, endpoint=True)),
-            pushed=int(rng.choice([i for i, n in enumerate(names) if _any_in(PUSHED, n)])),
+            pushed=int(
+                rng.choice(
+                    [i for i, n in enumerate(names) if any(part in n for part in PUSHED)]
+                )
+            ),
             push_start=rng.uniform(*PUSH_START),
             push_length=rng.uniform(*PUSH_LENGTH),
             push_torque=float(rng.uniform(*PUSH_TORQUE) * rng.choice((-1, 1))),
@@ -108,7 +114,7 @@ class Conditions:
             joints' ranges.
         """
         given: dict[str, Any] = {
-            name: _vector(name, options[name], len(getattr(self, name)))
+            name: finite_vector(name, options[name], len(getattr(self, name)))
             for name in ("bottle", "joints")
             if name in options
         }
@@ -145,16 +151,3 @@ class Conditions:
         last = first + round(1000 * self.push_length)
         torques[max(first, 0) : max(last, 0), self.pushed] = self.push_torque
         return torques
-
-
-def _any_in(parts: tuple[str, ...], name: str) -> bool:
-    return any(part in name for part in parts)
-
-
-def _vector(name: str, value: ArrayLike, length: int) -> NDArray[np.float64]:
-    vector = np.asarray(value, dtype=np.float64)
-    if vector.shape != (length,):
-        raise ShapeError(f"{name} needs {length} values, got shape {vector.shape}")
-    if not np.isfinite(vector).all():
-        raise DataError(f"{name} is not finite: {vector.tolist()}")
-    return vector

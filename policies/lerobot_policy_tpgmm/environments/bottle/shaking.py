@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_policy_tpgmm.environments.base import Observation, StateEnv
 from lerobot_policy_tpgmm.environments.bottle.conditions import Conditions, skill
 from lerobot_policy_tpgmm.environments.bottle.measures import Closing, find_shaking, successful
 from lerobot_policy_tpgmm.environments.bottle.scene import (
@@ -20,7 +20,6 @@ from lerobot_policy_tpgmm.environments.bottle.scene import (
     BottleScene,
     displaced,
 )
-from lerobot_policy_tpgmm.environments.rendering import Renderer
 from tpgmm_datasets.bottle.skill import PHASES, SHOULDERS, TASK, BottleShaking
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
@@ -41,10 +40,8 @@ GRIP_FORCE, GRIP_SLIP = 100.0, 0.03
 #: The range in which the bottle is observed: position [m] and quaternion.
 RANGE = np.array([5.0] * 3 + [1.0] * 4)
 
-Observation = dict[str, NDArray[np.float64]]
 
-
-class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
+class BottleShakingEnv(StateEnv):
     """A 17-joint upper body that should take a bottle with both hands, lift and shake it.
 
     An action is a reference for each joint [rad]. References are limited to the joints' ranges
@@ -109,7 +106,6 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
         If an option is not one of the above.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012
     task = TASK
     task_description = "take the bottle with both hands, lift it and shake it"
 
@@ -129,14 +125,10 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
         render_height: int = 240,
     ) -> None:
         steps = round(DURATION * fps) if episode_length is None else episode_length
-        self.fps, self.mode, self.episode_length = fps, mode, steps
-        self.pushes, self.noise, self.track = pushes, noise, track
-        self.frequency, self.amplitude, self.render_mode = frequency, amplitude, render_mode
+        super().__init__(fps, steps, CAMERA, render_mode, (render_width, render_height))
+        self.mode, self.pushes, self.noise, self.track = mode, pushes, noise, track
+        self.frequency, self.amplitude = frequency, amplitude
         self._check_options()
-        self._max_episode_steps = steps  # the name that LeRobot looks for
-        self.metadata = {**type(self).metadata, "render_fps": fps}
-        self._picture_size = render_width, render_height
-        self._renderer: Renderer | None = None
         robot = skill().robot
         self.joint_names = robot.joint_names
         self._pitches = [self.joint_names.index(name) for name in SHOULDERS]
@@ -159,8 +151,6 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
             raise DataError(f"mode is 'dynamic' or 'kinematic', got {self.mode!r}")
         if self.mode == "kinematic" and self.pushes:
             raise DataError("pushes are torques: they need mode='dynamic'")
-        if self.render_mode not in (None, "rgb_array"):
-            raise DataError(f"render_mode is None or 'rgb_array', got {self.render_mode!r}")
         if self.episode_length < 1:
             raise DataError(f"episode_length is at least 1, got {self.episode_length!r}")
         for name in ("frequency", "amplitude"):
@@ -200,8 +190,7 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._grasp_step = self.episode_length
         self._shoulders = np.empty((self.episode_length, len(SHOULDERS)))
         self._heights = np.empty(self.episode_length)
-        self._picture: NDArray[np.uint8] | None = None
-        self._steps = 0
+        self._picture, self._steps = None, 0
         return self._observation(), {"is_success": False}
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -330,24 +319,5 @@ class BottleShakingEnv(gym.Env[Observation, NDArray[np.float32]]):
         seen = displaced(bottle, self.noise * NOISE_BOTTLE * errors)
         return np.clip(seen, -RANGE, RANGE)
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """A picture; 25 new ones per simulated second.
-
-        Returns
-        -------
-        ndarray of shape (height, width, 3)
-            None without a render mode; small and black where nothing can be drawn.
-        """
-        if self.render_mode is None:
-            return None
-        if self._renderer is None:
-            self._renderer = Renderer(self._scene.model, *self._picture_size, CAMERA)
-        if self._picture is None or self._steps % max(1, round(self.fps / 25)) == 0:
-            self._picture = self._renderer(self._scene.data)
-        return self._picture
-
-    def close(self) -> None:
-        """Free the renderer."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+    def _simulation(self) -> tuple[Any, Any]:
+        return self._scene.model, self._scene.data
