@@ -17,7 +17,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
 
-__all__ = ["TPGMMConfig"]
+__all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
 #: Parameters of the estimator that go into the configuration under their own names.
 HYPERPARAMETERS = (
@@ -33,9 +33,49 @@ CHOICES = {
 }
 
 
+@dataclass
+class StatePolicyConfig(PreTrainedConfig):  # type: ignore[misc]
+    """What a policy shares that sees the present state alone, in SI units."""
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: dict.fromkeys(
+            ("STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
+        )
+    )
+
+    def get_scheduler_preset(self) -> None:
+        """No schedule."""
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the present observation."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the present action."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+
+
+def state_features(
+    n_state: int, n_environment: int, n_action: int
+) -> dict[str, dict[str, PolicyFeature]]:
+    """``input_features`` and ``output_features`` of a policy on states of such sizes.
+
+    There is no ``observation.environment_state`` where it has no entries.
+    """
+    inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (n_state,))}
+    if n_environment:
+        inputs[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (n_environment,))
+    outputs = {ACTION: PolicyFeature(FeatureType.ACTION, (n_action,))}
+    return {"input_features": inputs, "output_features": outputs}
+
+
 @PreTrainedConfig.register_subclass("tpgmm")
 @dataclass
-class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
+class TPGMMConfig(StatePolicyConfig):
     """Configuration of :class:`TPGMMPolicy`, ``--policy.type=tpgmm``.
 
     A policy that is fitted has everything here filled in; for training from a data set,
@@ -153,12 +193,6 @@ class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
     optimizer_lr: float = 1e-4
     push_to_hub: bool = False
 
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(
-            ("STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
-        )
-    )
-
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, choices in CHOICES.items():
@@ -242,21 +276,6 @@ class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
         return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
 
-    def set_features(self, n_state: int, n_environment: int, n_action: int) -> None:
-        """Declare inputs and outputs to LeRobot.
-
-        Parameters
-        ----------
-        n_state, n_environment, n_action : int
-            Numbers of entries; no ``observation.environment_state`` if there are none.
-        """
-        self.input_features = {OBS_STATE: PolicyFeature(FeatureType.STATE, (n_state,))}
-        if n_environment:
-            self.input_features[OBS_ENV_STATE] = PolicyFeature(
-                FeatureType.ENV, (n_environment,)
-            )
-        self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, (n_action,))}
-
     def validate_features(self) -> None:
         """Check that there are a state and an action.
 
@@ -276,21 +295,6 @@ class TPGMMConfig(PreTrainedConfig):  # type: ignore[misc]
     def get_optimizer_preset(self) -> AdamConfig:
         """Adam, without weight decay."""
         return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0)
-
-    def get_scheduler_preset(self) -> None:
-        """No schedule."""
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """Only the present observation."""
-
-    @property
-    def action_delta_indices(self) -> None:
-        """Only the present action."""
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
 
 
 def _description(operator: Operator) -> dict[str, Any] | str:

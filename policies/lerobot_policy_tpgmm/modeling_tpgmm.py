@@ -13,7 +13,11 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import HYPERPARAMETERS, TPGMMConfig
+from lerobot_policy_tpgmm.configuration_tpgmm import (
+    HYPERPARAMETERS,
+    TPGMMConfig,
+    state_features,
+)
 from lerobot_policy_tpgmm.control import ControlLoop
 from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
@@ -182,9 +186,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         poses = FrameFeatures(
             model.frame_names_, config.frames, environment_names, config.state_names, None
         )
-        config.set_features(
-            len(config.state_names), poses.n_environment, len(config.action_names)
-        )
+        sizes = len(config.state_names), poses.n_environment, len(config.action_names)
+        config.input_features, config.output_features = state_features(*sizes).values()
         policy = cls(config)
         policy.mixture.copy_from(model)
         return policy.eval().to(config.device)

@@ -160,9 +160,9 @@ class AlohaStateEnv(StateEnv):
         """
         super().reset(seed=seed)
         given = options or {}
-        joints = (
-            finite_vector("joints", given["joints"], len(JOINTS)) if "joints" in given else None
-        )
+        joints = given.get("joints")
+        if joints is not None:
+            joints = finite_vector("joints", joints, len(JOINTS))
         poses = self._sample(seed)  # also where poses are given: further draws stay the same
         if "environment_state" in given:
             poses = finite_vector("environment_state", given["environment_state"], len(poses))

@@ -84,11 +84,7 @@ class Conditions:
             joints=skill().start_postures(1, rng)[0].numpy(),
             mass=rng.uniform(*MASS),
             delay=int(rng.integers(*DELAY, endpoint=True)),
-            pushed=int(
-                rng.choice(
-                    [i for i, n in enumerate(names) if any(part in n for part in PUSHED)]
-                )
-            ),
+            pushed=int(rng.choice(strong)),
             push_start=rng.uniform(*PUSH_START),
             push_length=rng.uniform(*PUSH_LENGTH),
             push_torque=float(rng.uniform(*PUSH_TORQUE) * rng.choice((-1, 1))),

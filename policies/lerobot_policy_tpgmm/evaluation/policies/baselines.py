@@ -10,19 +10,15 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies import ACTConfig, DiffusionConfig, PreTrainedPolicy
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from lerobot_policy_tpgmm.configuration_tpgmm import state_features
 from lerobot_policy_tpgmm.evaluation.policies.elapsed_time import ElapsedTimeStep, time_features
-from lerobot_policy_tpgmm.evaluation.policies.episodes import (
-    ACTION,
-    ENVIRONMENT,
-    STATE,
-    Episodes,
-)
-from lerobot_policy_tpgmm.evaluation.policies.windows import Windows
+from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes, Windows
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["RECIPES", "Recipe", "Training", "train"]
@@ -187,12 +183,7 @@ def train(
             f"policy's {recipe.rate}"
         )
     if recipe.phase:
-        training, validation = (
-            episodes.with_environment(
-                torch.cat((episodes.environment, time_features(episodes.elapsed())), dim=1)
-            )
-            for episodes in (training, validation)
-        )
+        training, validation = (_with_time(episodes) for episodes in (training, validation))
     config = _configure(recipe, training)
     policy = get_policy_class(config.type)(config)
     processors = make_pre_post_processors(config, dataset_stats=_statistics(training))
@@ -200,7 +191,7 @@ def train(
     result = Training(policy, processors, recipe.rate, recipe.describe())
     deltas = config.observation_delta_indices, config.action_delta_indices
     windows, held_out = (
-        Windows(_normalized(episodes, preprocessor), stride, *deltas)
+        Windows(_normalized(episodes, preprocessor), episodes.bounds, stride, *deltas)
         for episodes in (training, validation)
     )
     rows = torch.linspace(0, len(held_out) - 1, CHECKED).long()
@@ -266,7 +257,9 @@ class _Learner:
 
     def _step(self) -> float:
         batch = self.windows.at(torch.randint(len(self.windows), (self.recipe.batch_size,)))
-        batch[STATE] = batch[STATE] + self.recipe.jitter * torch.randn_like(batch[STATE])
+        batch[OBS_STATE] = batch[OBS_STATE] + self.recipe.jitter * torch.randn_like(
+            batch[OBS_STATE]
+        )
         self.policy.train()
         loss, _ = self.policy.forward(batch)
         self.optimizer.zero_grad()
@@ -290,7 +283,7 @@ class _Learner:
             torch.manual_seed(0)
             loss, _ = policy.forward(batch)
             policy.reset()
-            seen = {key: batch[key] for key in (STATE, ENVIRONMENT)}
+            seen = {key: batch[key] for key in (OBS_STATE, OBS_ENV_STATE)}
             predicted = policy.predict_action_chunk(seen)[:, : config.n_action_steps]
         first = config.n_obs_steps - 1  # Diffusion also predicts the past
         steps = slice(first, first + config.n_action_steps)
@@ -299,20 +292,23 @@ class _Learner:
         return float(loss), float(apart[valid].mean())
 
 
+def _with_time(episodes: Episodes) -> Episodes:
+    environment = episodes.columns[OBS_ENV_STATE], time_features(episodes.elapsed())
+    return replace(
+        episodes, columns={**episodes.columns, OBS_ENV_STATE: torch.cat(environment, dim=1)}
+    )
+
+
+def _normalized(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:
+    """All rows through the preprocessor at once."""
+    rows = preprocessor(episodes.columns)
+    return {name: rows[name] for name in episodes.columns}
+
+
 def _configure(recipe: Recipe, training: Episodes) -> PreTrainedConfig:
-    sizes = {
-        STATE: (FeatureType.STATE, training.state),
-        ENVIRONMENT: (FeatureType.ENV, training.environment),
-    }
     mode = NormalizationMode(recipe.normalization)
     return recipe.config(
-        input_features={
-            key: PolicyFeature(type=kind, shape=(values.shape[1],))
-            for key, (kind, values) in sizes.items()
-        },
-        output_features={
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(training.action.shape[1],))
-        },
+        **state_features(*training.widths),
         normalization_mapping={"STATE": mode, "ENV": mode, "ACTION": mode},
         device="cpu",
         push_to_hub=False,
@@ -323,11 +319,7 @@ def _configure(recipe: Recipe, training: Episodes) -> PreTrainedConfig:
 def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
     """Statistics with room at both ends, and no division by the spread of a constant."""
     statistics = {}
-    for key, values in (
-        (STATE, training.state),
-        (ENVIRONMENT, training.environment),
-        (ACTION, training.action),
-    ):
+    for key, values in training.columns.items():
         std, low, high = values.std(0), values.min(0).values, values.max(0).values
         constant = std < CONSTANT
         margin = torch.where(constant, 1.0, 0.1 * (high - low))
@@ -338,13 +330,6 @@ def _statistics(training: Episodes) -> dict[str, dict[str, Tensor]]:
             "max": high + margin,
         }
     return statistics
-
-
-def _normalized(episodes: Episodes, preprocessor: Any) -> Episodes:
-    """All rows through the preprocessor at once."""
-    rows = {STATE: episodes.state, ENVIRONMENT: episodes.environment, ACTION: episodes.action}
-    done = preprocessor(rows)
-    return Episodes(episodes.fps, done[STATE], done[ENVIRONMENT], done[ACTION], episodes.bounds)
 
 
 def _action_scale(postprocessor: Any, config: PreTrainedConfig) -> Tensor:

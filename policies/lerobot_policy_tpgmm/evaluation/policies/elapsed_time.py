@@ -9,9 +9,8 @@ from typing import Any
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep
+from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
-
-from lerobot_policy_tpgmm.evaluation.policies.episodes import ENVIRONMENT
 
 __all__ = ["ElapsedTimeStep", "time_features"]
 
@@ -63,9 +62,9 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
         observation : dict
             With a batch dimension.
         """
-        environment = observation[ENVIRONMENT]
+        environment = observation[OBS_ENV_STATE]
         features = time_features(torch.full(environment.shape[:-1], self._count / self.fps))
-        observation[ENVIRONMENT] = torch.cat((environment, features.to(environment)), dim=-1)
+        observation[OBS_ENV_STATE] = torch.cat((environment, features.to(environment)), dim=-1)
         self._count += 1
         return observation
 
@@ -82,7 +81,7 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """The environment state grows by the time."""
         observed = dict(features[PipelineFeatureType.OBSERVATION])
-        given = observed[ENVIRONMENT]
+        given = observed[OBS_ENV_STATE]
         size = given.shape[-1] + len(time_features(torch.zeros(())))
-        observed[ENVIRONMENT] = PolicyFeature(type=given.type, shape=(size,))
+        observed[OBS_ENV_STATE] = PolicyFeature(type=given.type, shape=(size,))
         return {**features, PipelineFeatureType.OBSERVATION: observed}

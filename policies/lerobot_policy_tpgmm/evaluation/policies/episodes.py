@@ -1,23 +1,25 @@
-"""Episodes in memory, as the policies learn from them: every frame one row."""
+"""Episodes in memory, every frame one row, and the training batches drawn from them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Episodes"]
+__all__ = ["Episodes", "Windows"]
 
-STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
+COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +30,15 @@ class Episodes:
     ----------
     fps : int
         Rows per second.
-    state : Tensor of shape (N, n_joints)
-        Measured joints.
-    environment : Tensor of shape (N, e)
-        What is known of the objects.
-    action : Tensor of shape (N, n_joints)
-        Joint references.
+    columns : dict of str to Tensor of shape (N, n)
+        ``observation.state`` (measured joints), ``observation.environment_state`` (what is
+        known of the objects) and ``action`` (joint references), in this order.
     bounds : tuple of int
         Where each episode begins, and at last where the last one ends.
     """
 
     fps: int
-    state: Tensor
-    environment: Tensor
-    action: Tensor
+    columns: dict[str, Tensor]
     bounds: tuple[int, ...]
 
     @classmethod
@@ -64,12 +61,10 @@ class Episodes:
 
         fps = describe_lerobot(path).fps
         rows = pyarrow.dataset.dataset(str(Path(path) / "data"), format="parquet")
-        table = rows.to_table([STATE, ENVIRONMENT, ACTION, "episode_index", "index"])
-        table = table.sort_by("index")
+        table = rows.to_table([*COLUMNS, "episode_index", "index"]).sort_by("index")
         numbers = table["episode_index"].to_numpy()
         bounds = (0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers))
-        state, environment, action = (_matrix(table[k]) for k in (STATE, ENVIRONMENT, ACTION))
-        return cls(round(fps), state, environment, action, bounds)
+        return cls(round(fps), {name: _matrix(table[name]) for name in COLUMNS}, bounds)
 
     @classmethod
     def join(cls, fps: int, parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Episodes:
@@ -81,18 +76,20 @@ class Episodes:
             State, environment and action of each.
         """
         bounds = np.cumsum([0, *(len(state) for state, _, _ in parts)]).tolist()
-        state, environment, action = (
-            torch.cat(column).float() for column in zip(*parts, strict=True)
-        )
-        return cls(fps, state, environment, action, tuple(bounds))
+        columns = [torch.cat(column).float() for column in zip(*parts, strict=True)]
+        return cls(fps, dict(zip(COLUMNS, columns, strict=True)), tuple(bounds))
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Numbers of entries of state, environment and action."""
+        return tuple(column.shape[1] for column in self.columns.values())
 
     def __len__(self) -> int:
         return len(self.bounds) - 1
 
-    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for start, end in zip(self.bounds, self.bounds[1:], strict=False):
-            rows = slice(start, end)
-            yield self.state[rows], self.environment[rows], self.action[rows]
+    def __iter__(self) -> Iterator[tuple[Tensor, ...]]:
+        for start, end in pairwise(self.bounds):
+            yield tuple(column[start:end] for column in self.columns.values())
 
     def first(self, n: int) -> Episodes:
         """The first ``n`` episodes.
@@ -104,23 +101,8 @@ class Episodes:
         """
         if not 1 <= n <= len(self):
             raise DataError(f"{n} episodes are asked for, there are {len(self)}")
-        end = self.bounds[n]
-        return Episodes(
-            self.fps,
-            self.state[:end],
-            self.environment[:end],
-            self.action[:end],
-            self.bounds[: n + 1],
-        )
-
-    def with_environment(self, environment: Tensor) -> Episodes:
-        """The same with other columns of the environment.
-
-        Parameters
-        ----------
-        environment : Tensor of shape (N, e)
-        """
-        return replace(self, environment=environment)
+        columns = {name: column[: self.bounds[n]] for name, column in self.columns.items()}
+        return Episodes(self.fps, columns, self.bounds[: n + 1])
 
     def elapsed(self) -> Tensor:
         """Seconds since the beginning of its episode of every row, shape (N,)."""
@@ -135,7 +117,7 @@ class Episodes:
         warping = DynamicTimeWarping(features=["directions"])
         aligned = [warping.fit_transform(self._demonstrations())]
         aligned += [warping.transform(other._demonstrations()) for other in others]
-        n = self.state.shape[1]
+        n, *_ = self.widths
         sets = []
         for episodes, motions in zip((self, *others), aligned, strict=True):
             parts = [
@@ -151,6 +133,68 @@ class Episodes:
             Demonstration(torch.arange(len(s)) / self.fps, torch.cat((s, a), dim=1).double())
             for s, _, a in self
         ]
+
+
+class Windows:
+    """Observations and the actions that follow, at a rate below that of the recording.
+
+    A window may begin at any row of the recording and takes every ``stride``-th row from
+    there; no row is lost to the lower rate. The action of a step is the reference that is to
+    be reached at its end, so the last of the ``stride`` rows that the step lasts.
+
+    Parameters
+    ----------
+    columns, bounds
+        As in :class:`Episodes`.
+    stride : int
+        Rows of the recording for each step of the policy.
+    observed : sequence of int or None
+        The steps whose observations are given, 0 being the present one (LeRobot's
+        ``observation_delta_indices``).
+    acted : sequence of int
+        The steps whose actions are to be predicted (``action_delta_indices``).
+    """
+
+    def __init__(
+        self,
+        columns: Mapping[str, Tensor],
+        bounds: Sequence[int],
+        stride: int,
+        observed: Sequence[int] | None,
+        acted: Sequence[int],
+    ) -> None:
+        self.columns, edges = columns, torch.tensor(bounds)
+        self.first = edges[:-1].repeat_interleave(edges.diff())
+        self.last = edges[1:].repeat_interleave(edges.diff()) - 1
+        self.observed = None if observed is None else stride * torch.tensor(observed)
+        self.acted = stride * torch.tensor(acted) + stride - 1
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def at(self, rows: Tensor) -> dict[str, Tensor]:
+        """The windows whose present step is at these rows.
+
+        Parameters
+        ----------
+        rows : Tensor of shape (B,)
+
+        Returns
+        -------
+        dict
+            As LeRobot's policies take it in ``forward``: observations of shape (B, ...) or
+            (B, n_observed, ...), ``action`` (B, n_acted, n_joints), ``action_is_pad``. Before
+            the beginning of an episode stands its first observation, after its end its last
+            action.
+        """
+        first, last = self.first[rows, None], self.last[rows, None]
+        acted, seen = rows[:, None] + self.acted, rows
+        if self.observed is not None:
+            seen = (rows[:, None] + self.observed).clamp(first, last)
+        batch = {name: column[seen] for name, column in self.columns.items()}
+        batch[ACTION] = self.columns[ACTION][acted.clamp(first, last)]
+        batch["action_is_pad"] = (acted < first) | (acted > last)
+        return batch
 
 
 def _matrix(column: Any) -> Tensor:

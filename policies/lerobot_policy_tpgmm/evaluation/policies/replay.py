@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.configs import PreTrainedConfig
 from lerobot.optim import SGDConfig
 from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.evaluation.policies.episodes import (
-    ACTION,
-    ENVIRONMENT,
-    STATE,
-    Episodes,
-)
+from lerobot_policy_tpgmm.configuration_tpgmm import StatePolicyConfig, state_features
+from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
 
 __all__ = ["NearestConfig", "NearestPolicy"]
 
@@ -27,7 +24,7 @@ POSE = 7
 
 @PreTrainedConfig.register_subclass("nearest_demonstration")
 @dataclass
-class NearestConfig(PreTrainedConfig):  # type: ignore[misc]
+class NearestConfig(StatePolicyConfig):
     """Configuration of :class:`NearestPolicy`.
 
     Parameters
@@ -38,11 +35,6 @@ class NearestConfig(PreTrainedConfig):  # type: ignore[misc]
 
     n_demonstrations: int = 1
     n_steps: int = 1
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: dict.fromkeys(
-            ("STATE", "ENV", "ACTION"), NormalizationMode.IDENTITY
-        )
-    )
 
     def validate_features(self) -> None:
         """Nothing to check."""
@@ -50,21 +42,6 @@ class NearestConfig(PreTrainedConfig):  # type: ignore[misc]
     def get_optimizer_preset(self) -> SGDConfig:
         """Nothing is trained by gradient."""
         return SGDConfig()
-
-    def get_scheduler_preset(self) -> None:
-        """No schedule."""
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """Only the present observation."""
-
-    @property
-    def action_delta_indices(self) -> None:
-        """Only the present action."""
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards."""
 
 
 class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -97,15 +74,7 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config = NearestConfig(
             n_demonstrations=len(parts),
             n_steps=longest,
-            input_features={
-                STATE: PolicyFeature(FeatureType.STATE, tuple(episodes.state.shape[1:])),
-                ENVIRONMENT: PolicyFeature(
-                    FeatureType.ENV, tuple(episodes.environment.shape[1:])
-                ),
-            },
-            output_features={
-                ACTION: PolicyFeature(FeatureType.ACTION, tuple(episodes.action.shape[1:]))
-            },
+            **state_features(*episodes.widths),
             device="cpu",
             push_to_hub=False,
         )
@@ -125,7 +94,7 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
         """The next action of the demonstrations chosen at the first step; then the last one."""
         if self._chosen is None:
-            self._chosen = self._distance(batch[ENVIRONMENT]).argmin(dim=1)
+            self._chosen = self._distance(batch[OBS_ENV_STATE]).argmin(dim=1)
         step = min(self._step, self.config.n_steps - 1)
         self._step += 1
         return self.actions[self._chosen, step]

@@ -11,19 +11,28 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from tpgmm_torch.exceptions import DataError
+
 __all__ = ["cell_table", "episode_table", "wilson", "write_table"]
 
 #: What identifies a cell, in the order of the columns.
 KEYS = ("env", "policy", "demonstrations", "seed", "condition")
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """The 95 % score interval of a proportion (Wilson, JASA 22, 1927).
+def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Score interval of a proportion (Wilson, JASA 22, 1927).
 
     Unlike the normal approximation it stays within [0, 1] and is not empty where all trials
     succeed or none.
+
+    Raises
+    ------
+    DataError
+        If there are no trials, or more successes than trials.
     """
-    interval = binomtest(successes, trials).proportion_ci(method="wilson")
+    if not 0 <= successes <= trials or trials == 0:
+        raise DataError(f"{successes} successes of {trials} trials are no proportion")
+    interval = binomtest(successes, trials).proportion_ci(confidence, "wilson")
     return float(interval.low), float(interval.high)
 
 
