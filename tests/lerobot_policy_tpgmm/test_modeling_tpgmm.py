@@ -1,10 +1,13 @@
 """What a policy does is what its model predicts, in every way that LeRobot asks for it."""
 
 import copy
+import logging
 
+import numpy as np
 import pytest
 import torch
 
+import lerobot_policy_tpgmm
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.policies import (
     ENVIRONMENT,
@@ -18,6 +21,7 @@ from tests.support.policies import (
 )
 from tests.support.skills import (
     HANDS,
+    bottle_model,
     canonical,
     cups,
     hands,
@@ -25,8 +29,8 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
-from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 STEPS = len(small_bottle().time_)
 
@@ -208,3 +212,29 @@ def test_a_gradient_can_follow_inference():
     frame = situations(batch())[0].frames["bottle"]
     model.step(0.0, model.kinematics_.state(joints), {"bottle": frame}).joints.sum().backward()
     assert joints.grad is not None
+
+
+# Estimators
+
+
+class Mine(Canonical):
+    """An operator of one's own."""
+
+
+def test_estimators_that_cannot_be_written_are_refused():
+    with pytest.raises(NotFittedError, match="call fit"):
+        TPGMMPolicy.from_estimator(bottle_model())
+    model = canonical(operators=[Mine()]).fit(waves())
+    with pytest.raises(ModelFileError, match="'Mine', which is not known here"):
+        TPGMMPolicy.from_estimator(model)
+
+
+def test_a_seed_that_is_no_number_is_left_out(caplog):
+    model = copy.copy(canonical().fit(waves())).set_params(
+        random_state=np.random.RandomState(0)
+    )
+    with caplog.at_level(logging.WARNING):
+        policy = TPGMMPolicy.from_estimator(model, chunk_size=4)
+    assert policy.config.random_state is None and policy.config.chunk_size == 4
+    assert not caplog.records
+    assert lerobot_policy_tpgmm.TPGMMConfig is type(policy.config)

@@ -2,8 +2,11 @@
 
 import copy
 from functools import cache
+from pathlib import Path
 
 import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_policy
 from torch import Tensor
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
@@ -59,3 +62,10 @@ def changed(given: TPGMMPolicy, **fields: object) -> TPGMMPolicy:
     other = TPGMMPolicy(config)
     other.load_state_dict(given.state_dict())
     return other.eval()
+
+
+def loaded(path: Path, *overrides: str, **more: object) -> TPGMMPolicy:
+    """As LeRobot's commands load a policy."""
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=list(overrides))
+    config.pretrained_path = path
+    return make_policy(config, **more)

@@ -6,14 +6,11 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from lerobot_policy_tpgmm.evaluation import compare as module
 from lerobot_policy_tpgmm.evaluation import jobs
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.compare import Comparison, compare
-from lerobot_policy_tpgmm.evaluation.report.report import write_report
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from tests.support.command_line import output, refusal, run
 
 SETTINGS = Settings(
     options={"mode": "kinematic"},
@@ -113,30 +110,3 @@ def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatc
     runner = Runner.load(tmp_path / "policies" / cell.training)
     width = runner.policy.config.env_state_feature.shape[0]
     assert width == (40 if "phase" in policy else 7)
-
-
-def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
-    text = output("compare", "--help")
-    for word in ("--budget", "--conditions", "full grid", "lerobot-eval", "diffusion-phase"):
-        assert word in " ".join(text.split())
-    out = ("--out", tmp_path / "out")
-    assert "policy 'bc' is not in the comparison" in refusal(
-        "compare", "--policies", "bc", *out
-    )
-    assert "numbers like 5,10,25" in refusal("compare", "--demonstrations", "5;6", *out)
-    assert "disturbance 'rain'" in refusal("compare", "--conditions", "rain", *out)
-    result = run("compare", "--demonstrations", "101", *out)
-    assert result.exit_code == 2
-    assert "offers 100 demonstrations" in result.stderr
-
-
-def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "compare", lambda *_: Comparison(1, {TPGMM: "bad luck"}))
-    result = run("compare", "--out", tmp_path)
-    assert result.exit_code == 1
-    assert "1 cells failed" in result.stderr
-
-
-def test_a_report_names_the_cells_that_failed(tmp_path):
-    path = write_report(tmp_path, SETTINGS, [], {TPGMM: "bad luck"}, "")
-    assert f"- `{TPGMM.key}`: bad luck" in path.read_text()

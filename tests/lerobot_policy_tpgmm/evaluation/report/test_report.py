@@ -1,93 +1,14 @@
-"""The report, tables and pictures from given results."""
+"""The report and its pictures, from given results."""
 
-import json
-
-import numpy as np
 import pandas as pd
 import pytest
 
 from lerobot_policy_tpgmm.evaluation.cells import Cell
 from lerobot_policy_tpgmm.evaluation.report.report import write_report
-from lerobot_policy_tpgmm.evaluation.report.tables import cell_table, episode_table
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from tests.support.comparison import RESULTS, result
 
-LATENCIES = ("step_median_ms", "step_p99_ms", "chunk_median_ms", "chunk_p99_ms")
 SETTINGS = Settings(episodes=20, budget=120.0)
-
-
-def result(policy, count, successes, condition="nominal", curve=(), outcome="learned", seed=0):
-    rng = np.random.default_rng(count)
-    episodes = [
-        {
-            "seed": 100 + i,
-            "success": i < successes,
-            "grasp_mm": 1.0 if i < successes else float("inf"),
-            "grasp_deg": float(rng.uniform(0, 4)),
-            "lift_mm": 80.0,
-            "frequency_error": 0.01,
-            "amplitude_error": 0.3 if i % 2 else 0.1,
-        }
-        for i in range(20)
-    ]
-    return {
-        "cell": vars(Cell("bottle_shaking", policy, count, seed, condition)),
-        "settings": {"env": "bottle_shaking", "options": {}, "demonstration_seed": 0},
-        "training": {
-            "fps": 10,
-            "seconds": 12.0,
-            "parameters": 1234567,
-            "bytes": 5e6,
-            "outcome": outcome,
-            "recipe": {"check_every": 200},
-            "curve": list(curve),
-        },
-        "evaluation_seconds": 3.0,
-        "latency": {
-            "chunk_size": 8.0,
-            **dict.fromkeys(LATENCIES, 0.5),
-        },
-        "episodes": episodes,
-        "versions": {"torch": "1"},
-        "machine": {"processors": 2},
-    }
-
-
-def curve(*errors):
-    return [
-        {
-            "step": 200 * (i + 1),
-            "seconds": 10.0 * (i + 1),
-            "train_loss": 0.5 / (i + 1),
-            "validation_loss": 0.6 / (i + 1),
-            "validation_error": error,
-        }
-        for i, error in enumerate(errors)
-    ]
-
-
-BUDGET = "the budget of 2 min was used up"
-RESULTS = [
-    result("nearest", 5, 0),
-    result("tpgmm", 5, 20),
-    result("act", 5, 0, curve=curve(0.03, 0.02, 0.025), outcome="it stopped falling"),
-    result("tpgmm", 10, 20),
-    result("tpgmm", 10, 17, condition="pushes+noise"),
-    result("act", 10, 18, curve=curve(0.03, 0.01), outcome=BUDGET),
-]
-
-
-def test_tables_have_a_row_for_each_cell_and_each_episode():
-    cells, episodes = cell_table(RESULTS), episode_table(RESULTS)
-    assert len(cells) == 6
-    assert len(episodes) == 120
-    row = cells.iloc[5]
-    assert (row.policy, row.demonstrations, row.successes, row.success) == ("act", 10, 18, 0.9)
-    # Wilson's interval of 18 of 20
-    assert (row.success_low, row.success_high) == pytest.approx((0.699, 0.972), abs=1e-3)
-    assert row.grasp_mm_median == 1.0
-    assert row.grasp_mm_p95 == np.inf
-    assert json.loads(row.versions) == {"torch": "1"}
-    assert {"seed", "training_seed", "condition", "lift_mm"} <= set(episodes.columns)
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +59,9 @@ def test_several_seeds_are_taken_together(tmp_path):
     text = write_report(tmp_path, SETTINGS, results, {}, "").read_text()
     assert "| tpgmm | 30/40 = 75 % (" in text
     assert "Episodes of 2 training seeds are taken together" in text
+
+
+def test_a_report_names_the_cells_that_failed(tmp_path):
+    failed = Cell("bottle_shaking", "tpgmm", 3, 0)
+    path = write_report(tmp_path, SETTINGS, [], {failed: "bad luck"}, "")
+    assert f"- `{failed.key}`: bad luck" in path.read_text()

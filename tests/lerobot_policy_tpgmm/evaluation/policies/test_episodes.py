@@ -1,17 +1,11 @@
 """Episodes in memory, the windows drawn from them, and the time as an observation."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
-from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_policy_tpgmm.evaluation.policies.elapsed_time import ElapsedTimeStep, time_features
-from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
-from lerobot_policy_tpgmm.evaluation.policies.replay import NearestPolicy
-from lerobot_policy_tpgmm.evaluation.policies.windows import Windows
+from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes, Windows
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError
@@ -26,6 +20,10 @@ def numbered(*lengths):
         rows = 100.0 * number + torch.arange(length)[:, None]
         parts.append((rows, rows + 0.25, rows + 0.5))
     return Episodes.join(FPS, parts)
+
+
+def windowed(episodes, *arguments):
+    return Windows(episodes.columns, episodes.bounds, *arguments)
 
 
 def test_episodes_are_read_as_they_were_written(tmp_path):
@@ -48,13 +46,13 @@ def test_episodes_are_read_as_they_were_written(tmp_path):
         pose = torch.cat((motion.frame("bottle").position, torch.tensor([1.0, 0, 0, 0])))
         torch.testing.assert_close(environment, pose.float().expand(len(state), -1))
     assert episodes.first(2).bounds == (0, 12, 27)
-    assert len(episodes.first(2).state) == 27
+    assert len(episodes.first(2).columns[OBS_STATE]) == 27
     with pytest.raises(DataError, match="4 episodes are asked for, there are 3"):
         episodes.first(4)
 
 
 def test_windows_stay_in_their_episode_at_the_lower_rate():
-    windows = Windows(numbered(8, 6), 2, [-1, 0], [0, 1, 2])
+    windows = windowed(numbered(8, 6), 2, [-1, 0], [0, 1, 2])
     assert len(windows) == 14
     batch = windows.at(torch.tensor([0, 5, 8, 11]))
     # two steps, of two rows each, are seen
@@ -77,7 +75,7 @@ def test_windows_stay_in_their_episode_at_the_lower_rate():
 
 
 def test_without_a_history_observations_have_no_time_axis():
-    batch = Windows(numbered(8), 4, None, [0]).at(torch.tensor([3]))
+    batch = windowed(numbered(8), 4, None, [0]).at(torch.tensor([3]))
     assert batch[OBS_STATE].shape == (1, 1)
     assert batch[ACTION].tolist() == [[[6.5]]]
 
@@ -97,54 +95,8 @@ def test_the_common_clock_removes_differences_in_time():
     cosines = torch.stack([state[:, 1] for state, _, _ in (*training, *validation)])
     assert (cosines.max(0).values - cosines.min(0).values).max() < 0.1
     assert [float(rows[0, 0]) for _, rows, _ in training] == pytest.approx([1.0, 1.1, 0.9])
-    torch.testing.assert_close(training.action, training.state + 0.01, atol=1e-5, rtol=0)
+    state, action = training.columns[OBS_STATE], training.columns[ACTION]
+    torch.testing.assert_close(action, state + 0.01, atol=1e-5, rtol=0)
     assert training.elapsed()[: max(lengths)].tolist() == pytest.approx(
         [i / FPS for i in range(max(lengths))]
     )
-
-
-def test_the_elapsed_time_joins_the_environment_and_begins_anew():
-    step = ElapsedTimeStep(fps=10)
-    observation = {OBS_ENV_STATE: torch.zeros(2, 7), OBS_STATE: torch.zeros(2, 3)}
-    seen = [step.observation(dict(observation))[OBS_ENV_STATE] for _ in range(3)]
-    assert [float(x[1, 7]) for x in seen] == pytest.approx([0.0, 0.1, 0.2])
-    torch.testing.assert_close(seen[2][0, 7:], time_features(torch.tensor(0.2)))
-    assert float(time_features(torch.tensor(4.0))[1]) == pytest.approx(math.sin(math.pi / 2))
-    step.reset()
-    assert float(step.observation(dict(observation))[OBS_ENV_STATE][0, 7]) == 0.0
-    assert ElapsedTimeStep(**step.get_config()) == ElapsedTimeStep(fps=10)
-    features = {
-        PipelineFeatureType.OBSERVATION: {OBS_ENV_STATE: PolicyFeature(FeatureType.ENV, (7,))}
-    }
-    grown = step.transform_features(features)[PipelineFeatureType.OBSERVATION]
-    assert grown[OBS_ENV_STATE].shape == seen[0].shape[1:]
-
-
-def test_the_nearest_demonstration_is_replayed_to_its_end(tmp_path):
-    def pose(x, degrees):
-        half = math.radians(degrees) / 2
-        return torch.tensor([x, 0, 0, math.cos(half), 0, 0, math.sin(half)])
-
-    kept = [(0.0, 0), (0.1, 0), (0.0, 90)]
-    parts = [
-        (
-            torch.zeros(3 + i, 2),
-            pose(*at).expand(3 + i, -1),
-            (10.0 * i + torch.arange(3 + i))[:, None].expand(-1, 2),
-        )
-        for i, at in enumerate(kept)
-    ]
-    NearestPolicy.fit(Episodes.join(FPS, parts)).save_pretrained(tmp_path)
-    policy = NearestPolicy.from_pretrained(tmp_path)
-    # a quaternion and its negative are one orientation
-    given = torch.stack((pose(0.09, 10), -pose(0.02, 70), pose(0.01, -5)))
-    given[1, 0] = 0.02
-    batch = {OBS_ENV_STATE: given, OBS_STATE: torch.zeros(3, 2)}
-    taken = torch.stack([policy.select_action(batch)[:, 0] for _ in range(6)])
-    assert taken.T.tolist() == [
-        [10, 11, 12, 13, 13, 13],
-        [20, 21, 22, 23, 24, 24],
-        [0, 1, 2, 2, 2, 2],
-    ]
-    policy.reset()
-    assert policy.select_action(batch)[:, 0].tolist() == [10, 20, 0]

@@ -1,0 +1,32 @@
+"""``tpgmm compare`` as it is called."""
+
+from lerobot_policy_tpgmm.evaluation import compare as module
+from lerobot_policy_tpgmm.evaluation.cells import Cell
+from lerobot_policy_tpgmm.evaluation.compare import Comparison
+from tests.support.command_line import output, refusal, run
+
+
+def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
+    text = output("compare", "--help")
+    for word in ("--budget", "--conditions", "full grid", "lerobot-eval", "diffusion-phase"):
+        assert word in " ".join(text.split())
+    out = ("--out", tmp_path / "out")
+    assert "policy 'bc' is not in the comparison" in refusal(
+        "compare", "--policies", "bc", *out
+    )
+    assert "numbers like 5,10,25" in refusal("compare", "--demonstrations", "5;6", *out)
+    assert "disturbance 'rain'" in refusal("compare", "--conditions", "rain", *out)
+    result = run("compare", "--demonstrations", "101", *out)
+    assert result.exit_code == 2
+    assert "offers 100 demonstrations" in result.stderr
+
+
+def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        module,
+        "compare",
+        lambda *_: Comparison(1, {Cell("bottle_shaking", "tpgmm", 3, 0): "bad luck"}),
+    )
+    result = run("compare", "--out", tmp_path)
+    assert result.exit_code == 1
+    assert "1 cells failed" in result.stderr

@@ -1,0 +1,75 @@
+"""What ``config.json`` holds: defaults, overrides, and values that are refused."""
+
+import inspect
+
+import pytest
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.envs.factory import make_env_config
+from lerobot.policies.factory import make_policy
+
+from lerobot_policy_tpgmm.configuration_tpgmm import HYPERPARAMETERS, TPGMMConfig
+from tests.support.policies import loaded
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError
+
+
+def test_what_the_estimator_defaults_to_is_the_default():
+    parameters = inspect.signature(TaskParameterizedGMM).parameters
+    config = TPGMMConfig(device="cpu")
+    left_out = {"operators", "robot", "warm_start", "device", "verbose"}
+    assert set(HYPERPARAMETERS) == set(parameters) - left_out
+    for name in HYPERPARAMETERS:
+        assert getattr(config, name) == parameters[name].default
+
+
+def test_every_field_is_explained():
+    for name in vars(TPGMMConfig(device="cpu")).keys() - vars(PreTrainedConfig).keys():
+        if name not in PreTrainedConfig.__dataclass_fields__:
+            assert name in TPGMMConfig.__doc__ or name == "normalization_mapping", name
+
+
+def test_fields_can_be_overridden(saved):
+    policy = loaded(
+        saved,
+        "--control_fps=50",
+        "--units=deg",
+        "--default_environment_state=[0, 0, 0, 1, 0, 0, 0]",
+        "--largest_start_gap=null",
+        '--frames={"bottle": [0, 1, 2, 3, 4, 5, 6]}',
+        "--feedback=observation",
+        env_cfg=make_env_config("bottle_shaking"),
+    )
+    assert policy.config.rate == 50 and policy.config.largest_start_gap is None
+    assert policy.config.units == "deg" and policy.config.feedback == "observation"
+    assert policy.frames.default.tolist() == [0, 0, 0, 1, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("feedback", "velocity"),
+        ("loss", "hinge"),
+        ("alignment", "guess"),
+        ("fusion", "sum"),
+        ("n_components", 0),
+        ("control_fps", 0.0),
+        ("fps", float("nan")),
+        ("chunk_size", 0),
+        ("dtype", "bfloat16"),
+        ("normalization_mapping", {"STATE": NormalizationMode.MEAN_STD}),
+    ],
+)
+def test_a_value_that_is_none_is_refused(field, value):
+    with pytest.raises((ValueError, TypeError), match=field):
+        TPGMMConfig(device="cpu", **{field: value})
+
+
+def test_a_policy_without_anything_to_learn_from_is_refused():
+    config = TPGMMConfig(device="cpu")
+    with pytest.raises(DataError, match=r"--dataset.root"):
+        make_policy(config, env_cfg=make_env_config("bottle_shaking"))
+    config.input_features = {"observation.image": PolicyFeature(FeatureType.VISUAL, (3, 8, 8))}
+    with pytest.raises(DataError, match=r"needs observation.state; there are \['action'"):
+        config.validate_features()
+    with pytest.raises(DataError, match="does not know its rate"):
+        _ = config.rate

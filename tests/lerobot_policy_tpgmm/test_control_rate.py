@@ -1,0 +1,42 @@
+"""The rate at which an environment takes actions, and whether a policy gives as many."""
+
+import pytest
+import torch
+from lerobot.envs.factory import make_env_config
+
+from lerobot_policy_tpgmm.control_rate import CONTROL_RATE, check_rate, rate_processors
+from tests.support.policies import act, batch, changed, fitted
+from tpgmm_torch.exceptions import DataError
+
+
+def telling(rate):
+    return {CONTROL_RATE: torch.full((2, 1), float(rate))}
+
+
+def test_environments_tell_their_rate():
+    told, after = rate_processors(50)
+    assert told(batch())[CONTROL_RATE].tolist() == [[50.0], [50.0]]
+    assert not after.steps
+    before, _ = make_env_config("bottle_shaking", fps=25).get_env_processors()
+    assert before(batch())[CONTROL_RATE][0, 0] == 25
+
+
+@pytest.mark.parametrize("told", [100, 99.95, 100.05])
+def test_the_same_rate_is_accepted(told):
+    check_rate(telling(told), 100.0)
+    check_rate({}, 100.0)  # most environments do not tell
+
+
+@pytest.mark.parametrize("told", [50, 99, 99.8, 100.2, 101, 150, 199, 200])
+def test_another_rate_is_refused(told):
+    message = rf"takes {told:g} actions per second, the policy gives 100: --policy.control_fps="
+    with pytest.raises(DataError, match=message):
+        check_rate(telling(told), 100.0)
+
+
+def test_a_policy_looks_at_it():
+    told, _ = rate_processors(50)
+    with pytest.raises(DataError, match=r"takes 50 actions per second, the policy gives 2.\d+"):
+        act(fitted(), told(batch()), 1)
+    same = changed(fitted(), control_fps=50.0)
+    assert torch.equal(act(same, told(batch()), 3), act(same, batch(), 3))

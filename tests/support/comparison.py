@@ -1,0 +1,68 @@
+"""Results of a comparison that nobody ran."""
+
+import numpy as np
+
+from lerobot_policy_tpgmm.evaluation.cells import Cell
+
+LATENCIES = ("step_median_ms", "step_p99_ms", "chunk_median_ms", "chunk_p99_ms")
+
+
+def result(policy, count, successes, condition="nominal", curve=(), outcome="learned", seed=0):
+    rng = np.random.default_rng(count)
+    episodes = [
+        {
+            "seed": 100 + i,
+            "success": i < successes,
+            "grasp_mm": 1.0 if i < successes else float("inf"),
+            "grasp_deg": float(rng.uniform(0, 4)),
+            "lift_mm": 80.0,
+            "frequency_error": 0.01,
+            "amplitude_error": 0.3 if i % 2 else 0.1,
+        }
+        for i in range(20)
+    ]
+    return {
+        "cell": vars(Cell("bottle_shaking", policy, count, seed, condition)),
+        "settings": {"env": "bottle_shaking", "options": {}, "demonstration_seed": 0},
+        "training": {
+            "fps": 10,
+            "seconds": 12.0,
+            "parameters": 1234567,
+            "bytes": 5e6,
+            "outcome": outcome,
+            "recipe": {"check_every": 200},
+            "curve": list(curve),
+        },
+        "evaluation_seconds": 3.0,
+        "latency": {
+            "chunk_size": 8.0,
+            **dict.fromkeys(LATENCIES, 0.5),
+        },
+        "episodes": episodes,
+        "versions": {"torch": "1"},
+        "machine": {"processors": 2},
+    }
+
+
+def curve(*errors):
+    return [
+        {
+            "step": 200 * (i + 1),
+            "seconds": 10.0 * (i + 1),
+            "train_loss": 0.5 / (i + 1),
+            "validation_loss": 0.6 / (i + 1),
+            "validation_error": error,
+        }
+        for i, error in enumerate(errors)
+    ]
+
+
+BUDGET = "the budget of 2 min was used up"
+RESULTS = [
+    result("nearest", 5, 0),
+    result("tpgmm", 5, 20),
+    result("act", 5, 0, curve=curve(0.03, 0.02, 0.025), outcome="it stopped falling"),
+    result("tpgmm", 10, 20),
+    result("tpgmm", 10, 17, condition="pushes+noise"),
+    result("act", 10, 18, curve=curve(0.03, 0.01), outcome=BUDGET),
+]
