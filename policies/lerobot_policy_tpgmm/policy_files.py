@@ -2,44 +2,38 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import ModelFileError
-
-if TYPE_CHECKING:
-    from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 
 __all__ = ["read_tensors", "write_files"]
 
 
 def write_files(config: TPGMMConfig, tensors: Mapping[str, Tensor], directory: Path) -> None:
-    """Write configuration, numbers and both processors; each file in one step.
+    """Write configuration, numbers and both processors, all in one step.
 
     Parameters
     ----------
     tensors : mapping of str to Tensor
         The policy's ``state_dict``.
     directory : Path
-        It exists; other files in it stay.
+        Other files in it stay.
     """
-    with tempfile.TemporaryDirectory(prefix=".saving-", dir=directory) as name:
-        staging = Path(name)
-        config._save_pretrained(staging)
+    with replacing(directory.resolve(), keep=True) as folder:
+        config.save_pretrained(folder)
         blob = save({k: v.detach().cpu().contiguous() for k, v in tensors.items()})
-        (staging / SAFETENSORS_SINGLE_FILE).write_bytes(blob)
+        (folder / SAFETENSORS_SINGLE_FILE).write_bytes(blob)
         for processor in make_tpgmm_pre_post_processors(config):
-            processor.save_pretrained(staging)
-        for path in staging.iterdir():
-            path.replace(directory / path.name)
+            processor.save_pretrained(folder)
 
 
 def read_tensors(file: str, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
+from lerobot_policy_tpgmm import policy_files
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_metadata import dataset
 from tests.support.policies import STATE, act, batch, changed, fitted, loaded
@@ -61,6 +62,27 @@ def test_saving_twice_replaces(directory):
     other.save_pretrained(directory)
     assert {path.name for path in directory.iterdir()} == FILES
     assert TPGMMPolicy.from_pretrained(directory).config.chunk_size == 3
+
+
+def test_an_interrupted_save_leaves_what_was_there(directory, monkeypatch):
+    (directory / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in directory.iterdir()}
+    other = changed(fitted(), chunk_size=3)
+    with torch.no_grad():
+        other.mixture.logits.zero_()
+
+    def stop(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:  # when settings and numbers are written
+        patch.setattr(policy_files, "make_tpgmm_pre_post_processors", stop)
+        with pytest.raises(KeyboardInterrupt):
+            other.save_pretrained(directory)
+    assert {path.name: path.read_bytes() for path in directory.iterdir()} == before
+    assert [path.name for path in directory.parent.iterdir()] == [directory.name]
+    other.save_pretrained(directory)
+    assert TPGMMPolicy.from_pretrained(directory).config.chunk_size == 3
+    assert (directory / "notes.txt").read_text() == "mine"
 
 
 def test_the_pipelines_around_it_change_nothing(saved):

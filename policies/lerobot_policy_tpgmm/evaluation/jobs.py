@@ -25,6 +25,7 @@ from lerobot_policy_tpgmm.evaluation.policies.tpgmm import fit_tpgmm
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["POLICIES", "record", "run"]
@@ -106,29 +107,22 @@ def machine() -> dict[str, Any]:
 
 def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> None:
     """Write the pretrained directory in one step."""
-    partial = directory.with_name(f".{directory.name}.partial")
-    for rest in (partial, directory):  # of a run that was killed
-        shutil.rmtree(rest, ignore_errors=True)
     began = time.process_time()
     trained = _trainer(cell.policy)(folder / "episodes", settings, cell)
     seconds = time.process_time() - began
-    try:
+    with replacing(directory) as new:
         for part in (trained.policy, *trained.processors):
-            part.save_pretrained(partial)
-        size = sum(path.stat().st_size for path in partial.iterdir())
+            part.save_pretrained(new)
         description = {
             "fps": trained.fps,
             "seconds": seconds,
             "parameters": sum(p.numel() for p in trained.policy.parameters()),
-            "bytes": size,
+            "bytes": sum(path.stat().st_size for path in new.iterdir()),
             "outcome": trained.outcome,
             "recipe": trained.recipe,
             "curve": trained.curve,
         }
-        write_json(partial / RECORD, description)
-        partial.rename(directory)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        write_json(new / RECORD, description)
 
 
 def _trainer(name: str) -> Callable[[Path, Settings, Cell], Training]:

@@ -23,6 +23,7 @@ from lerobot_policy_tpgmm.evaluation.report.tables import (
     write_table,
 )
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from tpgmm_torch.atomic import replacing
 
 __all__ = ["write_report"]
 
@@ -79,9 +80,8 @@ def write_report(
     if commands:
         paragraphs += ["## Commands", "\n".join(("```", *commands, "```"))]
     path = out / "report.md"
-    partial = path.with_name(".report.md.partial")
-    partial.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
-    partial.replace(path)
+    with replacing(path) as file:
+        file.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
     return path
 
 

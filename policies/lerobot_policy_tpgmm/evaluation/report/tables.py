@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["cell_table", "episode_table", "wilson", "write_table"]
@@ -108,14 +109,7 @@ def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
-    """Write a table as parquet and as CSV, each in one step.
-
-    Parameters
-    ----------
-    path : Path
-        Without suffix.
-    """
+    """Write a table as ``PATH.parquet`` and ``PATH.csv``, each in one step."""
     for suffix, write in ((".parquet", table.to_parquet), (".csv", table.to_csv)):
-        partial = path.with_name(f".{path.name}{suffix}.partial")
-        write(partial, index=False)
-        partial.replace(path.with_suffix(suffix))
+        with replacing(path.with_suffix(suffix)) as file:
+            write(file, index=False)
