@@ -241,6 +241,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.device = device
         self.verbose = verbose
 
+    def check_parameters(self) -> None:
+        """Check types and ranges of the parameters, as :meth:`fit` does before it begins.
+
+        Raises
+        ------
+        InvalidParameterError
+            If one is not allowed.
+        """
+        self._validate_params()
+
     def fit(
         self,
         X: Iterable[Demonstration] | Iterable[Sequence[Demonstration]],

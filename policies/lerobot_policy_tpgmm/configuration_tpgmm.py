@@ -212,7 +212,7 @@ class TPGMMConfig(StatePolicyConfig):
                 "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
                 f"got {self.normalization_mapping}"
             )
-        self.estimator(None, ())._validate_params()
+        self.estimator(None, ()).check_parameters()
 
     @property
     def rate(self) -> float:

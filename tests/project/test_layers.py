@@ -206,6 +206,39 @@ def test_no_private_name_is_used_across_packages():
     assert not wrong, "\n".join(wrong)
 
 
+def private_names(tree: ast.AST) -> Iterator[str]:
+    """Those that a module defines: functions, classes, variables, fields, attributes."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+                yield name
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name
+
+
+def private_uses(tree: ast.AST) -> Iterator[tuple[str, str]]:
+    """Objects other than ``self`` and the like, and an underscored attribute of theirs."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and re.match(r"_(?!_)", node.attr):
+            target = ast.unparse(node.value)
+            if target not in ("self", "cls", "super()"):
+                yield target, node.attr
+
+
+@pytest.mark.parametrize("package", ["tpgmm_datasets", "lerobot_policy_tpgmm"])
+def test_no_private_attribute_of_another_package_is_used(package):
+    trees = SOURCES[package]
+    ours = {name for tree in trees.values() for name in private_names(tree)}
+    ours |= {"_asdict", "_replace", "_exit"}  # public, of named tuples and ``os``
+    wrong = [
+        f"{module} uses {target}.{name}"
+        for module, tree in trees.items()
+        for target, name in private_uses(tree)
+        if name not in ours
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
 def test_optional_packages_are_not_imported_at_module_level():
     wrong = [
         f"{module} imports {name} at module level; do it in the function that needs it"
