@@ -289,8 +289,8 @@ class TPGMMConfig(StatePolicyConfig):
             (ACTION, self.action_feature),
         ):
             if feature is None:
-                known = sorted({**(self.input_features or {}), **(self.output_features or {})})
-                raise DataError(f"a tpgmm policy needs {key}; there are {known}")
+                there = sorted({**(self.input_features or {}), **(self.output_features or {})})
+                raise DataError(f"a tpgmm policy needs {key}; there are {there}")
 
     def get_optimizer_preset(self) -> AdamConfig:
         """Adam, without weight decay."""

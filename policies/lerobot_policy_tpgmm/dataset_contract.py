@@ -71,11 +71,11 @@ def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
         If names, order or rate differ.
     """
     for key, field in NAMES.items():
-        own, found = getattr(config, field), _names(dataset.features, key)
-        if own and found and list(own) != found:
+        expected, names = getattr(config, field), _names(dataset.features, key)
+        if expected and names and list(expected) != names:
             raise DataError(
-                f"{key} of the data set has the entries {found}, the policy was made for "
-                f"{list(own)}. If they are the same joints in another order or spelling, "
+                f"{key} of the data set has the entries {names}, the policy was made for "
+                f"{list(expected)}. If they are the same joints in another order or spelling, "
                 f"--policy.{field}='[...]' says so; else fit a policy to this data set"
             )
     _check_rate(config, dataset)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -106,11 +106,13 @@ class MixtureParameters(nn.Module):
         """
         if not hasattr(model, "weights_"):
             raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
-        own, given = self._shapes(self.means), self._shapes(model.means_)
-        if own != given:
+        shapes, given = (
+            [tuple(m.shape) for m in means] for means in (self.means, model.means_)
+        )
+        if shapes != given:
             raise ShapeError(
                 f"the model has means of shapes {given} (components, 1 + local coordinates), "
-                f"the policy's configuration asks for {own}: make both with the same "
+                f"the policy's configuration asks for {shapes}: make both with the same "
                 "n_components and operators"
             )
         # a weight that underflowed to zero would be an infinite logit
@@ -159,7 +161,3 @@ class MixtureParameters(nn.Module):
         return TaskParameterizedGMM.from_parameters(
             weights, copies, covariances, time, **settings
         )
-
-    @staticmethod
-    def _shapes(means: Iterable[Tensor]) -> list[tuple[int, ...]]:
-        return [tuple(mean.shape) for mean in means]

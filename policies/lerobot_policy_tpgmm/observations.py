@@ -72,7 +72,9 @@ class JointFeatures(nn.Module):
                 f"{list(joint_names)}. Learn them too; what moves no link of the URDF, like a "
                 "gripper, is one of the robot's coordinates"
             )
-        _check_units(units, {*state_names, *action_names, *joint_names})
+        names = {*state_names, *action_names, *joint_names}
+        if isinstance(units, Mapping) and (unknown := sorted(set(units) - names)):
+            raise DataError(f"units are given for {unknown}; the joints are {sorted(names)}")
         entry = {joint: name for name, joint in in_state.items()}
         state = [_scale(units, entry[joint], joint) for joint in joint_names]
         action = [_scale(units, name, in_action[name]) for name in action_names]
@@ -156,8 +158,10 @@ class FrameFeatures:
         for index, name in enumerate(frame_names):
             environment, state = named.get(name), stated.get(name)
             if places and name in places:
-                environment, own = _placed(name, places[name], environment_names, state_names)
-                state = own or state
+                environment, placed = _placed(
+                    name, places[name], environment_names, state_names
+                )
+                state = placed or state
             elif environment is None and not environment_names:
                 environment = [*range(POSE * index, POSE * (index + 1))]
             if environment is not None:
@@ -222,12 +226,6 @@ class FrameFeatures:
             return Frame(values[:, :3], values[:, 3:])
         except DataError as error:
             raise DataError(f"frame {name!r}: {error}") from error
-
-
-def _check_units(units: Any, known: set[str]) -> None:
-    unknown = sorted(set(units) - known) if isinstance(units, Mapping) else []
-    if unknown:
-        raise DataError(f"units are given for {unknown}; the joints are {sorted(known)}")
 
 
 def _scale(units: Any, name: str, joint: str) -> Scale:

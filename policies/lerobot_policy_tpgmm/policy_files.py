@@ -58,12 +58,12 @@ def read_tensors(file: str, expected: Mapping[str, Tensor]) -> dict[str, Tensor]
         tensors = load_file(file)
     except (OSError, SafetensorError) as error:
         raise ModelFileError(f"{file} cannot be read: {error}") from error
+    read = {name: _signature(tensor) for name, tensor in tensors.items()}
     wanted = {name: _signature(tensor) for name, tensor in expected.items()}
-    found = {name: _signature(tensor) for name, tensor in tensors.items()}
     wrong = [
-        f"{name} is {found.get(name, 'missing')}, expected {wanted.get(name, 'nothing')}"
-        for name in sorted({*wanted, *found})
-        if wanted.get(name) != found.get(name)
+        f"{name} is {read.get(name, 'missing')}, expected {wanted.get(name, 'nothing')}"
+        for name in sorted(read.keys() | wanted.keys())
+        if read.get(name) != wanted.get(name)
     ]
     if wrong:
         raise ModelFileError(

@@ -13,9 +13,10 @@ def lerobot(command: str, *arguments: object, home: Path) -> subprocess.Complete
     metadata = home / "lerobot_robot_bimanual-0.dist-info" / "METADATA"
     metadata.parent.mkdir(parents=True, exist_ok=True)
     metadata.write_text("Metadata-Version: 2.1\nName: lerobot_robot_bimanual\nVersion: 0\n")
+    path = os.environ.get("PYTHONPATH", "")
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join(map(str, (PLUGINS, home))),
+        "PYTHONPATH": os.pathsep.join(filter(None, (str(PLUGINS), str(home), path))),
         "HF_HOME": str(home / "huggingface"),
         "HF_HUB_OFFLINE": "1",
         "OMP_NUM_THREADS": "1",

@@ -92,13 +92,7 @@ class Benchmark(ABC):
 
 
 class BottleBenchmark(Benchmark):
-    """Reach a bottle with both hands, grasp it, bring it, shake it.
-
-    Parameters
-    ----------
-    rate, options
-        As for :class:`Benchmark`.
-    """
+    """Reach a bottle with both hands, grasp it, bring it, shake it."""
 
     env = "bottle_shaking"
     default_rate = 100
@@ -184,13 +178,7 @@ def _references(motion: Demonstration) -> torch.Tensor:
 
 
 class AlohaBenchmark(Benchmark):
-    """gym-aloha's cube transfer, demonstrated by a scripted expert.
-
-    Parameters
-    ----------
-    rate, options
-        As for :class:`Benchmark`.
-    """
+    """gym-aloha's cube transfer, demonstrated by a scripted expert."""
 
     env = "aloha_state"
     fixed: ClassVar = {"task": "transfer_cube"}
@@ -222,13 +210,7 @@ class AlohaBenchmark(Benchmark):
 
 
 class AlohaInsertionBenchmark(AlohaBenchmark):
-    """gym-aloha's insertion of a peg into a socket.
-
-    Parameters
-    ----------
-    rate, options
-        As for :class:`Benchmark`.
-    """
+    """gym-aloha's insertion of a peg into a socket."""
 
     fixed: ClassVar = {"task": "insertion"}
 

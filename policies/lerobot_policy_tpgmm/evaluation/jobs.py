@@ -49,8 +49,8 @@ def record(folder: Path, settings: Settings, n: int) -> None:
     place = folder / "episodes"
     summary = place / "summary.json"
     if summary.exists():
-        known = json.loads(summary.read_text(encoding="utf-8"))
-        if len(known["successes"]) >= n:
+        recorded = json.loads(summary.read_text(encoding="utf-8"))["successes"]
+        if len(recorded) >= n:
             return
     shutil.rmtree(place, ignore_errors=True)
     benchmark = settings.benchmark()

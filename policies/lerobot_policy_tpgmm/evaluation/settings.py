@@ -73,12 +73,12 @@ class Settings:
             If the environment has no such disturbance.
         """
         benchmark = self.benchmark()
-        known, options = benchmark.disturbances, benchmark.options
+        disturbances, options = benchmark.disturbances, benchmark.options
         for name in () if condition == NOMINAL else condition.split("+"):
-            if name not in known:
+            if name not in disturbances:
                 where = f"the conditions of {self.env}"
-                raise UnknownNameError("disturbance", name, where, {NOMINAL, *known})
-            options = {**options, **known[name]}
+                raise UnknownNameError("disturbance", name, where, {NOMINAL, *disturbances})
+            options = {**options, **disturbances[name]}
         return options
 
     def keep(self, path: Path) -> None:
@@ -89,20 +89,21 @@ class Settings:
         DataError
             If the file belongs to a comparison with other settings.
         """
-        own = asdict(self)
+        now = asdict(self)
         if not path.exists():
-            write_json(path, own)
+            write_json(path, now)
             return
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
+            before = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise DataError(f"{path} is not JSON: {error}") from error
-        differ = [key for key in {**own, **found} if own.get(key) != found.get(key)]
-        if differ:
+        changes = [
+            f"{key} was {before.get(key)!r}, now {now.get(key)!r}"
+            for key in {**now, **before}
+            if now.get(key) != before.get(key)
+        ]
+        if changes:
             raise DataError(
-                f"{path.parent} holds results with other settings: "
-                + "; ".join(
-                    f"{key} was {found.get(key)!r}, now {own.get(key)!r}" for key in differ
-                )
-                + ". Take another folder, or the settings of before"
+                f"{path.parent} holds results with other settings: {'; '.join(changes)}. Take "
+                "another folder, or the settings of before"
             )

@@ -73,8 +73,8 @@ class Clock:
             return steps.double() / self.fps
         time = torch.empty(len(steps), dtype=torch.float64)
         for episode in episodes.unique().tolist():
-            mine = episodes == episode
+            rows = episodes == episode
             evenly = np.linspace(0, self.lengths[episode] - 1, len(self.grid))
             path = self.paths.get(episode, evenly)
-            time[mine] = torch.from_numpy(np.interp(steps[mine].numpy(), path, self.grid))
+            time[rows] = torch.from_numpy(np.interp(steps[rows].numpy(), path, self.grid))
         return time

@@ -105,10 +105,10 @@ class RecordedEpisode:
         DataError
             If a frame that was there has other values.
         """
-        again = self.seen[steps]
+        repeated = self.seen[steps]
         for key, column in columns.items():
-            other = (self.columns[key][steps] != column).reshape(len(steps), -1).any(1)
-            changed = again & other
+            differs = (self.columns[key][steps] != column).reshape(len(steps), -1).any(1)
+            changed = repeated & differs
             if changed.any():
                 raise DataError(
                     f"{key} of frame {int(steps[changed][0])} of episode {number} has other "
@@ -117,7 +117,7 @@ class RecordedEpisode:
                 )
             self.columns[key][steps] = column
         self.seen[steps] = True
-        return bool(again.any())
+        return bool(repeated.any())
 
 
 @dataclass(eq=False)
@@ -169,14 +169,14 @@ class EpochRecorder:
         self._check(batch, numbers, steps)
         columns = {key: batch[key].detach().cpu() for key in COLUMNS if key in batch}
         self._batch_size = max(self._batch_size, len(steps))
-        again = False
+        repeated = False
         for number in numbers.unique().tolist():
-            mine = numbers == number
-            part = {key: column[mine] for key, column in columns.items()}
+            rows = numbers == number
+            part = {key: column[rows] for key, column in columns.items()}
             if number not in self.episodes:
                 self.episodes[number] = RecordedEpisode.empty(len(self.ranges[number]), part)
-            again |= self.episodes[number].fill(number, steps[mine], part)
-        return again
+            repeated |= self.episodes[number].fill(number, steps[rows], part)
+        return repeated
 
     def _check(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> None:
         """Whether values are finite, and frames come at their time."""

@@ -1,6 +1,6 @@
 """Learning inside LeRobot's training loop: collect an epoch, fit by EM, go on by gradient.
 
-The first epoch of a run changes nothing: its frames are put together into demonstrations. These
+The first epoch of a run changes nothing: its frames become demonstrations. These
 are aligned and learned as :class:`tpgmm_torch.TaskParameterizedGMM` does; a policy that is
 fitted already keeps its mixture. From then on every batch gives a loss whose gradient reaches
 all parameters of the mixture.
@@ -113,8 +113,8 @@ class Learner:
         if training:
             check_one_process()
         if training and recorder is not None:
-            again = recorder.record(batch)
-            if not (again and recorder.complete):
+            repeated = recorder.record(batch)
+            if not (repeated and recorder.complete):
                 # no gradient, not a zero one: an optimizer's momentum must not move anything
                 return torch.zeros((), requires_grad=True)
             self._finish(recorder)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
@@ -113,14 +113,12 @@ def likelihood_loss(
     penalty = torch.zeros_like(mixture.logits)
     triangles = mixture.triangles()
     for j, (mean, triangle, x) in enumerate(zip(mixture.means, triangles, points, strict=True)):
-        white = torch.linalg.solve_triangular(triangle, x.mT - mean[..., None], upper=False)
-        log_volume = triangle.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-        constant = mean.shape[1] * math.log(2 * math.pi) / 2
-        joint = joint - white.square().sum(1) / 2 - log_volume - constant
+        normal = MultivariateNormal(mean, scale_tril=triangle, validate_args=False)
+        joint = joint + normal.log_prob(x[:, None]).mT
         if regularization is not None:
             root = regularization[j].sqrt().diag().expand_as(triangle)
-            white = torch.linalg.solve_triangular(triangle, root, upper=False)
-            penalty = penalty + white.square().sum((1, 2)) / 2
+            whitened = torch.linalg.solve_triangular(triangle, root, upper=False)
+            penalty = penalty + whitened.square().sum((1, 2)) / 2
     shares = torch.softmax(joint.detach(), 0).mean(1)
     return (shares * penalty).sum() - torch.logsumexp(joint, 0).mean()
 

@@ -141,8 +141,8 @@ class BottleScene:
         self._unit_inertia = model.body_inertia[self._bottle].copy()  # of 1 kg
         # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
         # is its damping, the joint's own and the control's: so much it has to be led
-        own = model.dof_damping[: self._n]
-        self._lead = (own - model.actuator_biasprm[:, 2]) / model.actuator_gainprm[:, 0]
+        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
+        self._lead = damping / model.actuator_gainprm[:, 0]
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -202,7 +202,7 @@ class BottleScene:
             if torques is not None:
                 data.qfrc_applied[:n] = torques[i]
             mujoco.mj_step(model, data)
-        if data.warning.number[_DIVERGED].any():  # MuJoCo then begins anew by itself
+        if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
             raise DataError(f"the simulation diverges at {references[-1].tolist()}")
         mujoco.mj_kinematics(model, data)
         if self.held:
@@ -249,10 +249,10 @@ class BottleScene:
         model.geom_conaffinity[self._surface] = _TABLE
         inverse, turn = np.empty(4), np.empty(4)
         for weld, hand in enumerate(self._hands):
-            apart = data.xpos[hand] - data.xpos[bottle]
+            offset = data.xpos[hand] - data.xpos[bottle]
             mujoco.mju_negQuat(inverse, data.xquat[hand])
             mujoco.mju_mulQuat(turn, inverse, data.xquat[bottle])
-            point = data.xmat[bottle].reshape(3, 3).T @ apart
+            point = data.xmat[bottle].reshape(3, 3).T @ offset
             # a point of the bottle, where it is in the hand, and how the bottle is turned there
             model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
             data.eq_active[weld] = True

@@ -239,7 +239,7 @@ class BottleShakingEnv(StateEnv):
         dict of str to float
         """
         joints, bottle = (torch.from_numpy(part) for part in self._contact)
-        apart, turned = skill().grasp_error(joints, Frame(bottle[:3], bottle[3:]))
+        distance, angle = skill().grasp_error(joints, Frame(bottle[:3], bottle[3:]))
         since = slice(self._grasp_step, self._steps)
         shaking = find_shaking(self._shoulders[since], self.fps, self.frequency)
         worse = np.abs(shaking.amplitudes / self.amplitude - 1).argmax()
@@ -248,8 +248,8 @@ class BottleShakingEnv(StateEnv):
         if self._scene.held:
             lift = float(self._heights[since][shaking.start :].min()) - FOOT - TABLE_LOW
         return {
-            "grasp_mm": 1e3 * float(apart),
-            "grasp_deg": math.degrees(float(turned)),
+            "grasp_mm": 1e3 * float(distance),
+            "grasp_deg": math.degrees(float(angle)),
             "lift_mm": 1e3 * lift,
             "frequency_hz": shaking.frequency,
             "amplitude_rad": amplitude,

@@ -257,9 +257,8 @@ class _Learner:
 
     def _step(self) -> float:
         batch = self.windows.at(torch.randint(len(self.windows), (self.recipe.batch_size,)))
-        batch[OBS_STATE] = batch[OBS_STATE] + self.recipe.jitter * torch.randn_like(
-            batch[OBS_STATE]
-        )
+        noise = torch.randn_like(batch[OBS_STATE])
+        batch[OBS_STATE] = batch[OBS_STATE] + self.recipe.jitter * noise
         self.policy.train()
         loss, _ = self.policy.forward(batch)
         self.optimizer.zero_grad()
@@ -288,8 +287,8 @@ class _Learner:
         first = config.n_obs_steps - 1  # Diffusion also predicts the past
         steps = slice(first, first + config.n_action_steps)
         valid = ~batch["action_is_pad"][:, steps]
-        apart = (predicted - batch[ACTION][:, steps]).abs() * self.scale
-        return float(loss), float(apart[valid].mean())
+        errors = (predicted - batch[ACTION][:, steps]).abs() * self.scale
+        return float(loss), float(errors[valid].mean())
 
 
 def _with_time(episodes: Episodes) -> Episodes:

@@ -102,11 +102,11 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _distance(self, poses: Tensor) -> Tensor:
         """Between each of these poses and each demonstration's, shape (B, n)."""
         given = poses[:, None].unflatten(-1, (-1, POSE))
-        known = self.poses[None].unflatten(-1, (-1, POSE))
-        apart = (given[..., :3] - known[..., :3]).square().sum(-1)
-        cosine = (given[..., 3:] * known[..., 3:]).sum(-1).abs().clamp(max=1)
+        kept = self.poses[None].unflatten(-1, (-1, POSE))
+        squares = (given[..., :3] - kept[..., :3]).square().sum(-1)
+        cosine = (given[..., 3:] * kept[..., 3:]).sum(-1).abs().clamp(max=1)
         turn = METRES_PER_RADIAN * 2 * torch.arccos(cosine)
-        return (apart + turn.square()).sum(-1)
+        return (squares + turn.square()).sum(-1)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
         """One action as a chunk."""

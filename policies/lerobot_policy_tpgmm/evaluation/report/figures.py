@@ -42,11 +42,11 @@ def _look(policy: str) -> dict[str, Any]:
 
 def _policies(table: pd.DataFrame) -> list[str]:
     """Those of a table, in the order of the report."""
-    known = [*LOOKS, *sorted(set(table.policy) - set(LOOKS))]
-    return [policy for policy in known if policy in set(table.policy)]
+    names = set(table.policy)
+    return [*(name for name in LOOKS if name in names), *sorted(names - set(LOOKS))]
 
 
-def _apart(counts: Sequence[int], index: int, total: int) -> np.ndarray[Any, Any]:
+def _spread(counts: Sequence[int], index: int, total: int) -> np.ndarray[Any, Any]:
     """Numbers of demonstrations, moved a little so that policies do not hide one another."""
     return np.asarray(counts) * 1.04 ** (index - (total - 1) / 2)
 
@@ -78,7 +78,7 @@ def draw_success(episodes: pd.DataFrame, path: Path) -> None:
         rates = groups.mean()
         bounds = np.array([wilson(int(group.sum()), len(group)) for _, group in groups]).T
         spread = np.abs(bounds - rates.to_numpy())
-        x = _apart(list(rates.index), index, len(policies))
+        x = _spread(list(rates.index), index, len(policies))
         axes.errorbar(x, rates, yerr=spread, capsize=2, elinewidth=1, **_look(policy))
     _over_demonstrations(axes, episodes)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -114,7 +114,7 @@ def draw_errors(
             low, middle, high = (
                 groups.quantile(share, interpolation="nearest") for share in (0.25, 0.5, 0.75)
             )
-            x = _apart(list(middle.index), index, len(policies))
+            x = _spread(list(middle.index), index, len(policies))
             spread = np.array((middle - low, high - middle))
             look = _look(policy) | {"markersize": 5}
             axes.errorbar(x, middle, yerr=spread, capsize=2, elinewidth=1, **look)
