@@ -154,10 +154,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         **options
             Other fields of :class:`TPGMMConfig`.
 
-        Returns
-        -------
-        TPGMMPolicy
-
         Raises
         ------
         NotFittedError

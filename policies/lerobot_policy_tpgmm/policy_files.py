@@ -44,10 +44,6 @@ def read_tensors(file: str, expected: Mapping[str, Tensor]) -> dict[str, Tensor]
     expected : mapping of str to Tensor
         The ``state_dict`` that they are for.
 
-    Returns
-    -------
-    dict of str to Tensor
-
     Raises
     ------
     ModelFileError

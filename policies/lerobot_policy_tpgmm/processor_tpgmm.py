@@ -23,10 +23,6 @@ def make_tpgmm_pre_post_processors(
     ----------
     dataset_stats : dict, optional
         Not used: nothing is normalised.
-
-    Returns
-    -------
-    preprocessor, postprocessor : PolicyProcessorPipeline
     """
     pipelines: tuple[Any, Any] = make_default_pre_post_processors(config, None)
     return pipelines

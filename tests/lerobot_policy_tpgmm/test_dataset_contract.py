@@ -5,7 +5,7 @@ import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_metadata import dataset
@@ -26,8 +26,7 @@ UPPER_BODY = {"robot": "upper_body", "links": ["l_hand", "r_hand"]}
 
 def config(n_environment: int = 7, **options: object) -> TPGMMConfig:
     """As ``make_policy`` gives it to a policy."""
-    made = TPGMMConfig(device="cpu", **options)
-    made.set_features(17, n_environment, 17)
+    made = TPGMMConfig(device="cpu", **state_features(17, n_environment, 17), **options)
     made.input_features["observation.image"] = PolicyFeature(FeatureType.VISUAL, (3, 8, 8))
     return made
 

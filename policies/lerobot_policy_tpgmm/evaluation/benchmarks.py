@@ -225,12 +225,7 @@ BENCHMARKS: dict[str, type[Benchmark]] = {
 def benchmark(
     name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Benchmark:
-    """A benchmark by its name.
-
-    Parameters
-    ----------
-    rate, options
-        As for :class:`Benchmark`.
+    """A benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`.
 
     Raises
     ------

@@ -70,10 +70,6 @@ def compare(
     command : str
         For the report.
 
-    Returns
-    -------
-    Comparison
-
     Raises
     ------
     UnknownNameError

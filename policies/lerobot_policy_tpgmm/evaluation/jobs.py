@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -21,12 +21,14 @@ from lerobot_policy_tpgmm.evaluation.cells import Cell, Results, write_json
 from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES, Training, train
 from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
 from lerobot_policy_tpgmm.evaluation.policies.replay import NearestPolicy
-from lerobot_policy_tpgmm.evaluation.policies.tpgmm import fit_tpgmm
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tpgmm_datasets import load_lerobot
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.atomic import replacing
-from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["POLICIES", "record", "run"]
 
@@ -108,7 +110,8 @@ def machine() -> dict[str, Any]:
 def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> None:
     """Write the pretrained directory in one step."""
     began = time.process_time()
-    trained = _trainer(cell.policy)(folder / "episodes", settings, cell)
+    train_it = {"nearest": _nearest} | dict.fromkeys(RECIPES, _baseline)
+    trained = train_it.get(cell.policy, _tpgmm)(folder / "episodes", settings, cell)
     seconds = time.process_time() - began
     with replacing(directory) as new:
         for part in (trained.policy, *trained.processors):
@@ -123,16 +126,6 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
             "curve": trained.curve,
         }
         write_json(new / RECORD, description)
-
-
-def _trainer(name: str) -> Callable[[Path, Settings, Cell], Training]:
-    if name in RECIPES:
-        return _baseline
-    if name == "nearest":
-        return _nearest
-    if name in ("tpgmm", "tpgmm-position-only"):
-        return _tpgmm
-    raise UnknownNameError("policy", name, "the comparison", POLICIES)
 
 
 def _baseline(episodes: Path, settings: Settings, cell: Cell) -> Training:
@@ -152,15 +145,24 @@ def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
 
 
 def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    """Align the first episodes and learn their references."""
     benchmark = settings.benchmark()
-    policy = fit_tpgmm(
-        benchmark,
+    demonstrations = load_lerobot(
         episodes / "training",
-        cell.demonstrations,
-        cell.seed,
-        settings.n_components,
-        orientation=cell.policy == "tpgmm",
+        robot=benchmark.robot,
+        joints="action",
+        episodes=range(cell.demonstrations),
     )
+    if not benchmark.synchronous:
+        warping = DynamicTimeWarping(features=["directions"])
+        demonstrations = warping.fit_transform(demonstrations)
+    model = TaskParameterizedGMM(
+        settings.n_components or benchmark.n_components,
+        benchmark.operators(orientation=cell.policy == "tpgmm"),
+        benchmark.robot,
+        random_state=cell.seed,
+    )
+    policy = TPGMMPolicy.from_estimator(model.fit(demonstrations), fps=benchmark.rate)
     recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"

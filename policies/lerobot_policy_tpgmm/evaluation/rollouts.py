@@ -74,21 +74,18 @@ class Runner:
         return self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
 
 
-class _Outcomes:
+class _Outcomes(gym.vector.VectorWrapper):  # type: ignore[misc]
     """A vector environment that keeps what ``info`` says when its episodes end first.
 
     LeRobot's rollout does not return it.
     """
 
     def __init__(self, env: gym.vector.VectorEnv) -> None:
-        self._env = env
+        super().__init__(env)
         self.outcomes: list[dict[str, float] | None] = [None] * env.num_envs
 
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
-
     def step(self, actions: Any) -> Any:
-        transition = self._env.step(actions)
+        transition = super().step(actions)
         _, _, terminated, truncated, info = transition
         for index in np.flatnonzero(terminated | truncated):
             if self.outcomes[index] is None:

@@ -149,10 +149,6 @@ class AlohaStateEnv(StateEnv):
             ``environment_state``, the objects' poses, and ``joints``, the arms' posture.
             Others are ignored: LeRobot gives one of its own.
 
-        Returns
-        -------
-        observation, info : dict
-
         Raises
         ------
         DataError
@@ -195,10 +191,6 @@ class AlohaStateEnv(StateEnv):
         ----------
         action : array of shape (14,)
             In the order of ``joint_names``; what is out of reach is clipped.
-
-        Returns
-        -------
-        observation, reward, terminated, truncated, info
 
         Raises
         ------

@@ -99,10 +99,6 @@ class Conditions:
         options : mapping
             ``"bottle"`` and ``"joints"`` are looked at, if they are there.
 
-        Returns
-        -------
-        Conditions
-
         Raises
         ------
         DataError

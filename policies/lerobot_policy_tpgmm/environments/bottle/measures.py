@@ -121,10 +121,6 @@ def find_shaking(joints: NDArray[np.float64], rate: float, nominal: float) -> Sh
     nominal : float
         Frequency to look for [Hz]: what is found is between two thirds and twice of it, so that
         a window always holds more than one period.
-
-    Returns
-    -------
-    Shaking
     """
     length = round(2 * rate / nominal)
     if len(joints) < length:

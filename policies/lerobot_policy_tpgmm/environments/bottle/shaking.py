@@ -170,10 +170,6 @@ class BottleShakingEnv(StateEnv):
             ``"bottle"``: its initial position and orientation, shape (7,); ``"joints"``: the
             start posture, shape (17,). Other keys are for others, and ignored.
 
-        Returns
-        -------
-        observation, info : dict
-
         Raises
         ------
         DataError
@@ -232,12 +228,7 @@ class BottleShakingEnv(StateEnv):
         return self._observation(), float(info["is_success"]), False, over, info
 
     def figures(self) -> dict[str, float]:
-        """How well the episode goes, so far; the class says what each figure is.
-
-        Returns
-        -------
-        dict of str to float
-        """
+        """How well the episode goes, so far; the class says what each figure is."""
         joints, bottle = (torch.from_numpy(part) for part in self._contact)
         distance, angle = skill().grasp_error(joints, Frame(bottle[:3], bottle[3:]))
         since = slice(self._grasp_step, self._steps)

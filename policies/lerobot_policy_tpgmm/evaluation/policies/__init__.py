@@ -1,1 +1,1 @@
-"""What is compared: TP-GMM, learned baselines, and replay."""
+"""What TP-GMM is compared with: learned baselines, and replay."""

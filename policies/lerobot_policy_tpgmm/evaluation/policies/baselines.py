@@ -166,10 +166,6 @@ def train(
     report : callable
         Called with a line at each validation.
 
-    Returns
-    -------
-    Training
-
     Raises
     ------
     DataError
