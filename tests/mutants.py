@@ -27,7 +27,7 @@ LINKED = ("tpgmm_torch", "datasets", "policies", "tests")
 #: constants of modules and decorated functions (properties, caches, abstract methods).
 EQUIVALENT = {
     "text of an error or warning": r"^raise \w+.*|warnings\.warn\(.*",
-    "device, where there is only one": r"(, )?\bdevice=[\w.]+",
+    "device, where there is one": r"(?<=\()[\w.=]*\bdevice, |(, )?[\w.=]*\bdevice\b(?=[,)])",
     "zip that checks lengths which agree": r", strict=\w+",
     "type given to the type checker": r"(?<=\bcast\()[^,]+",
 }

@@ -282,3 +282,55 @@ def test_without_dtaidistance_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "dtaidistance", None)
     with pytest.raises(DependencyError, match=r"tpgmm-torch\[data\]"):
         DynamicTimeWarping().fit(DEMONSTRATIONS[:2])
+
+
+@pytest.mark.parametrize("options", [{}, {"open_end": True}, {"reference": "barycenter"}])
+def test_when_a_clock_starts_does_not_matter(options):
+    options = {"reference": 0, "n_iter": 2} | options
+    family = DEMONSTRATIONS[1:4]
+    later = [
+        Demonstration(d.time + shift, d.joints, d.frames, d.joint_names)
+        for d, shift in zip(family, (0.0, 7.0, -3.0), strict=True)
+    ]
+    same, shifted = (DynamicTimeWarping(**options).fit(x) for x in (family, later))
+    for one, other in zip(same.transform(family), shifted.transform(later), strict=True):
+        # where nothing moves, rounding decides what is matched
+        torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=5e-3)
+    np.testing.assert_allclose(same.distortions_, shifted.distortions_, rtol=1e-3)
+    moved = DynamicTimeWarping(**options).fit([later[1], *later[::2]])
+    start = 0.0 if options["reference"] == "barycenter" else 7.0
+    assert float(moved.time_[0]) == pytest.approx(start)
+
+
+def test_distortions_are_distances_of_features_along_the_paths():
+    family = DEMONSTRATIONS[:3]
+    fitted = DynamicTimeWarping(0, features=["joints"]).fit(family)
+    joints = [one.joints for one in fitted.fit_transform(family)]
+    scale = np.sqrt(
+        np.average(
+            [d.joints.var(0, correction=0).sum() for d in family],
+            weights=list(map(len, family)),
+        )
+    )
+    expected = [
+        float((one - joints[0]).square().sum(1).mean().sqrt()) / scale for one in joints
+    ]
+    assert fitted.distortions_ == pytest.approx(expected, rel=1e-2, abs=1e-9)
+
+
+def test_smoothing_covers_its_seconds_on_both_sides():
+    even = np.linspace(0, 4, 401)
+    halting = np.minimum(even, 2) + np.maximum(even - 3, 0)  # waits from 2 s to 3 s
+    waiting = Demonstration(even, halting[:, None])
+    steady = Demonstration(np.linspace(0, 3, 301), np.linspace(0, 3, 301)[:, None])
+    options = {"features": ["joints"], "penalty": 0.0}
+    sharp, smooth = (
+        DynamicTimeWarping(0, smoothing=s, **options).fit([waiting, steady]).paths_[1].numpy()
+        / 100
+        for s in (0.0, 0.5)
+    )
+    np.testing.assert_allclose(sharp, halting, rtol=0, atol=0.02)
+    far = (abs(even - 2) > 0.52) & (abs(even - 3) > 0.52)
+    np.testing.assert_allclose(smooth[far], sharp[far], rtol=0, atol=0.02)
+    near = (abs(even - 2) < 0.3) | (abs(even - 3) < 0.3)
+    assert np.abs(smooth - sharp)[near].max() > 0.05
