@@ -8,11 +8,15 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.robots.robot import Kinematics, Robot
+from tpgmm_torch.robots.kinematic_tree import MovingTree, reduce
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.urdf import read_urdf
 
 HANDS = ("l_hand", "r_hand")
 G1_PATH = Path(
@@ -145,18 +149,57 @@ class Pinocchio:
         return place.translation, place.rotation, np.array(columns).T
 
 
+def tree_of(robot: Robot) -> MovingTree:
+    """The tree of a robot without tools."""
+    config = robot.config()
+    model = read_urdf(config["urdf"])
+    columns = {n: i for i, n in enumerate(robot.joint_names) if n in model.joint}
+    links = [(link, np.eye(4)) for link in robot.links]
+    return reduce(model, config["base"], links, columns, config["locked"])
+
+
+def written_out(tree: MovingTree, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (L, 4, 4) and geometric Jacobians (L, 6, n), joint by joint."""
+    poses: list[np.ndarray] = []
+    axes: list[np.ndarray] = []
+    for frame in tree.frames:
+        value = frame.multiplier * joints[frame.joint] + frame.shift
+        motion = np.eye(4)
+        if frame.prismatic:
+            motion[:3, 3] = value * frame.axis
+        else:
+            motion[:3, :3] = Rotation.from_rotvec(value * frame.axis).as_matrix()
+        carrier = poses[frame.parent] if frame.parent >= 0 else np.eye(4)
+        poses.append(carrier @ frame.offset @ motion)
+        axes.append((carrier @ frame.offset)[:3, :3] @ frame.axis)
+    links, jacobians = [], []
+    for link in tree.links:
+        pose = (poses[link.frame] if link.frame >= 0 else np.eye(4)) @ link.pose
+        jacobian = np.zeros((6, len(joints)))
+        for index in tree.moved_by(link.frame):
+            frame, axis = tree.frames[index], axes[index]
+            arm = pose[:3, 3] - poses[index][:3, 3]
+            column = (axis, 0 * axis) if frame.prismatic else (np.cross(axis, arm), axis)
+            jacobian[:, frame.joint] += frame.multiplier * np.concatenate(column)
+        links.append(pose)
+        jacobians.append(jacobian)
+    return np.array(links), np.array(jacobians)
+
+
 def assert_agrees(
     robot: Robot, oracle: Pinocchio, base: str, locked: dict[str, float] | None = None
 ) -> None:
-    for joints in random_joints(robot, 20):
+    postures = random_joints(robot, 20)
+    many = robot.state(postures.repeat(10, 1))
+    for number, joints in enumerate(postures):
         oracle.run((locked or {}) | dict(zip(robot.joint_names, joints.tolist(), strict=True)))
-        state = robot.state(joints)
-        for index, link in enumerate(robot.links):
-            expected = oracle.link(link, base, robot.joint_names)
-            turned = quaternions.to_matrix(state.orientation(link))
-            found = state.position(link), turned, state.jacobians[index]
-            for mine, theirs in zip(found, expected, strict=True):
-                np.testing.assert_allclose(mine.numpy(), theirs, rtol=0, atol=1e-12)
+        for state in (robot.state(joints), many[number], many[180 + number]):
+            for index, link in enumerate(robot.links):
+                expected = oracle.link(link, base, robot.joint_names)
+                turned = quaternions.to_matrix(state.orientation(link))
+                found = state.position(link), turned, state.jacobians[index]
+                for mine, theirs in zip(found, expected, strict=True):
+                    np.testing.assert_allclose(mine.numpy(), theirs, rtol=0, atol=1e-12)
 
 
 def assert_differences_agree(robot: Kinematics, joints: Tensor, atol: float = 1e-8) -> None:

@@ -1,15 +1,15 @@
 """Poses and Jacobians of the links of a tree, for a batch of joint vectors at once.
 
-Each joint turns or slides along the z axis of its own frame, so that its axis is a column of
-the frame's pose, and the pose of a frame in its parent is linear in the sine and the cosine of
-the joint (or in the joint itself, where it slides). So is Hbar of its unit quaternion in those
-of half the joint: as ``eps_parent * eps = Hbar(eps) eps_parent``, its transpose takes the
-parent's quaternion, a row, to the frame's own. Poses and turns are 4 x 4 matrices alike.
-One batch of matrix products multiplies all of them by their parents; every further one doubles
-the number of joints that are behind: ten joints in a row need four. That costs more arithmetic
-and fewer operations than going from joint to joint, which is what a controller wants. Many
-robots at once go level by level, in the end with only the rows that are wanted: three of a
-pose, one of a turn. Inside, the B robots stand in the last dimension; one robot has none.
+Each joint turns or slides along the z axis of its frame, so that its axis is a column of the
+frame's pose, and the pose of a frame in its parent is linear in the sine and the cosine of the
+joint (or in the joint itself, where it slides). So is Hbar of its unit quaternion in those of
+half the joint: as ``eps_parent * eps = Hbar(eps) eps_parent``, its transpose takes the
+parent's quaternion, a row, to that of the frame. Poses and turns are 4 x 4 matrices alike.
+
+Their products along the tree are taken in two ways. Many robots go level by level, with only
+the rows that are wanted: three of a pose, one of a turn. For few, the number of operations
+counts: one batch of matrix products multiplies all matrices by their parents, and every
+further one doubles the number of joints that are behind: ten joints in a row need four.
 """
 
 import itertools
@@ -26,11 +26,8 @@ from tpgmm_torch.robots.kinematic_tree import MovingTree
 
 __all__ = ["TreeKinematics"]
 
-#: Joint vectors at once from which arithmetic costs more than the number of operations.
-MANY = 16
-
-#: ... and from which it is worth two runs to leave out the rows that are not wanted.
-PLENTY = 128
+#: Joint vectors at once up to which the number of operations costs more than arithmetic.
+FEW = 8
 
 
 class TreeKinematics:
@@ -39,10 +36,11 @@ class TreeKinematics:
     Parameters
     ----------
     tree : MovingTree
+        What moves the L links.
     n_joints : int
         Length of the joint vector.
-    dtype : torch.dtype
-    device : torch.device or str
+    dtype, device : torch.dtype, torch.device or str
+        Of all results.
     """
 
     def __init__(
@@ -54,8 +52,8 @@ class TreeKinematics:
         def index(values: Any) -> Tensor:
             return torch.tensor(values, dtype=torch.long, device=device)
 
-        # bodies are the moving frames and, fixed to them, the links; behind the base's and
-        # theirs, in order of depth, stand the matrices that turn
+        # bodies are the base, the moving frames and, fixed to them, the links, in order of
+        # depth; behind the N matrices of their poses stand the N that turn
         frames, links = tree.frames, tree.links
         carriers = [frame.parent for frame in frames] + [link.frame for link in links]
         depths = [1 + len(tree.moved_by(carrier)) for carrier in carriers]
@@ -64,7 +62,7 @@ class TreeKinematics:
         count = len(row)
         factors = np.zeros((4, 2 * count, 4, 4))  # of 1, sine, cosine, joint
         factors[0, [0, count]] = np.eye(4)
-        follow, shift = np.zeros((2 * count, n_joints)), np.zeros(2 * count)
+        follow, shift = np.zeros((2 * count, n_joints)), np.zeros((2 * count, 1))
         parents = [0] * count
         turned = {-1: np.eye(4)} | {f: _z_to(frame.axis) for f, frame in enumerate(frames)}
         for body, carrier in enumerate(carriers):
@@ -80,24 +78,20 @@ class TreeKinematics:
             factors[:, turn] = _turn(offset) @ (STAY if frame.prismatic else HALF_TURN)
             follow[pose, frame.joint], shift[pose] = frame.multiplier, frame.shift
             follow[turn], shift[turn] = follow[pose] / 2, shift[pose] / 2
+        self._factors = constant(factors).unsqueeze(-1).unbind(0)  # (2N, 4, 4, 1) each
+        self._follow, self._shift = constant(follow), constant(shift)  # (2N, n), (2N, 1)
 
-        # (N, 4, 4) each, for one robot, and with a dimension for many
-        one = constant(factors)
-        self._factors = {3: one.unbind(0), 4: one.unsqueeze(-1).unbind(0)}
-        self._follow, self._shift = constant(follow), constant(shift)  # (N, n), (N,)
-        hops = _hops(parents)
-        self._hops = [index(hop + [count + parent for parent in hop]) for hop in hops]
-        # of one robot, number by number, which is sooner done than row by row
-        numbers = torch.arange(16, device=device).view(4, 4)
-        self._hops_of_one = [16 * hop.view(-1, 1, 1) + numbers for hop in self._hops]
-        # level by level: how many bodies there are, and whom they are carried by
+        # for few robots: each matrix's ancestor of degree 1, 2, 4, ...
+        self._ancestors = [index(hop + [count + p for p in hop]) for hop in _hops(parents)]
+        # for many: how many bodies each level has, and which of the one before carry them;
+        # None for each its own
         self._counts = [1, *np.bincount(depths)[1:].tolist()]
-        self._parents: list[Tensor | None] = []
+        self._carriers: list[Tensor | None] = []
         first, start = 0, 1
         for before, number in itertools.pairwise(self._counts):
             places = [parent - first for parent in parents[start : start + number]]
             first, start = start, start + number
-            self._parents.append(None if places == list(range(before)) else index(places))
+            self._carriers.append(None if places == list(range(before)) else index(places))
 
         # each column of the Jacobians is moved by a frame, or by none
         column = {frame.joint: f for f, frame in enumerate(frames)}
@@ -112,129 +106,105 @@ class TreeKinematics:
         movers = [row[c] for c in columns]
 
         def wanted(pose_size: int, turn_size: int) -> Tensor:
-            numbers = [
-                pose_size * pose + 4 * line + place
-                for poses, place in (
-                    (bodies, 3),  # where links are
-                    (movers, 3),  # where the frames that move columns are,
-                    (movers, 2),  # and their axes
-                )
-                for pose in poses
-                for line in range(3)
+            columns = [(body, 3) for body in bodies]  # where links are,
+            columns += [(mover, 3) for mover in movers]  # where what moves them is,
+            columns += [(mover, 2) for mover in movers]  # and about which axis
+            poses = [
+                pose_size * pose + 4 * line + at for pose, at in columns for line in range(3)
             ]
             turns = [pose_size * count + turn_size * body for body in bodies]
-            return index(numbers + [turn + place for turn in turns for place in range(4)])
+            return index(poses + [turn + place for turn in turns for place in range(4)])
 
         self._in_matrices, self._in_rows = wanted(16, 16), wanted(12, 4)
         self._sizes = 3 * len(bodies), 3 * len(movers), 3 * len(movers), 4 * len(bodies)
         moved = [[float(c in tree.moved_by(link.frame)) for link in links] for c in columns]
-        mask = np.reshape(moved, (len(columns), len(links), 1))
-        slide = np.array([c >= 0 and frames[c].prismatic for c in columns]).reshape(-1, 1, 1)
-
-        def both(values: Any) -> dict[int, Tensor]:
-            """(C, L, 1) for one robot, and with a dimension for many."""
-            return {3: constant(values), 4: constant(values).unsqueeze(-1)}
-
-        self._turns, self._slides = both(mask * ~slide), None
-        if slide.any():
-            self._slides = both(mask * slide)
+        mask = np.reshape(moved, (len(columns), len(links), 1, 1))
+        slide = np.array([c >= 0 and frames[c].prismatic for c in columns], bool)
+        slide = slide.reshape(-1, 1, 1, 1)
+        self._turns = constant(mask * ~slide)  # (C, L, 1, 1)
+        self._slides = constant(mask * slide) if slide.any() else None
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Poses and Jacobians in the base frame.
 
         Parameters
         ----------
-        joints : Tensor of shape (B, n_joints), or (n_joints,)
+        joints : Tensor of shape (B, n_joints)
 
         Returns
         -------
-        positions : Tensor of shape (B, L, 3), or (L, 3)
-        orientations : Tensor of shape (B, L, 4), or (L, 4)
+        positions : Tensor of shape (B, L, 3)
+        orientations : Tensor of shape (B, L, 4)
             Unit quaternions, real part not negative.
-        jacobians : Tensor of shape (B, L, 6, n_joints), or (L, 6, n_joints)
+        jacobians : Tensor of shape (B, L, 6, n_joints)
             Linear rows above angular rows.
         """
-        batch = joints.shape[:-1]
+        # inside, robots are the last dimension
+        count = len(joints)
+        few = 0 < count <= FEW and not torch.compiler.is_compiling()
         if torch.compiler.is_compiling():  # a sum is a loop that others can join
-            moved = self._shift.unsqueeze(-1) + (self._follow.unsqueeze(-1) * joints.T).sum(1)
-        elif batch:
-            moved = torch.addmm(self._shift.unsqueeze(-1), self._follow, joints.T)  # (N, B)
+            moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
         else:
-            moved = torch.addmv(self._shift, self._follow, joints)
-        local = self._local(moved.view(len(moved), 1, 1, *batch))
-        numbers = self._products(local, batch)
+            moved = torch.addmm(self._shift, self._follow, joints.T)  # (2N, B)
+        local = self._local(moved[:, None, None])
+        numbers = self._products_of_few(local) if few else self._products(local)
         position, origin, axis, quaternion = numbers.split(self._sizes)
-        columns, links = self._turns[3].shape[:2]
-        position = position.view(links, 3, *batch)
-        quaternion = quaternion.view(links, 4, *batch)
-        quaternion = quaternion * quaternions.hemisphere_sign(quaternion[:, :1])
-        origin, axis = (x.view(columns, 1, 3, *batch) for x in (origin, axis))
-        turning = axis * self._turns[axis.ndim]  # (C, L, 3[, B])
-        linear = _cross(turning, position - origin)
+        columns, links = self._turns.shape[:2]
+        position = position.view(links, 3, count)
+        quaternion = quaternion.view(links, 4, count)
+        quaternion = quaternion * quaternions.hemisphere_sign(quaternion.narrow(1, 0, 1))
+        origin, axis = origin.view(columns, 1, 3, count), axis.view(columns, 1, 3, count)
+        turning = axis * self._turns  # (C, L, 3, B)
+        linear = (_cross_of_few if few else _cross)(turning, position - origin)
         if self._slides is not None:
-            linear = linear + axis * self._slides[axis.ndim]
-        jacobians = torch.cat((linear, turning), 2)
-        if batch:
-            position, quaternion = position.permute(2, 0, 1), quaternion.permute(2, 0, 1)
-            jacobians = jacobians.permute(3, 1, 2, 0)  # (B, L, 6, C)
-        else:
-            jacobians = jacobians.permute(1, 2, 0)
+            linear = linear + axis * self._slides
+        jacobians = torch.cat((linear, turning), 2).permute(3, 1, 2, 0)  # (B, L, 6, C)
         if self._mimic is not None:
             jacobians = jacobians @ self._mimic
-        return position, quaternion, jacobians
+        return position.permute(2, 0, 1), quaternion.permute(2, 0, 1), jacobians
 
     def _local(self, moved: Tensor) -> Tensor:
-        """The matrices of all bodies in their carriers, the base first, (N, 4, 4[, B])."""
-        constant, sine, cosine, sliding = self._factors[moved.ndim]
+        """The matrices of all bodies in what carries them, (2N, 4, 4, B)."""
+        constant, sine, cosine, sliding = self._factors
         local = torch.addcmul(constant, sine, moved.sin())
         local = torch.addcmul(local, cosine, moved.cos())
         return torch.addcmul(local, sliding, moved) if self._slides is not None else local
 
-    def _products(self, local: Tensor, batch: torch.Size) -> Tensor:
-        """The numbers that are wanted of the products along the tree, (W[, B])."""
-        if not batch:
-            for numbers in self._hops_of_one:
-                local = torch.bmm(local.take(numbers), local)
-            return local.view(-1).index_select(0, self._in_matrices)
-        count = PLENTY if torch.compiler.is_compiling() else batch.numel()
-        if count < MANY:
-            for hop in self._hops:
-                local = _product(local.index_select(0, hop), local)
-            return local.reshape(16 * len(local), *batch).index_select(0, self._in_matrices)
-        halves = local.view(2, -1, 4, 4, *batch)
-        if count < PLENTY:
-            matrices = self._down(halves, 4)
-            return matrices.view(-1, *batch).index_select(0, self._in_matrices)
-        parts = (self._down(halves[:1], 3), self._down(halves[1:], 1))
-        numbers = torch.cat([part.view(-1, *batch) for part in parts])
+    def _products(self, local: Tensor) -> Tensor:
+        """The numbers that are wanted of the products along the tree, (W, B)."""
+        poses, turns = local.chunk(2)
+        numbers = torch.cat((self._level_by_level(poses, 3), self._level_by_level(turns, 1)))
         return numbers.index_select(0, self._in_rows)
 
-    def _down(self, local: Tensor, rows: int) -> Tensor:
-        """The first rows of the products, level by level; local is (H, N, 4, 4, B)."""
-        base, *others = local.split(self._counts, 1)
-        level = base[:, :, :rows]
-        levels = [level]
-        for parents, matrices in zip(self._parents, others, strict=True):
-            if parents is not None:
-                level = level.index_select(1, parents)
-            level = _product(level, matrices)
-            levels.append(level)
-        return torch.cat(levels, 1)
+    def _level_by_level(self, local: Tensor, rows: int) -> Tensor:
+        """The first rows of the products, (N * rows * 4, B)."""
+        base, *others = local.split(self._counts)
+        levels = [base[:, :rows]]
+        for carriers, matrices in zip(self._carriers, others, strict=True):
+            level = levels[-1] if carriers is None else levels[-1].index_select(0, carriers)
+            levels.append((level.unsqueeze(-2) * matrices.unsqueeze(-4)).sum(-3))
+        return torch.cat(levels).flatten(0, 2)
 
-
-def _product(first: Tensor, second: Tensor) -> Tensor:
-    """Products of matrices (..., 4, 4, B)."""
-    return (first.unsqueeze(-2) * second.unsqueeze(-4)).sum(-3)
+    def _products_of_few(self, local: Tensor) -> Tensor:
+        """The same for few robots."""
+        count = local.shape[-1]
+        local = local.movedim(-1, 0).reshape(-1, 4, 4)  # (B * 2N, 4, 4)
+        for ancestors in self._ancestors:
+            before = local.view(count, -1, 16).index_select(1, ancestors)
+            local = torch.bmm(before.view(-1, 4, 4), local)
+        return local.view(count, -1).index_select(1, self._in_matrices).T
 
 
 def _cross(first: Tensor, second: Tensor) -> Tensor:
-    """Cross products along the third dimension of (C, L, 3), or (C, L, 3, B)."""
-    few = first.ndim == 3 or first.shape[-1] < MANY
-    if few and not torch.compiler.is_compiling():
-        return torch.linalg.cross(first, second, dim=2)
+    """Cross products along the third dimension of (C, L, 3, B)."""
     x, y, z = first.unbind(2)
     u, v, w = second.unbind(2)
     return torch.stack((y * w - z * v, z * u - x * w, x * v - y * u), 2)
+
+
+def _cross_of_few(first: Tensor, second: Tensor) -> Tensor:
+    """The same in one operation, which takes six times as long for many robots."""
+    return torch.linalg.cross(first, second, dim=2)
 
 
 def _z_to(axis: Array) -> Array:

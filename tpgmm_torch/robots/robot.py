@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -141,14 +141,13 @@ class Robot(Kinematics):
         """
         joints = self.joint_tensor(joints)
         batch = joints.shape[:-1]
-        # to a compiler, one robot is a batch as well
-        alone = not torch.compiler.is_compiling() and batch.numel() == 1
-        if len(batch) == (0 if alone else 1):
-            return RobotState(joints, self.links, *self.forward_kinematics(joints))
-        rows = (self.n_joints,) if alone else (batch.numel(), self.n_joints)
-        parts = self.forward_kinematics(joints.reshape(rows))
-        poses = (part.reshape(batch + part.shape[len(rows) - 1 :]) for part in parts)
-        return RobotState(joints, self.links, *poses)
+        rows = joints.reshape(batch.numel(), self.n_joints)
+        parts: Iterable[Tensor] = self.forward_kinematics(rows)
+        if not batch:
+            parts = tuple(part.squeeze(0) for part in parts)
+        elif len(batch) > 1:
+            parts = tuple(part.unflatten(0, batch) for part in parts)
+        return RobotState(joints, self.links, *parts)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None

@@ -1,31 +1,89 @@
-"""One pass through the tree, whichever way it goes, and pytorch-kinematics as an oracle."""
+"""Products along the tree, for one robot and for many, against products written out."""
 
+import numpy as np
 import pytest
 import pytorch_kinematics
 import torch
 
-from tests.support.robot_zoo import HANDS, g1, random_joints, upper_body, zoo
+from tests.support.robot_zoo import (
+    HANDS,
+    assert_differences_agree,
+    g1,
+    random_joints,
+    tree_of,
+    upper_body,
+    written_out,
+    zoo,
+)
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.robots.forward_kinematics import MANY
+from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.robot import Robot
 
-ROBOTS = {"upper body": upper_body, "zoo": zoo, "zoo from its tip": lambda: zoo(base="tip")}
-ROBOTS["g1"] = g1
+ROBOTS = {
+    "upper body": upper_body,
+    "zoo": zoo,
+    "zoo from its tip": lambda: zoo(base="tip"),
+    "zoo that does not move": lambda: zoo(("flange", "arm"), base="arm"),
+    "zoo of a slide": lambda: zoo(("column",), joints=["lift"], coordinates=["free"]),
+    "zoo of fingers": lambda: zoo(("l_finger", "r_finger"), joints=["wag", "grip", "elbow"]),
+    "g1": g1,
+}
+COUNTS = [1, 2, 7, 40, 300]
 
 
 @pytest.mark.parametrize("make", ROBOTS.values(), ids=list(ROBOTS))
-@pytest.mark.parametrize("count", [2, MANY - 1, MANY, 3 * MANY])
-def test_many_robots_are_each_one_alone(make, count):
+@pytest.mark.parametrize("count", COUNTS)
+def test_every_robot_of_a_batch_is_the_products_along_its_tree(make, count):
+    robot = make()
+    tree = tree_of(robot)
+    joints = random_joints(robot, count, seed=count)
+    kinematics = TreeKinematics(tree, robot.n_joints, torch.float64, "cpu")
+    positions, orientations, jacobians = kinematics(joints)
+    assert positions.shape == (count, len(robot.links), 3)
+    assert orientations.shape == (count, len(robot.links), 4)
+    assert jacobians.shape == (count, len(robot.links), 6, robot.n_joints)
+    assert bool((orientations[..., 0] >= 0).all())
+    rotations = quaternions.to_matrix(orientations)
+    for index in range(0, count, 1 + count // 20):
+        poses, expected = written_out(tree, joints[index].numpy())
+        np.testing.assert_allclose(positions[index], poses[:, :3, 3], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(rotations[index], poses[:, :3, :3], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(jacobians[index], expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("make", ROBOTS.values(), ids=list(ROBOTS))
+@pytest.mark.parametrize("count", COUNTS[1:])
+def test_many_robots_are_each_what_one_is(make, count):
     robot = make()
     joints = random_joints(robot, count)
-    together = robot.state(joints)
-    for index in (0, count - 1):
-        alone = robot.state(joints[index])
-        for name in ("positions", "orientations", "jacobians"):
-            torch.testing.assert_close(
-                getattr(together, name)[index], getattr(alone, name), rtol=0, atol=1e-14
-            )
+    many = robot.forward_kinematics(joints)
+    for index in range(0, count, 1 + count // 20):
+        one = robot.forward_kinematics(joints[index : index + 1])
+        for some, single in zip(many, one, strict=True):
+            torch.testing.assert_close(some[index], single[0], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_type_is_the_one_asked_for(count):
+    robot = zoo()
+    joints = random_joints(robot, count)
+    single = TreeKinematics(tree_of(robot), 5, torch.float32, "cpu")(joints.float())
+    for rounded, exact in zip(single, robot.forward_kinematics(joints), strict=True):
+        assert rounded.dtype == torch.float32
+        torch.testing.assert_close(rounded.double(), exact, rtol=0, atol=2e-6)
+
+
+def test_a_turn_beyond_a_half_comes_back_with_a_real_part_that_is_not_negative():
+    robot = zoo(("turret",), joints=["swivel"])
+    for angle in (2.0, 3.5, 6.0, -3.5):
+        for joints in ([[angle]], [[angle], [0.0]]):
+            turn = robot.state(joints).orientation("turret")[0]
+            assert turn[0] >= 0
+            at_rest = robot.state([0.0]).orientation("turret")
+            turned = quaternions.product(turn, quaternions.conjugate(at_rest))
+            angle_seen = float(quaternions.log(turned).norm())
+            assert angle_seen == pytest.approx(abs((angle + np.pi) % (2 * np.pi) - np.pi))
 
 
 def test_one_robot_has_any_shape():
@@ -51,11 +109,12 @@ def test_a_link_that_nothing_moves_has_a_jacobian_of_zeros():
     assert not state.jacobians.any()
 
 
-def test_upper_body_agrees_with_pytorch_kinematics():
+@pytest.mark.parametrize("repeats", [1, 10])
+def test_upper_body_agrees_with_pytorch_kinematics(repeats):
     robot = upper_body()
     chain = pytorch_kinematics.build_chain_from_urdf(upper_body_urdf().encode())
     assert tuple(chain.get_joint_parameter_names()) == robot.joint_names
-    joints = random_joints(robot, 20)
+    joints = random_joints(robot, 20).repeat(repeats, 1)
     state = robot.state(joints)
     poses = chain.to(dtype=torch.float64).forward_kinematics(joints)
     for hand in HANDS:
@@ -66,9 +125,16 @@ def test_upper_body_agrees_with_pytorch_kinematics():
         torch.testing.assert_close(rotation, matrix[:, :3, :3], rtol=0, atol=1e-6)
 
 
-def test_second_derivatives_are_those_of_finite_differences():
+@pytest.mark.parametrize("make", [upper_body, zoo, lambda: zoo(base="tip"), g1])
+def test_the_jacobian_is_the_derivative_of_the_poses(make):
+    robot = make()
+    assert_differences_agree(robot, random_joints(robot, seed=1))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_second_derivatives_are_those_of_finite_differences(count):
     robot = zoo()
-    joints = random_joints(robot, 1).requires_grad_()
+    joints = random_joints(robot, count).requires_grad_()
 
     def position(q):
         return robot.state(q).positions

@@ -76,11 +76,6 @@ class TestOracles:
                 np.testing.assert_allclose(position, body.xpos, atol=1e-12)
                 np.testing.assert_allclose(rotation, body.xmat.reshape(3, 3), atol=1e-12)
 
-    @pytest.mark.parametrize("make", [upper_body, zoo, lambda: zoo(base="tip"), g1])
-    def test_jacobian_is_the_derivative_of_the_poses(self, make: Any) -> None:
-        robot = make()
-        assert_differences_agree(robot, random_joints(robot, seed=1))
-
 
 class TestUpperBody:
     def test_shoulder_centres_are_the_published_ones(self) -> None:

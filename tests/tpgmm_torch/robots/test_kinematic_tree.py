@@ -1,0 +1,105 @@
+"""The moving part of a description, hung on any base, against pinocchio."""
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from tests.support.robot_zoo import (
+    ZOO,
+    ZOO_FOLLOWERS,
+    ZOO_JOINTS,
+    ZOO_LINKS,
+    Pinocchio,
+    random_joints,
+    written_out,
+    zoo,
+)
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.kinematic_tree import MovingTree, reduce
+from tpgmm_torch.robots.urdf import placement, read_urdf
+
+COLUMNS = {name: column for column, name in enumerate(ZOO_JOINTS)}
+
+
+def tree(
+    links: Any, base: str = "ground", joints: Any = COLUMNS, **locked: float
+) -> MovingTree:
+    others = dict.fromkeys(set(ZOO_JOINTS) - set(joints), 0.0)
+    wanted = [(link, np.eye(4)) for link in links]
+    return reduce(read_urdf(ZOO), base, wanted, joints, others | locked)
+
+
+@pytest.mark.parametrize("base", ["ground", "column", "turret", "flange", "tip", "r_finger"])
+@pytest.mark.parametrize("locked", [{}, {"elbow": 0.7, "lift": 0.3}, {"grip": 0.05}])
+def test_poses_and_jacobians_are_those_of_pinocchio_from_any_base(base, locked):
+    names = [name for name in ZOO_JOINTS if name not in locked]
+    reduced = tree(ZOO_LINKS, base, {n: i for i, n in enumerate(names)}, **locked)
+    oracle = Pinocchio(pin.buildModelFromXML(ZOO), ZOO_FOLLOWERS)
+    for joints in random_joints(zoo(joints=names), 5).numpy():
+        oracle.run(locked | dict(zip(names, joints.tolist(), strict=True)))
+        poses, jacobians = written_out(reduced, joints)
+        for link, pose, jacobian in zip(ZOO_LINKS, poses, jacobians, strict=True):
+            position, rotation, expected = oracle.link(link, base, tuple(names))
+            np.testing.assert_allclose(pose[:3, 3], position, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(pose[:3, :3], rotation, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(jacobian, expected, rtol=0, atol=1e-12)
+
+
+def test_only_joints_on_the_way_are_kept_and_parents_come_first():
+    reduced = tree(("flange", "tail"))
+    assert [frame.joint for frame in reduced.frames] == [0, 1, 2, 4]
+    assert [frame.parent for frame in reduced.frames] == [-1, 0, 1, -1]
+    assert [frame.prismatic for frame in reduced.frames] == [True, False, False, False]
+    assert [link.frame for link in reduced.links] == [2, 3]
+    assert reduced.moved_by(2) == {0, 1, 2}
+    assert reduced.moved_by(3) == {3}
+    assert reduced.moved_by(-1) == set()
+
+
+def test_followers_say_how_they_follow():
+    reduced = tree(("r_finger", "tip"))
+    following = {(f.joint, f.multiplier, f.shift) for f in reduced.frames}
+    assert following == {
+        (0, 1.0, 0.0),
+        (1, 1.0, 0.0),
+        (2, 1.0, 0.0),
+        (3, -1.0, 0.01),
+        (4, 1.0, 0.0),
+        (2, 0.5, 0.2),
+    }
+
+
+def test_what_two_links_share_is_there_once():
+    reduced = tree(("l_finger", "r_finger", "flange", "flange"))
+    assert len(reduced.frames) == 5
+    assert [link.frame for link in reduced.links] == [3, 4, 2, 2]
+
+
+def test_seen_from_beyond_a_joint_its_axis_is_the_other_way_round():
+    down, up = tree(("column",)), tree(("ground",), "column")
+    assert down.frames[0].axis.tolist() == [0, 0, 1]
+    assert up.frames[0].axis.tolist() == [0, 0, -1]
+    np.testing.assert_array_equal(down.links[0].pose, np.eye(4))
+    np.testing.assert_allclose(up.links[0].pose @ down.frames[0].offset, np.eye(4), atol=1e-15)
+
+
+def test_the_pose_in_a_link_is_kept_behind_what_is_folded_into_it():
+    tool = placement(np.array([0.1, 0.2, 0.3]), np.array([0.3, 0.2, 0.1]))
+    weld = placement(np.array([0.2, 0.0, 0.0]), np.array([1.2, 0.4, -0.7]))
+    reduced = reduce(read_urdf(ZOO), "arm", [("flange", tool)], COLUMNS, {})
+    assert reduced.frames == ()
+    assert reduced.links[0].frame == -1
+    np.testing.assert_allclose(reduced.links[0].pose, weld @ tool, atol=1e-15)
+
+
+def test_joints_of_several_degrees_of_freedom_are_refused_only_on_the_way():
+    text = ZOO.replace("</robot>", "") + (
+        '<link name="world"/><joint name="free" type="floating">'
+        '<parent link="world"/><child link="ground"/></joint></robot>'
+    )
+    model, wanted = read_urdf(text), [("flange", np.eye(4))]
+    assert len(reduce(model, "ground", wanted, COLUMNS, {}).frames) == 3
+    with pytest.raises(DataError, match="'free' of type 'floating' lies between"):
+        reduce(model, "world", wanted, COLUMNS, {})
