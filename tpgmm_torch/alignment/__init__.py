@@ -1,9 +1,11 @@
-"""Demonstrations of unequal duration brought onto one clock."""
+"""Demonstrations of unequal duration brought onto one clock.
+
+Transformers in scikit-learn's sense on lists of demonstrations. What they return can be
+fitted as it is; without alignment, demonstrations are fitted on their own clocks.
+"""
 
 from tpgmm_torch.alignment.base import Alignment
-from tpgmm_torch.alignment.dynamic_time_warping import (
-    DynamicTimeWarping,
-    LinearTimeNormalization,
-)
+from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping
+from tpgmm_torch.alignment.linear import LinearTimeNormalization
 
 __all__ = ["Alignment", "DynamicTimeWarping", "LinearTimeNormalization"]

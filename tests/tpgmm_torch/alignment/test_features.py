@@ -4,13 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.motions import DEMONSTRATIONS, Arm
+from tests.support.motions import DEMONSTRATIONS, Arm, turning
+from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.alignment.features import AlignmentFeatures, quaternion_columns
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import (
     DataError,
+    ShapeError,
     UnknownNameError,
 )
+from tpgmm_torch.robots.tracked_poses import Poses
 
 
 def test_features_are_named_and_constant_ones_left_out():
@@ -38,3 +42,128 @@ def test_frames_unknown_to_fit_are_an_error():
     bare = Demonstration(DEMONSTRATIONS[0].time, DEMONSTRATIONS[0].joints, None, tuple("abcde"))
     with pytest.raises(UnknownNameError, match="'elbow in bottle'"):
         fitted.transform([bare])
+
+
+def unscaled(demonstrations, name, robot=None):
+    """The columns of one group, which has weight 1."""
+    features = AlignmentFeatures.fit(demonstrations, robot, [name], {name: 1.0})
+    return [features(one) for one in demonstrations]
+
+
+def variance(rows):
+    """Of the columns along each demonstration, summed; a mean over all time steps."""
+    sizes = [len(one) for one in rows]
+    return np.average([one.var(axis=0).sum() for one in rows], weights=sizes)
+
+
+@pytest.mark.parametrize("name", ["joints", "directions", "hand", "hand in bottle"])
+def test_a_group_has_the_square_of_its_weight_as_variance(name):
+    family = DEMONSTRATIONS[:3]
+    features = AlignmentFeatures.fit(family, Arm(), [name], {name: 2.5})
+    assert variance([features(one) for one in family]) == pytest.approx(2.5**2)
+
+
+def test_usual_weights_are_three_for_the_directions_and_one_for_all_others():
+    family = DEMONSTRATIONS[:3]
+    features = AlignmentFeatures.fit(family, Arm())
+    assert features.names == ("joints", "directions", "elbow", "hand")
+    assert list(features.scales) == list(features.columns) == list(features.names)
+    by_group = {
+        name: features.scales[name]
+        / AlignmentFeatures.fit(family, Arm(), [name], {name: 1.0}).scales[name]
+        for name in features.names
+    }
+    other = 3**-0.5
+    expected = {"joints": other, "directions": 3.0, "elbow": other, "hand": other}
+    assert by_group == pytest.approx(expected)
+    alone = AlignmentFeatures.fit(family, None, ["directions"])
+    assert variance([alone(one) for one in family]) == pytest.approx(9.0)
+
+
+def test_features_are_what_they_are_called():
+    family = DEMONSTRATIONS[:2]
+    [joints, _] = unscaled(family, "joints")
+    given = family[0].joints.numpy()
+    np.testing.assert_allclose(joints / joints[500, 0], given / given[500, 0], rtol=1e-9)
+    seen = unscaled(family, "hand in bottle", Arm())[0]
+    frame = family[0].frames["bottle"]
+    place = frame.inverse_transform(Arm().state(family[0].joints).position("hand")).numpy()
+    moved = place.std(axis=0) > 1e-9
+    np.testing.assert_allclose(seen / seen[300, 0], place[:, moved] / place[300, moved][0])
+
+
+def test_directions_do_not_depend_on_the_speed_and_fade_out_at_standstill():
+    time = np.linspace(0, 4, 401)
+    # forth along (3, 4), a rest, and back at half the speed
+    way = np.interp(time, [0, 1, 2, 4], [0, 1, 1, 0])
+    direction = unscaled([Demonstration(time, np.outer(way, [3.0, 4.0]))], "directions")[0]
+    forth, rest, back = direction[50], direction[150], direction[300]
+    np.testing.assert_allclose(forth[1] / forth[0], 4 / 3)
+    np.testing.assert_allclose(rest, 0, atol=1e-9)
+    np.testing.assert_allclose(back / back[1], forth / forth[1])
+    # of speeds 5 and 2.5 after a root mean square over all of them
+    speeds = np.array([5.0, 2.5])
+    usual = 0.3**2 * np.mean(np.array([5.0, 0, 2.5, 2.5]) ** 2)
+    expected = np.divide(*(speeds / np.sqrt(speeds**2 + usual)))
+    assert -forth[0] / back[0] == pytest.approx(expected, rel=0.01)
+
+
+def test_directions_are_those_of_uneven_time_steps_too():
+    time = np.linspace(0, 2, 201) ** 2
+    even = np.linspace(0, 4, 201)
+
+    def path(t):
+        return np.stack((np.sin(2 * t), np.cos(3 * t)), axis=1)
+
+    uneven, regular = (
+        unscaled([Demonstration(t, path(t))], "directions")[0] for t in (time, even)
+    )
+    for column in range(2):
+        expected = np.interp(time, even, regular[:, column])
+        ratio = uneven[20:-20, column] @ expected[20:-20] / (expected[20:-20] ** 2).sum()
+        assert np.abs(uneven[20:-20, column] - ratio * expected[20:-20]).max() < 0.1
+
+
+def test_quaternions_are_found_by_the_names_of_the_joints():
+    time = np.linspace(0, 1, 30)
+    own = turning(time, time)
+    poses = Poses(["hand"])
+    assert quaternion_columns(own, poses) == [[3, 4, 5, 6]]
+    names = own.joint_names
+    assert quaternion_columns(own.reordered(names[::-1]), poses) == [[3, 2, 1, 0]]
+    plain = Demonstration(own.time, own.joints)
+    assert quaternion_columns(plain, poses) == [[3, 4, 5, 6]]
+    assert quaternion_columns(plain, None) == quaternion_columns(plain, Arm()) == []
+    with pytest.raises(ShapeError, match="has 3 joints without names, the robot has 7"):
+        quaternion_columns(Demonstration(time, np.ones((30, 3))), poses)
+    with pytest.raises(UnknownNameError, match=r"'hand\.qw' is not in the demonstration"):
+        quaternion_columns(own.reordered(names[:3]), poses)
+
+
+def test_quaternions_count_as_rotations():
+    time = np.linspace(0, 1, 30)
+    own = turning(time, time)
+    turns = own.frames["moving"].orientation
+    [rows] = unscaled([own], "joints", Poses(["hand"]))
+    expected = np.column_stack((own.joints[:, :3], quaternions.to_matrix(turns).flatten(1)))
+    np.testing.assert_allclose(rows / rows[9, 0], expected / expected[9, 0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "weights", "error", "message"),
+    [
+        (["knee"], None, UnknownNameError, "feature 'knee' is not in the features; it has"),
+        (None, {"knee": 1.0}, UnknownNameError, "weight 'knee' is not in the features"),
+        (None, {"joints": -1.0}, DataError, "'joints' is a number >= 0, got -1"),
+        (None, {"joints": np.inf}, DataError, "'joints' is a number >= 0, got inf"),
+        (["joints"], {"joints": 0.0}, DataError, r"none of the features \['joints'\] changes"),
+    ],
+)
+def test_what_is_no_feature_or_weight_is_refused(names, weights, error, message):
+    with pytest.raises(error, match=message):
+        AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, names, weights)
+
+
+def test_a_weight_of_nothing_leaves_a_group_out():
+    features = AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, None, {"joints": 0})
+    assert features.names == ("directions",)

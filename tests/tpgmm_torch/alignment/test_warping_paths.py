@@ -5,7 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tpgmm_torch.alignment.warping_paths import moving_average, warping_map, warping_path
+from tpgmm_torch.alignment.warping_paths import (
+    barycenter,
+    medoid,
+    moving_average,
+    resample,
+    warping_map,
+    warping_path,
+)
 
 
 def written_out(a, b, window, penalty, open_end):
@@ -69,3 +76,104 @@ def test_a_path_becomes_a_strictly_increasing_map():
     assert (np.diff(steps) > 0).all()
     assert steps == pytest.approx([0, 2, 2, 2, 4, 6], abs=0.01)
     assert steps[[0, -1]].tolist() == [0, 6]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1), length=st.integers(2, 40), width=st.sampled_from([0, 1, 3])
+)
+def test_a_map_keeps_both_ends_of_its_path_and_the_means_between(seed, length, width):
+    rng = np.random.default_rng(seed)
+    steps = np.array([[1, 1], [1, 0], [0, 1]])[rng.integers(0, 3, length)]
+    path = np.concatenate(([[0, 0]], steps.cumsum(axis=0)))
+    if path[-1, 0] == 0 or path[-1, 1] == 0:
+        return
+    found = warping_map(path, width)
+    assert len(found) == path[-1, 0] + 1
+    assert found[[0, -1]] == pytest.approx(path[[0, -1], 1], abs=1e-12)
+    assert (np.diff(found) > 0).all()
+    means = np.array([path[path[:, 0] == i, 1].mean() for i in range(len(found))])
+    means[[0, -1]] = path[[0, -1], 1]
+    line = np.linspace(0, path[-1, 1], len(found))
+    expected = 0.999 * moving_average(means, width) + 0.001 * line
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(30,), (30, 2)])
+@pytest.mark.parametrize("width", [0, 1, 4, 29, 50])
+def test_the_moving_average_is_a_hann_window_over_point_reflections(shape, width):
+    values = np.random.default_rng(0).standard_normal(shape)
+    smooth = moving_average(values, width)
+    assert smooth.shape == shape
+    width = min(width, 29)
+    offsets = np.arange(-width, width + 1)
+    weights = 1 + np.cos(np.pi * offsets / (width + 1))
+    for i in range(30):
+        around = []
+        for k in i + offsets:
+            if k < 0:
+                around.append(2 * values[0] - values[-k])
+            elif k > 29:
+                around.append(2 * values[-1] - values[58 - k])
+            else:
+                around.append(values[k])
+        expected = np.tensordot(weights / weights.sum(), np.array(around), 1)
+        np.testing.assert_allclose(smooth[i], expected, rtol=0, atol=1e-12)
+
+
+def test_a_single_value_cannot_be_smoothed():
+    assert moving_average(np.array([3.0]), 5).tolist() == [3.0]
+
+
+def test_columns_are_resampled_one_by_one():
+    time, grid = np.array([0.0, 1.0, 3.0]), np.array([0.5, 2.0, 4.0])
+    values = np.array([[0.0, 3.0], [2.0, 1.0], [4.0, 0.0]])
+    assert resample(values, time, grid).tolist() == [[1.0, 2.0], [3.0, 0.5], [4.0, 0.0]]
+
+
+@pytest.mark.parametrize("window", [None, 0.1])
+def test_the_medoid_has_the_least_summed_distance(window):
+    rng = np.random.default_rng(4)
+    family = [rng.standard_normal((n, 2)).cumsum(axis=0) for n in (20, 31, 25, 28)]
+    phase = np.linspace(0, 1, 31)
+    even = [resample(s, np.linspace(0, 1, len(s)), phase) for s in family]
+    band = None if window is None else 3
+    distances = [[np.sqrt(written_out(a, b, band, 0.0, False)) for b in even] for a in even]
+    sums = np.sum(distances, axis=1)
+    assert medoid(family, window) == int(np.argmin(sums))
+    # whatever place it has in the family
+    order = [int(np.argmin(sums)), *np.delete(np.arange(4), int(np.argmin(sums)))]
+    assert [medoid([family[i] for i in np.roll(order, k)], window) for k in range(4)] == [
+        0,
+        1,
+        2,
+        3,
+    ]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_of_two_the_first_is_the_medoid(count):
+    assert medoid([np.eye(3), np.ones((4, 3))][:count]) == 0
+
+
+def test_one_round_of_the_barycenter_averages_what_is_matched_with_each_point():
+    rng = np.random.default_rng(5)
+    family = [rng.standard_normal((n, 2)).cumsum(axis=0) for n in (12, 15, 10)]
+    start = family[0]
+    expected = [[] for _ in start]
+    for sequence in family:
+        for at, other in warping_path(start, sequence, penalty=0.5)[0]:
+            expected[at].append(sequence[other])
+    found = barycenter(family, start, 1, penalty=0.5)
+    np.testing.assert_allclose(found, [np.mean(e, axis=0) for e in expected], atol=1e-12)
+
+
+def test_rounds_of_the_barycenter_lower_the_cost_until_they_do_not():
+    rng = np.random.default_rng(6)
+    family = [rng.standard_normal((30, 2)).cumsum(axis=0) for _ in range(4)]
+
+    def cost(average):
+        return sum(warping_path(average, sequence)[1] for sequence in family)
+
+    costs = [cost(barycenter(family, family[0], rounds)) for rounds in (1, 2, 3, 30, 31)]
+    assert cost(family[0]) > costs[0] > costs[1] > costs[2] >= costs[3] == costs[4]
+    np.testing.assert_array_equal(barycenter([family[0], family[0]], family[0], 5), family[0])
