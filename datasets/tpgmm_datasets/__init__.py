@@ -3,25 +3,21 @@
 Needs the extra ``data`` (pandas, pyarrow); LeRobot itself is never imported.
 """
 
-from tpgmm_torch.exceptions import DependencyError
+from importlib import import_module
+from typing import TYPE_CHECKING
 
-try:
-    import pandas  # noqa: F401
-    import pyarrow  # noqa: F401
-except ModuleNotFoundError as error:
-    raise DependencyError(
-        f"data sets need {error.name}: pip install 'tpgmm-torch[data]'"
-    ) from None
-
-from tpgmm_datasets.conversion.poses import FramePose, LinkPose
-from tpgmm_datasets.conversion.timing import resample, trim
-from tpgmm_datasets.description import DatasetInfo, describe_lerobot
-from tpgmm_datasets.episode_batches import EpisodeBatches
-from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
-from tpgmm_datasets.reader import iter_lerobot, load_lerobot
-from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
-from tpgmm_datasets.units import Scale
-from tpgmm_datasets.writer import save_lerobot
+# what needs pandas and PyTorch is loaded when it is first asked for, so that the commands
+# here are quick to look up
+if TYPE_CHECKING:
+    from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+    from tpgmm_datasets.conversion.timing import resample, trim
+    from tpgmm_datasets.description import DatasetInfo, describe_lerobot
+    from tpgmm_datasets.episode_batches import EpisodeBatches
+    from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
+    from tpgmm_datasets.reader import iter_lerobot, load_lerobot
+    from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
+    from tpgmm_datasets.units import Scale
+    from tpgmm_datasets.writer import save_lerobot
 
 __all__ = [
     "CHECKS",
@@ -41,3 +37,39 @@ __all__ = [
     "save_lerobot",
     "trim",
 ]
+
+_HOMES = {
+    "conversion.poses": ("FramePose", "LinkPose"),
+    "conversion.timing": ("resample", "trim"),
+    "description": ("DatasetInfo", "describe_lerobot"),
+    "episode_batches": ("EpisodeBatches",),
+    "errors": ("CHECKS", "DatasetError", "DatasetWarning"),
+    "reader": ("iter_lerobot", "load_lerobot"),
+    "tables": ("demonstrations_from_frame", "demonstrations_to_frame"),
+    "units": ("Scale",),
+    "writer": ("save_lerobot",),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    """A public name, loaded when it is first asked for."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = import_module(f"{__name__}.{_HOME[name]}")
+    except ModuleNotFoundError as error:
+        if error.name not in ("pandas", "pyarrow"):
+            raise
+        from tpgmm_torch.exceptions import DependencyError
+
+        raise DependencyError(
+            f"data sets need {error.name}: pip install 'tpgmm-torch[data]'"
+        ) from None
+    globals()[name] = getattr(module, name)
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    """What there is to ask for, whether or not it is loaded yet."""
+    return sorted({*globals(), *__all__})

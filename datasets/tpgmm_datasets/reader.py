@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -17,146 +19,6 @@ from tpgmm_datasets.units import Units
 from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
-
-
-def load_lerobot(
-    path: str | Path,
-    *,
-    robot: Any = None,
-    joints: str | None = None,
-    joint_names: Mapping[str, str] | Sequence[str] | None = None,
-    units: Units = "auto",
-    frames: Mapping[str, FrameSource] | None = None,
-    events: Mapping[str, EventSource] | None = None,
-    episodes: slice | Sequence[int] | str | None = None,
-    rate: float | None = None,
-    trim: float | None = None,
-    relax: Collection[str] = (),
-) -> list[Demonstration]:
-    """Read a LeRobot data set as demonstrations; videos are not looked at.
-
-    Parameters
-    ----------
-    path : str or Path
-        A folder in layout v2.1 or v3.0, or the id of a data set on the Hugging Face hub.
-    robot : object with ``joint_names`` and ``state(joints)``, optional
-        The demonstrations then have its joints in its order, found by name (also if spelled
-        in another way, ``kLeftElbow`` or ``l_elbow.pos`` for ``left_elbow_joint``); values
-        of the set that are none of its joints are left out. Without a robot all values are
-        taken.
-    joints : str, optional
-        The feature that holds the joints; the default is the first of
-        ``observation.state``, ``state``, ``action`` and their variants.
-    joint_names : mapping or sequence of str, optional
-        Names instead of the data set's: all of them in order, or name in the set to name of
-        the robot's joint for those that differ.
-    units : str, Scale, or mapping of name to these, default="auto"
-        ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is) or a
-        :class:`Scale`, for all values or by name. ``"auto"`` believes the metadata, else
-        assumes radians and refuses what cannot be radians.
-    frames : mapping of str to str, FramePose, LinkPose or Frame, optional
-        Where the pose of each frame is: in a feature (its name alone stands for x y z and a
-        quaternion w x y z, constant from the first row on; if the feature names the poses
-        in it, the one of this name), where a link is at an event, or given. The default is
-        every pose that the names of ``observation.environment_state`` tell of (``bottle.x``
-        ... ``bottle.qz``), constant if it never changes.
-    events : mapping of str to callable, optional
-        Functions from the demonstration, with all values of the joint feature, to a time
-        [s]. Columns ``event.*`` are found by themselves.
-    episodes : slice, sequence of int, or str, optional
-        Which: of all in order, by index, or those of a task. The default is all.
-    rate : float, optional
-        Resample to this many steps per second.
-    trim : float, optional
-        Cut off the start and end where no joint is faster than this [rad/s].
-    relax : collection of str, default=()
-        Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
-        left out with a :class:`DatasetWarning`.
-
-    Returns
-    -------
-    list of Demonstration
-        In order of the episodes; time starts at 0.
-
-    Raises
-    ------
-    DatasetError
-        With file, episode and column, if the set is incomplete or contradicts itself or the
-        arguments.
-
-    Examples
-    --------
-    >>> from tpgmm_datasets import save_lerobot
-    >>> import tempfile
-    >>> shown = Demonstration([0.0, 0.1, 0.2], [[0.0], [0.5], [1.0]], joint_names=["elbow"])
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = save_lerobot([shown], Path(folder) / "bends", fps=10, task="bend the elbow")
-    ...     [again] = load_lerobot(path)
-    >>> again.joint_names, again.joints[:, 0].tolist()
-    (('elbow',), [0.0, 0.5, 1.0])
-    """
-    selected = iter_lerobot(
-        path,
-        robot=robot,
-        joints=joints,
-        joint_names=joint_names,
-        units=units,
-        frames=frames,
-        events=events,
-        episodes=episodes,
-        rate=rate,
-        trim=trim,
-        relax=relax,
-    )
-    return list(selected)
-
-
-def iter_lerobot(
-    path: str | Path,
-    *,
-    robot: Any = None,
-    joints: str | None = None,
-    joint_names: Mapping[str, str] | Sequence[str] | None = None,
-    units: Units = "auto",
-    frames: Mapping[str, FrameSource] | None = None,
-    events: Mapping[str, EventSource] | None = None,
-    episodes: slice | Sequence[int] | str | None = None,
-    rate: float | None = None,
-    trim: float | None = None,
-    relax: Collection[str] = (),
-) -> Iterator[Demonstration]:
-    """Read episode by episode, for sets larger than memory.
-
-    The metadata are checked at the call, the rows of an episode when it comes.
-
-    Parameters
-    ----------
-    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
-        As for :func:`load_lerobot`.
-
-    Yields
-    ------
-    Demonstration
-
-    Raises
-    ------
-    DatasetError
-        As :func:`load_lerobot`.
-    """
-    recording = open_recording(
-        path,
-        robot=robot,
-        joints=joints,
-        joint_names=joint_names,
-        units=units,
-        frames=frames,
-        events=events,
-        episodes=episodes,
-        rate=rate,
-        trim=trim,
-        relax=relax,
-    )
-    return recording.demonstrations()
 
 
 @dataclass(frozen=True)
@@ -254,3 +116,118 @@ def select_episodes(
     if missing:
         raise DatasetError(f"there are no episodes {missing}; the set has {sorted(known)}")
     return [known[index] for index in sorted({int(index) for index in episodes})]
+
+
+def opened_by[**P, T](
+    opener: Callable[P, Recording],
+) -> Callable[[Callable[[Recording], T]], Callable[P, T]]:
+    """Let a function of a recording take the arguments of what opens one.
+
+    Parameters
+    ----------
+    opener : callable
+        Whose signature the function then has, for people, editors and type checkers.
+    """
+
+    def decorate(function: Callable[[Recording], T]) -> Callable[P, T]:
+        @wraps(function)
+        def opening(*args: P.args, **kwargs: P.kwargs) -> T:
+            return function(opener(*args, **kwargs))
+
+        returned = signature(function).return_annotation
+        shown = signature(opener).replace(return_annotation=returned)
+        opening.__signature__ = shown  # type: ignore[attr-defined]
+        return opening
+
+    return decorate
+
+
+@opened_by(open_recording)
+def load_lerobot(recording: Recording) -> list[Demonstration]:
+    """Read a LeRobot data set as demonstrations; videos are not looked at.
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder in layout v2.1 or v3.0, or the id of a data set on the Hugging Face hub.
+    robot : object with ``joint_names`` and ``state(joints)``, optional
+        The demonstrations then have its joints in its order, found by name (also if spelled
+        in another way, ``kLeftElbow`` or ``l_elbow.pos`` for ``left_elbow_joint``); values
+        of the set that are none of its joints are left out. Without a robot all values are
+        taken.
+    joints : str, optional
+        The feature that holds the joints; the default is the first of
+        ``observation.state``, ``state``, ``action`` and their variants.
+    joint_names : mapping or sequence of str, optional
+        Names instead of the data set's: all of them in order, or name in the set to name of
+        the robot's joint for those that differ.
+    units : str, Scale, or mapping of name to these, default="auto"
+        ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is) or a
+        :class:`Scale`, for all values or by name. ``"auto"`` believes the metadata, else
+        assumes radians and refuses what cannot be radians.
+    frames : mapping of str to str, FramePose, LinkPose or Frame, optional
+        Where the pose of each frame is: in a feature (its name alone stands for x y z and a
+        quaternion w x y z, constant from the first row on; if the feature names the poses
+        in it, the one of this name), where a link is at an event, or given. The default is
+        every pose that the names of ``observation.environment_state`` tell of (``bottle.x``
+        ... ``bottle.qz``), constant if it never changes.
+    events : mapping of str to callable, optional
+        Functions from the demonstration, with all values of the joint feature, to a time
+        [s]. Columns ``event.*`` are found by themselves.
+    episodes : slice, sequence of int, or str, optional
+        Which: of all in order, by index, or those of a task. The default is all.
+    rate : float, optional
+        Resample to this many steps per second.
+    trim : float, optional
+        Cut off the start and end where no joint is faster than this [rad/s].
+    relax : collection of str, default=()
+        Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
+        left out with a :class:`DatasetWarning`.
+
+    Returns
+    -------
+    list of Demonstration
+        In order of the episodes; time starts at 0.
+
+    Raises
+    ------
+    DatasetError
+        With file, episode and column, if the set is incomplete or contradicts itself or the
+        arguments.
+
+    Examples
+    --------
+    >>> from tpgmm_datasets import save_lerobot
+    >>> import tempfile
+    >>> shown = Demonstration([0.0, 0.1, 0.2], [[0.0], [0.5], [1.0]], joint_names=["elbow"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = save_lerobot([shown], Path(folder) / "bends", fps=10, task="bend the elbow")
+    ...     [again] = load_lerobot(path)
+    >>> again.joint_names, again.joints[:, 0].tolist()
+    (('elbow',), [0.0, 0.5, 1.0])
+    """
+    return list(recording.demonstrations())
+
+
+@opened_by(open_recording)
+def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
+    """Read episode by episode, for sets larger than memory.
+
+    The metadata are checked at the call, the rows of an episode when it comes.
+
+    Parameters
+    ----------
+    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
+        As for :func:`load_lerobot`.
+
+    Yields
+    ------
+    Demonstration
+        In order of the episodes.
+
+    Raises
+    ------
+    DatasetError
+        As :func:`load_lerobot`.
+    """
+    return recording.demonstrations()

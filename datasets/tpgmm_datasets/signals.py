@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Self
 
 from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources
-from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.conversion.poses import FramePose
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.hub import local_folder
-from tpgmm_datasets.lerobot.layout import Feature, open_layout
+from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
-from tpgmm_datasets.units import Scale, Units, as_scale
+from tpgmm_datasets.reader import open_recording
+from tpgmm_datasets.units import Scale, as_scale
 
 __all__ = ["Signals"]
 
@@ -52,32 +52,29 @@ class Signals:
     @classmethod
     def of(
         cls,
-        path: str,
+        path: str | Path,
         robot: Any = None,
         *,
-        joints: str | None = None,
-        units: Units = "auto",
         frames: Mapping[str, FrameSource] | None = None,
-        rate: float | None = None,
+        **options: Any,
     ) -> Self:
         """Read the metadata of a data set.
 
         Parameters
         ----------
-        path, robot, joints, units, frames, rate
-            What :func:`load_lerobot` was given.
+        path, robot, frames, **options
+            What :func:`load_lerobot` was given; frames at links are left out.
 
         Raises
         ------
         DatasetError
             If the data set cannot be read, or states and actions have different units.
         """
-        layout = open_layout(local_folder(path))
-        source = layout.feature(joints or joint_feature(layout))
+        assembly = open_recording(path, robot=robot, **options).assembly
+        layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
         state = layout.features.get(STATE, source)
         action = layout.features.get(ACTION)
         environment = layout.features.get(ENVIRONMENT)
-        columns = JointColumns.choose(source, None, units, robot)
         scales = {
             name: as_scale(unit, source.key)
             for name, unit in zip(columns.names or (), columns.units, strict=False)
@@ -92,7 +89,7 @@ class Signals:
             if isinstance(pose, FramePose) and environment and _plain(pose)
         }
         return cls(
-            rate or layout.fps,
+            assembly.rate or layout.fps,
             state.names,
             action.names if action else None,
             environment.names if environment else None,

@@ -108,7 +108,9 @@ def test_every_command_has_its_help_on_the_page_of_the_command_line():
     page = (DOCS / "api" / "command_line.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^```\{help-of\} (.+)$", page, re.MULTILINE))
     group = typer.main.get_command(application.app)
-    commands = {name: command for name, command in group.commands.items()}
+    context = typer.Context(group)
+    names = group.list_commands(context)
+    commands = {name: group.get_command(context, name) for name in names}
     known = {name for name, command in commands.items() if not hasattr(command, "commands")} | {
         f"{name} {inner}"
         for name, command in commands.items()

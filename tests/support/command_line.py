@@ -4,6 +4,9 @@ from typer.testing import CliRunner
 
 from tpgmm_torch.cli.application import app
 
+#: The robot of the generated skill, and its hands.
+UPPER_BODY = ("--robot", "upper_body", "--link", "l_hand", "--link", "r_hand")
+
 
 def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])

@@ -1,5 +1,8 @@
+"""Units of stored values: named, declared, guessed, calibrated."""
+
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,11 +18,8 @@ from tests.support.lerobot_sets import (
     undeclared,
     write,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    Scale,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, Scale, load_lerobot
+from tpgmm_datasets.units import as_scale, convert, guess_unit, with_pose_units
 
 
 @pytest.fixture
@@ -89,3 +89,55 @@ def test_scales_take_the_ends_of_a_range_to_each_other():
     assert ticks.factor * 3072 + ticks.offset == pytest.approx(math.pi / 2)
     with pytest.raises(DatasetError, match="two different ends"):
         Scale.between((1, 1), (0, 1))
+
+
+@pytest.mark.parametrize("zero", [None, 0, 1000, 1500, 2500])
+@pytest.mark.parametrize("per_turn", [4096, 1000])
+@pytest.mark.parametrize("stored", [(-100.0, 100.0), (0.0, 100.0)])
+def test_calibrated_values_are_angles_from_the_zero(zero, per_turn, stored):
+    low, high = 1000, 3000
+    scale = Scale.calibrated(low, high, per_turn=per_turn, zero=zero, stored=stored)
+    for share in (0.0, 0.3, 1.0):
+        value = stored[0] + share * (stored[1] - stored[0])
+        tick = low + share * (high - low) - (2000 if zero is None else zero)
+        angle = 2 * math.pi * tick / per_turn
+        assert scale.factor * value + scale.offset == pytest.approx(angle, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("rad", 1), ("deg", math.pi / 180), ("m", 1), ("mm", 1e-3), ("raw", 1), ("auto", 1)],
+)
+def test_units_have_names(unit, factor):
+    assert as_scale(unit, "c") == Scale(factor)
+    stored = np.array([[0.5, -2.0]])
+    converted = convert(stored, ("a", "b"), (unit, Scale(3.0, 1.0)), "c")
+    assert converted == pytest.approx(np.array([[0.5 * factor, -5.0]]))
+
+
+def test_an_unknown_unit_is_refused_with_its_column():
+    with pytest.raises(DatasetError, match=r"column 'c': unit 'turn' is unknown; .*'deg'"):
+        as_scale("turn", "c")
+
+
+@pytest.mark.parametrize(
+    ("largest", "guess"),
+    [
+        (4 * math.pi, "rad"),
+        (13, "deg or normalised"),
+        (100, "deg or normalised"),
+        (101, "deg"),
+        (360, "deg"),
+        (361, "ticks"),
+    ],
+)
+def test_a_unit_is_guessed_from_the_range(largest, guess):
+    assert guess_unit(0.0, largest) == guess_unit(-largest, 1.0) == guess
+
+
+def test_values_of_poses_have_the_units_of_poses():
+    names = ["elbow", *(f"cup.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz"))]
+    units = ("deg", "m", "m", "m", "1", "1", "1", "1")
+    assert with_pose_units(names, ["deg"] * 8) == units
+    assert with_pose_units(names[:-1], ["deg"] * 7) == ("deg",) * 7
+    assert with_pose_units(None, ["deg"]) == ("deg",)

@@ -5,18 +5,22 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from tpgmm_torch.cli.plugins import COMMANDS, found
+
 __all__ = ["explain"]
 
-#: Each entry point is a typer app or a function, added under its name.
-ENTRY_POINTS = "tpgmm.commands"
+#: What ``--help`` lists first, in this order; other plugins' commands follow.
+ORDER = ("demo", "fit", "reproduce", "plot", "view", "dataset")
+#: Plugins of this distribution are quick to import: ``--help`` shows what theirs are for.
+DISTRIBUTION = "tpgmm-torch"
 #: Packages that come with the extra ``cli``.
 OPTIONAL = ("dtaidistance", "matplotlib", "pandas", "pyarrow")
 
@@ -58,34 +62,31 @@ class Commands(TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Own commands, then those of plugins."""
-        own = super().list_commands(ctx)
-        return [*own, *sorted(set(_plugins()) - set(own))]
+        """The commands of this package and those of plugins."""
+        names = {*super().list_commands(ctx), *found(COMMANDS)}
+        return sorted(names, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command by name; of a plugin's, which may take long to import, only the name."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or cmd_name not in _plugins():
-            return own
-        plugin = _plugins()[cmd_name]
+        command = super().get_command(ctx, cmd_name)
+        if command is not None or (plugin := found(COMMANDS).get(cmd_name)) is None:
+            return command
         origin = plugin.dist.name if plugin.dist else plugin.module
+        if origin == DISTRIBUTION:
+            with suppress(Exception):  # --help lists the others all the same
+                return _loaded(plugin)
         return TyperCommand(cmd_name, help=f"A command of {origin}: tpgmm {cmd_name} --help")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is about to run; now a plugin is imported."""
-        name = args[0]
-        if name in set(_plugins()) - set(super().list_commands(ctx)):
-            self.add_command(_loaded(_plugins()[name]))
+        plugin = found(COMMANDS).get(args[0])
+        if plugin is not None and args[0] not in self.commands:
+            self.add_command(_loaded(plugin))
         return super().resolve_command(ctx, args)
 
 
 def explain(error: Exception) -> str | None:
-    """The message of an error that a user can mend; None for any other.
-
-    Parameters
-    ----------
-    error : Exception
-    """
+    """The message of an ``error`` that a user can mend; None for any other."""
     # typer brought its own copy of click's classes with it in some releases, not in others
     if hasattr(error, "format_message"):
         context = getattr(error, "ctx", None)
@@ -119,22 +120,18 @@ def _warnings_in_one_line() -> Iterator[None]:
         warnings.showwarning = original
 
 
-def _plugins() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
-
-
 def _loaded(plugin: EntryPoint) -> Any:
-    from tpgmm_torch.exceptions import DependencyError
-
     try:
-        found = plugin.load()
-        if not isinstance(found, typer.Typer):
-            if not callable(found):
-                raise TypeError(f"it is {found!r}, not a typer app or a function")
-            function, found = found, typer.Typer(add_completion=False)
-            found.command(plugin.name)(function)
-        command = typer.main.get_command(found)
+        app = plugin.load()
+        if not isinstance(app, typer.Typer):
+            if not callable(app):
+                raise TypeError(f"it is {app!r}, not a typer app or a function")
+            function, app = app, typer.Typer(add_completion=False)
+            app.command(plugin.name)(function)
+        command = typer.main.get_command(app)
     except Exception as error:  # whatever is wrong with it
+        from tpgmm_torch.exceptions import DependencyError
+
         raise DependencyError(
             f"the command {plugin.name!r} of a plugin cannot be loaded: "
             f"{type(error).__name__}: {error}"

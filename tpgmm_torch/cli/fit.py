@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from tpgmm_torch.cli import options
-from tpgmm_torch.cli.formats import OWN, writer
+from tpgmm_torch.cli.plugins import OWN, model_format
 
 if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
@@ -173,22 +173,21 @@ def fit(
     safetensors that 'tpgmm reproduce' and 'tpgmm plot' take. Several processes learn together
     under torchrun.
     """
-    from tpgmm_datasets.signals import Signals
     from tpgmm_torch.cli.training_data import read_training_data
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.large_data.processes import joined_processes
     from tpgmm_torch.mixture.checkpoints import Checkpoint
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
-    write = writer(output_format)
+    write = model_format(output_format)
     operators = [parse_operator(text) for text in operator or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
-    reading = options.reading_options(kinematics, frame, episodes, units, joints, rate)
+    recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
     links = kinematics.links if kinematics is not None else ()
     state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)
     kept = 0 if state is None else state.n_iter()
     with joined_processes() as processes:
-        data = read_training_data(dataset, reading, alignment, batch_episodes, processes)
+        data = read_training_data(recordings, kinematics, alignment, batch_episodes, processes)
         model = TaskParameterizedGMM(
             n_components,
             operators or default_operators(links, list(data.frames)),
@@ -212,15 +211,7 @@ def fit(
     if write is None:
         model.save(out)
     else:
-        signals = Signals.of(
-            dataset,
-            kinematics,
-            joints=joints,
-            units=reading["units"],
-            frames=reading["frames"],
-            rate=rate,
-        )
-        write(model, out, signals)
+        write(model, out, recordings.signals())
     _report(model, durations, steps, data.aligned)
     if kept:
         typer.echo(f"resumed          {checkpoint}, after {kept} iterations")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+
+from tpgmm_torch.cli import plugins
 
 if TYPE_CHECKING:
     from tpgmm_torch.alignment.base import Alignment
@@ -18,22 +19,12 @@ if TYPE_CHECKING:
 __all__ = [
     "align",
     "aligner",
-    "parse_episodes",
-    "parse_frames",
-    "parse_units",
-    "read_demonstrations",
     "read_robot",
-    "reading_options",
+    "recordings",
 ]
 
 DATA, ROBOT = "Data set", "Robot"
 ENVIRONMENT = "observation.environment_state"
-#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
-FRAME = re.compile(
-    r"(?P<name>[^=@\[\]]+)"
-    r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
-)
-
 Dataset = Annotated[str, typer.Argument(help="A LeRobot data set: its folder, or its hub id.")]
 Model = Annotated[Path, typer.Argument(metavar="DIR", help="A model that 'tpgmm fit' saved.")]
 Frames = Annotated[
@@ -116,7 +107,7 @@ AlignmentMethod = Annotated[
 ]
 
 
-def read_demonstrations(
+def recordings(
     dataset: str,
     robot: Kinematics | None,
     frames: Sequence[str] | None,
@@ -124,125 +115,21 @@ def read_demonstrations(
     units: Sequence[str] | None,
     joints: str | None,
     rate: float | None,
-) -> list[Demonstration]:
-    """Read a data set as the options say.
+) -> plugins.Recordings:
+    """A data set as the options say, not yet read.
 
     Parameters
     ----------
     dataset : str
+        A folder or a hub id.
     robot : Kinematics or None
         Gives the order of the joints.
     frames, episodes, units, joints, rate
         The options.
     """
-    from tpgmm_datasets import load_lerobot
-
-    return load_lerobot(
-        dataset, **reading_options(robot, frames, episodes, units, joints, rate)
-    )
-
-
-def reading_options(
-    robot: Kinematics | None,
-    frames: Sequence[str] | None,
-    episodes: str | None,
-    units: Sequence[str] | None,
-    joints: str | None,
-    rate: float | None,
-) -> dict[str, Any]:
-    """Arguments of ``load_lerobot`` that say what the options do.
-
-    Parameters
-    ----------
-    robot, frames, episodes, units, joints, rate
-        As for :func:`read_demonstrations`.
-    """
-    return {
-        "robot": robot,
-        "frames": parse_frames(frames or ()),
-        "episodes": parse_episodes(episodes),
-        "units": parse_units(units or ()),
-        "joints": joints,
-        "rate": rate,
-    }
-
-
-def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
-    """What ``load_lerobot`` takes as ``frames``; None if nothing was given.
-
-    Parameters
-    ----------
-    texts : sequence of str
-        ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``.
-
-    Raises
-    ------
-    DataError
-        If a text is none of these.
-    """
-    from tpgmm_datasets import FramePose, LinkPose
-    from tpgmm_torch.exceptions import DataError
-
-    frames: dict[str, Any] = {}
-    for text in texts:
-        match = FRAME.fullmatch(text)
-        if match is None:
-            raise DataError(
-                f"frame {text!r} is none of NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
-                "NAME=LINK@EVENT"
-            )
-        source, event, start = match["source"], match["event"], match["start"]
-        if event:
-            frames[match["name"]] = LinkPose(source, event)
-        elif source is None:
-            frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
-        else:
-            columns = slice(int(start), int(match["stop"])) if start else None
-            frames[match["name"]] = FramePose(source, columns)
-    return frames or None
-
-
-def parse_episodes(text: str | None) -> slice | list[int] | str | None:
-    """What ``load_lerobot`` takes as ``episodes``.
-
-    Parameters
-    ----------
-    text : str or None
-        ``"0:10"`` is a slice, ``"0,3,5"`` a list, anything else the name of a task.
-    """
-    if text is None:
-        return None
-    if re.fullmatch(r"(-?\d*):(-?\d*)", text):
-        start, stop = (int(part) if part else None for part in text.split(":"))
-        return slice(start, stop)
-    if re.fullmatch(r"\d+(,\d+)*", text):
-        return [int(part) for part in text.split(",")]
-    return text
-
-
-def parse_units(texts: Sequence[str]) -> Any:
-    """What ``load_lerobot`` takes as ``units``.
-
-    Parameters
-    ----------
-    texts : sequence of str
-        One unit for all, or any number of ``JOINT=UNIT``.
-
-    Raises
-    ------
-    DataError
-        If both are given, or several for all.
-    """
-    from tpgmm_torch.exceptions import DataError
-
-    pairs = [text.rpartition("=") for text in texts]
-    if not pairs:
-        return "auto"
-    if len(pairs) == 1 and not pairs[0][1]:
-        return pairs[0][2]
-    if not all(name and unit for name, _, unit in pairs):
-        raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
-    return {name: unit for name, _, unit in pairs}
+    reader = plugins.required(plugins.READERS, "lerobot")
+    opened: plugins.Recordings = reader(dataset, robot, frames, episodes, units, joints, rate)
+    return opened
 
 
 def read_robot(
@@ -286,10 +173,8 @@ def read_robot(
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.urdf import read_urdf
 
-    if robot == "upper_body":
-        from tpgmm_datasets.robots import upper_body_urdf
-
-        robot = upper_body_urdf()
+    if robot in (named := plugins.found(plugins.ROBOTS)):
+        robot = str(named[robot].load()())
     moving = None
     if joints:
         actuated = read_urdf(robot).actuated

@@ -59,11 +59,8 @@ def plot(
     for name in chosen:
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
-    demonstrations = options.align(
-        options.read_demonstrations(dataset, kinematics, frame, episodes, units, joints, rate),
-        alignment,
-        kinematics,
-    )
+    recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
+    demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
     [trajectory] = fitted.predict([Situation.of(demonstrations[0])])
     shown: list[tuple[Any, Any, Any]] = [(trajectory, demonstrations[0].frames, {})]
     drawings: dict[str, Figure] = {}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tpgmm_torch.cli import options
+from tpgmm_torch.cli.plugins import TABLES, required
 
 if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -69,9 +70,9 @@ def reproduce(
     if dataset is not None:
         wanted = [
             situation_of(demonstration)
-            for demonstration in options.read_demonstrations(
+            for demonstration in options.recordings(
                 dataset, kinematics, frame, episodes, units, joints, rate
-            )
+            ).demonstrations()
         ]
     elif situations is not None:
         wanted = read_situations(situations, kinematics.joint_names)
@@ -127,11 +128,10 @@ def _write(
 ) -> None:
     import numpy as np
 
-    from tpgmm_datasets import demonstrations_to_frame
     from tpgmm_torch.atomic import replacing
     from tpgmm_torch.data.demonstrations import Demonstration
 
-    table = demonstrations_to_frame(
+    table = required(TABLES, "pandas")(
         [
             Demonstration(t.time, t.joints, s.frames, t.joint_names)
             for t, s in zip(trajectories, situations, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -12,8 +12,10 @@ from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
     from tpgmm_torch.alignment.base import Alignment
+    from tpgmm_torch.cli.plugins import Recordings
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.large_data.processes import Processes
+    from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["AlignedBatches", "TrainingData", "read_training_data"]
 
@@ -86,8 +88,8 @@ class TrainingData:
 
 
 def read_training_data(
-    dataset: str,
-    reading: dict[str, Any],
+    recordings: Recordings,
+    robot: Kinematics | None,
     alignment: str,
     batch_episodes: int | None,
     processes: Processes,
@@ -99,23 +101,23 @@ def read_training_data(
 
     Parameters
     ----------
-    dataset : str
-    reading : dict
-        Arguments of ``load_lerobot``.
+    recordings : Recordings
+        All episodes.
+    robot : Kinematics or None
+        What the alignment may ask for links.
     alignment : {"dtw", "barycenter", "linear", "none"}
+        The option.
     batch_episodes : int or None
         Episodes in a batch.
     processes : Processes
+        Those that learn together.
     """
-    from tpgmm_datasets import EpisodeBatches, load_lerobot
-
-    robot = reading["robot"]
     if batch_episodes is None:
-        read = load_lerobot(dataset, **reading)
+        read = recordings.demonstrations()
         aligned = options.align(read, alignment, robot)
         return TrainingData(processes.share(aligned), tuple(read[0].frames), read, aligned)
-    first = next(iter(EpisodeBatches(dataset, batch_episodes, **reading)))
+    first = next(iter(recordings.batches(batch_episodes)))
     chosen = options.aligner(alignment, robot)
     fitted = None if chosen is None else chosen.fit(first)
-    batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **reading)
+    batches = recordings.batches(batch_episodes, processes)
     return TrainingData(AlignedBatches(batches, fitted), tuple(first[0].frames), (), ())

@@ -107,9 +107,9 @@ def view(
     fitted = TaskParameterizedGMM.load(where, device="cpu")
     demonstrations = []
     if dataset is not None:
-        demonstrations = options.read_demonstrations(
+        demonstrations = options.recordings(
             dataset, fitted.kinematics_, frame, episodes, units, joints, rate
-        )
+        ).demonstrations()
     if situations is not None:
         wanted = read_situations(situations, fitted.kinematics_.joint_names)
     else:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tpgmm_datasets.conversion.timing import row_times, time_problems
 from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
 from tpgmm_datasets.lerobot.files import METADATA_KEY
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
 from tpgmm_datasets.lerobot.parquet import episode_tables, open_parquet
+from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
 __all__ = ["EpisodeRows", "Policy", "read_episodes", "strict_policy"]
 

@@ -1,60 +1,15 @@
-"""Commands that other distributions add to ``tpgmm``."""
+"""What is found by entry points: formats of models, readers, robots, tables."""
 
 from importlib.metadata import EntryPoint
 
 import pytest
-import typer
 
-from tests.support.command_line import output, run
-from tpgmm_torch.cli import commands, formats
+from tests.support.command_line import refusal
+from tpgmm_datasets import demonstrations_to_frame
+from tpgmm_datasets.commands.recordings import Recordings
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch.cli import plugins
 from tpgmm_torch.exceptions import DataError, DependencyError
-
-
-def greet(name: str = "you") -> None:
-    """Greet."""
-    typer.echo(f"hello {name}")
-
-
-greeting = typer.Typer()
-greeting.command()(greet)
-nonsense = 1
-
-
-@pytest.fixture
-def plugins(monkeypatch):
-    entries = {"greet": "greet", "welcome": "greeting", "odd": "nonsense", "gone": "absent"}
-    found = [
-        EntryPoint(name, f"{__name__}:{value}", commands.ENTRY_POINTS)
-        for name, value in entries.items()
-    ]
-    found.append(EntryPoint("fit", f"{__name__}:greet", commands.ENTRY_POINTS))
-    monkeypatch.setattr(commands, "entry_points", lambda group: found)
-
-
-def test_plugins_add_commands(plugins):
-    for name in ("greet", "welcome"):
-        assert output(name, "--name", "me") == "hello me\n"
-    assert "Learn a skill" in output("fit", "--help")
-
-
-def test_help_names_the_commands_of_plugins_without_importing_any(plugins):
-    result = run("--help")
-    assert result.exit_code == 0
-    assert result.stderr == ""
-    unwrapped = " ".join(result.stdout.replace("│", " ").split())
-    for name in ("greet", "welcome", "odd", "gone"):
-        assert f"tpgmm {name} --help" in unwrapped
-    assert "Greet." in output("greet", "--help")
-
-
-@pytest.mark.parametrize(("name", "reason"), [("gone", "AttributeError"), ("odd", "it is 1")])
-def test_a_broken_plugin_is_one_line_and_spares_the_others(plugins, name, reason):
-    result = run(name)
-    assert result.exit_code == 2
-    [line] = result.stderr.splitlines()
-    assert line.startswith(f"tpgmm: the command {name!r} of a plugin cannot be loaded")
-    assert reason in line
-    assert output("greet") == "hello you\n"
 
 
 def sketch(model, path, signals):
@@ -63,13 +18,27 @@ def sketch(model, path, signals):
 
 def test_plugins_add_formats(monkeypatch):
     found = [
-        EntryPoint("sketch", f"{__name__}:sketch", formats.ENTRY_POINTS),
-        EntryPoint("gone", f"{__name__}_gone:sketch", formats.ENTRY_POINTS),
+        EntryPoint("sketch", f"{__name__}:sketch", plugins.FORMATS),
+        EntryPoint("gone", f"{__name__}_gone:sketch", plugins.FORMATS),
     ]
-    monkeypatch.setattr(formats, "entry_points", lambda group: found)
-    assert formats.writer("tpgmm") is None
-    assert formats.writer("sketch").__doc__ == sketch.__doc__
+    monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+    assert plugins.model_format("tpgmm") is None
+    assert plugins.model_format("sketch").__doc__ == sketch.__doc__
     with pytest.raises(DependencyError, match=r"the plugin of format 'gone'.*cannot be loaded"):
-        formats.writer("gone")
+        plugins.model_format("gone")
     with pytest.raises(DataError, match=r"there are \['gone', 'sketch', 'tpgmm'\]"):
-        formats.writer("onnx")
+        plugins.model_format("onnx")
+
+
+def test_what_this_distribution_registers_is_there():
+    assert {"dataset", "demo"} <= plugins.found(plugins.COMMANDS).keys()
+    assert plugins.required(plugins.READERS, "lerobot") is Recordings
+    assert plugins.required(plugins.ROBOTS, "upper_body") is upper_body_urdf
+    assert plugins.required(plugins.TABLES, "pandas") is demonstrations_to_frame
+
+
+def test_an_installation_that_is_older_than_the_code_is_pointed_out(monkeypatch, tmp_path):
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [])
+    line = refusal("fit", "x", "--out", tmp_path / "y")
+    assert "registers 'lerobot' in 'tpgmm.readers': install 'tpgmm-torch[cli]' again" in line
+    assert "No such command 'demo'" in refusal("demo")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["app"]
 
-app = typer.Typer()
+app = typer.Typer(add_completion=False)
 
 #: Heading, entry of the metrics, figures shown, digits behind the point.
 COLUMNS = (

@@ -1,11 +1,12 @@
-"""Commands that write data sets: ``tpgmm dataset generate`` and ``tpgmm dataset convert``."""
+"""``tpgmm dataset``: data sets looked at, generated and converted."""
 
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from tests.support.command_line import output, refusal
+from tests.support.command_line import output, refusal, run
 from tests.support.lerobot_sets import (
     FPS,
     assert_equal,
@@ -14,8 +15,9 @@ from tests.support.lerobot_sets import (
     undeclared,
     write,
 )
-from tpgmm_datasets import describe_lerobot, load_lerobot, resample
+from tpgmm_datasets import describe_lerobot, load_lerobot, resample, save_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_torch import Demonstration
 
 RATE = 10
 
@@ -177,3 +179,47 @@ def test_joints_of_a_robot_are_chosen_in_its_order(generated, tmp_path):
         assert list(found.joint_names) == names
         assert_equal([found.joints], [before.reordered(names).joints])
         assert list(found.frames) == ["held"]
+
+
+PNG = b"\x89PNG"
+
+
+def test_info_and_plot_show_what_is_in_it(generated, tmp_path):
+    text = output("dataset", "info", generated)
+    for expected in ("v3.0", "10 rows per second", "bottle.qw", "l_shoulder_pitch", "rad"):
+        assert expected in text
+    output("dataset", "plot", generated, "--out", tmp_path / "d.png")
+    assert (tmp_path / "d.png").read_bytes().startswith(PNG)
+
+
+def test_check_lists_all_problems_and_fails(tmp_path):
+    assert "no problems in 2 episodes" in output("dataset", "check", bad_set(tmp_path / "a", 0))
+    result = run("dataset", "check", bad_set(tmp_path / "b", 2))
+    assert result.exit_code == 1
+    lines = result.stdout.splitlines()
+    assert len(lines) == 2
+    assert all(
+        f"episode {i}" in line and "observation.state" in line for i, line in enumerate(lines)
+    )
+    assert "problem: " in output("dataset", "info", tmp_path / "b")
+
+
+def bad_set(folder, wrong):
+    """Two episodes, in as many of which as ``wrong`` says there is a NaN."""
+    time = np.arange(10) / 10
+    joints = np.sin(time)[:, None] * np.ones(2)
+    save_lerobot([Demonstration(time, joints)] * 2, folder, fps=10, task="t")
+    [file] = folder.glob("data/*/*.parquet")
+    table = pd.read_parquet(file)
+    for episode in range(wrong):
+        state = table["observation.state"][10 * episode + 3].copy()
+        state[0] = np.nan
+        table.at[10 * episode + 3, "observation.state"] = state
+    table.to_parquet(file)
+    return folder
+
+
+def test_a_picture_is_not_put_below_a_file(generated, tmp_path):
+    (tmp_path / "file").write_text("")
+    line = refusal("dataset", "plot", generated, "--out", tmp_path / "file" / "d.png")
+    assert str(tmp_path / "file") in line

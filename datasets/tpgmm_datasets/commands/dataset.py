@@ -8,17 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tpgmm_datasets.commands.recordings import Recordings, parse_episodes, parse_units
 from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_datasets import DatasetInfo
-    from tpgmm_datasets.description import ColumnInfo
+    from tpgmm_datasets.description import ColumnInfo, DatasetInfo
     from tpgmm_datasets.lerobot.layout import Layout
     from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
 
-app = typer.Typer(help="Look at LeRobot data sets, or write one: generated, or converted.")
+app = typer.Typer(
+    help="Look at LeRobot data sets, or write one: generated, or converted.",
+    add_completion=False,
+)
 
 Target = Annotated[Path, typer.Argument(help="Folder of the set to write.")]
 Append = Annotated[
@@ -30,7 +33,7 @@ CONVERT = "Example: tpgmm dataset convert recordings/arm out/arm --units deg --r
 @app.command(epilog="Example: tpgmm dataset info out/demo/dataset")
 def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
-    from tpgmm_datasets import describe_lerobot
+    from tpgmm_datasets.description import describe_lerobot
 
     found = describe_lerobot(path)
     for name, value in _summary(found).items():
@@ -49,7 +52,7 @@ def info(path: options.Dataset) -> None:
 @app.command(epilog="Example: tpgmm dataset check out/demo/dataset && tpgmm fit ...")
 def check(path: options.Dataset) -> None:
     """List all problems of a data set; the exit code is 1 if there are any."""
-    from tpgmm_datasets import describe_lerobot
+    from tpgmm_datasets.description import describe_lerobot
 
     found = describe_lerobot(path)
     for problem in found.problems:
@@ -74,9 +77,8 @@ def plot(
 
     from tpgmm_torch.plotting import figure
 
-    demonstrations = options.read_demonstrations(
-        path, None, frame, episodes, units, joints, rate
-    )
+    recordings = Recordings(path, None, frame, episodes, units, joints, rate)
+    demonstrations = recordings.demonstrations()
     first = demonstrations[0]
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
     panels += [f"{name}.{axis}" for name in first.frames for axis in "xyz"]
@@ -116,8 +118,8 @@ def generate(
     append: Append = False,
 ) -> None:
     """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'."""
-    from tpgmm_datasets import DatasetError
     from tpgmm_datasets.bottle.skill import TASK, BottleShaking
+    from tpgmm_datasets.errors import DatasetError
 
     if path.exists() and not append:  # the writer would say so too, ten seconds later
         raise DatasetError(f"{path} exists; remove it, or add episodes to it with --append")
@@ -155,9 +157,8 @@ def convert(
 
     layout = open_layout(local_folder(source))
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    demonstrations = options.read_demonstrations(
-        source, kinematics, frame, episodes, units, joints, rate
-    )
+    recordings = Recordings(source, kinematics, frame, episodes, units, joints, rate)
+    demonstrations = recordings.demonstrations()
     tasks = [task] * len(demonstrations) if task else _tasks(layout, episodes)
     _save(
         demonstrations,
@@ -177,7 +178,7 @@ def _units(
     from tpgmm_datasets.conversion.joints import joint_feature
 
     feature = layout.features[joints or joint_feature(layout)]
-    told = options.parse_units(texts or [])
+    told = parse_units(texts or [])
     if told == "auto":
         told = dict(zip(feature.names or (), feature.units or (), strict=False))
     elif isinstance(told, str):
@@ -192,7 +193,7 @@ def _tasks(layout: Layout, episodes: str | None) -> list[str]:
     from tpgmm_datasets.reader import select_episodes
     from tpgmm_torch.exceptions import DataError
 
-    chosen = select_episodes(layout, options.parse_episodes(episodes))
+    chosen = select_episodes(layout, parse_episodes(episodes))
     for episode in chosen:
         if len(episode.tasks) != 1:
             raise DataError(
@@ -204,7 +205,7 @@ def _tasks(layout: Layout, episodes: str | None) -> list[str]:
 def _save(
     demonstrations: Sequence[Demonstration], path: Path, append: bool, **described: Any
 ) -> None:
-    from tpgmm_datasets import save_lerobot
+    from tpgmm_datasets.writer import save_lerobot
 
     save_lerobot(demonstrations, path, append=append, **described)
     rows = sum(map(len, demonstrations))

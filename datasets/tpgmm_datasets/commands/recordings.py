@@ -1,0 +1,169 @@
+"""The reader that the commands of ``tpgmm`` look up: what their options say of a data set."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tpgmm_datasets.episode_batches import EpisodeBatches
+    from tpgmm_datasets.signals import Signals
+    from tpgmm_torch.data.demonstrations import Demonstration
+    from tpgmm_torch.large_data.processes import Processes
+    from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["Recordings", "parse_episodes", "parse_frames", "parse_units"]
+
+ENVIRONMENT = "observation.environment_state"
+#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
+FRAME = re.compile(
+    r"(?P<name>[^=@\[\]]+)"
+    r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
+)
+
+
+class Recordings:
+    """A LeRobot data set as the options of a command describe it.
+
+    Parameters
+    ----------
+    dataset : str
+        A folder or a hub id.
+    robot : Kinematics or None
+        Gives the order of the joints.
+    frames, episodes, units
+        Texts as :func:`parse_frames`, :func:`parse_episodes` and :func:`parse_units` take
+        them, or None.
+    joints : str or None
+        The feature that holds the joints.
+    rate : float or None
+        Steps per second.
+
+    Attributes
+    ----------
+    options : dict
+        Arguments of :func:`tpgmm_datasets.load_lerobot`.
+
+    Raises
+    ------
+    DataError
+        If a text cannot be understood.
+    """
+
+    def __init__(
+        self,
+        dataset: str,
+        robot: Kinematics | None,
+        frames: Sequence[str] | None,
+        episodes: str | None,
+        units: Sequence[str] | None,
+        joints: str | None,
+        rate: float | None,
+    ) -> None:
+        self.dataset = dataset
+        self.options: dict[str, Any] = {
+            "robot": robot,
+            "frames": parse_frames(frames or ()),
+            "episodes": parse_episodes(episodes),
+            "units": parse_units(units or ()),
+            "joints": joints,
+            "rate": rate,
+        }
+
+    def demonstrations(self) -> list[Demonstration]:
+        """All episodes that are meant."""
+        from tpgmm_datasets.reader import load_lerobot
+
+        return load_lerobot(self.dataset, **self.options)
+
+    def batches(self, size: int, processes: Processes | None = None) -> EpisodeBatches:
+        """The same in batches of ``size`` episodes; a share of them for each process."""
+        from tpgmm_datasets.episode_batches import EpisodeBatches
+        from tpgmm_torch.large_data.processes import ALONE
+
+        return EpisodeBatches(self.dataset, size, processes=processes or ALONE, **self.options)
+
+    def signals(self) -> Signals:
+        """What a policy that was learned from it must know."""
+        from tpgmm_datasets.signals import Signals
+
+        return Signals.of(self.dataset, **self.options)
+
+
+def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
+    """What ``load_lerobot`` takes as ``frames``; None if nothing was given.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``.
+
+    Raises
+    ------
+    DataError
+        If a text is none of these.
+    """
+    from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+    from tpgmm_torch.exceptions import DataError
+
+    frames: dict[str, Any] = {}
+    for text in texts:
+        match = FRAME.fullmatch(text)
+        if match is None:
+            raise DataError(
+                f"frame {text!r} is none of NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
+                "NAME=LINK@EVENT"
+            )
+        source, event, start = match["source"], match["event"], match["start"]
+        if event:
+            frames[match["name"]] = LinkPose(source, event)
+        elif source is None:
+            frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
+        else:
+            columns = slice(int(start), int(match["stop"])) if start else None
+            frames[match["name"]] = FramePose(source, columns)
+    return frames or None
+
+
+def parse_episodes(text: str | None) -> slice | list[int] | str | None:
+    """What ``load_lerobot`` takes as ``episodes``.
+
+    Parameters
+    ----------
+    text : str or None
+        ``"0:10"`` is a slice, ``"0,3,5"`` a list, anything else the name of a task.
+    """
+    if text is None:
+        return None
+    if re.fullmatch(r"(-?\d*):(-?\d*)", text):
+        start, stop = (int(part) if part else None for part in text.split(":"))
+        return slice(start, stop)
+    if re.fullmatch(r"\d+(,\d+)*", text):
+        return [int(part) for part in text.split(",")]
+    return text
+
+
+def parse_units(texts: Sequence[str]) -> Any:
+    """What ``load_lerobot`` takes as ``units``.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        One unit for all, or any number of ``JOINT=UNIT``.
+
+    Raises
+    ------
+    DataError
+        If both are given, or several for all.
+    """
+    from tpgmm_torch.exceptions import DataError
+
+    pairs = [text.rpartition("=") for text in texts]
+    if not pairs:
+        return "auto"
+    if len(pairs) == 1 and not pairs[0][1]:
+        return pairs[0][2]
+    if not all(name and unit for name, _, unit in pairs):
+        raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
+    return {name: unit for name, _, unit in pairs}

@@ -1,0 +1,36 @@
+"""What the options of the command line say of a data set."""
+
+import pytest
+
+from tpgmm_datasets.commands.recordings import parse_episodes, parse_frames, parse_units
+from tpgmm_torch.exceptions import DataError
+
+
+def test_episodes_units_and_frames_are_read_from_text():
+    assert parse_episodes(None) is None
+    assert parse_episodes("0:10") == slice(0, 10)
+    assert parse_episodes(":-2") == slice(None, -2)
+    assert parse_episodes("0,3,5") == [0, 3, 5]
+    assert parse_episodes("4") == [4]
+    assert parse_episodes("shake the bottle") == "shake the bottle"
+    assert parse_units([]) == "auto"
+    assert parse_units(["deg"]) == "deg"
+    assert parse_units(["arm=deg", "gripper=raw"]) == {"arm": "deg", "gripper": "raw"}
+    frames = parse_frames(["a", "b=poses", "c=poses[7:14]", "d=hand@close"])
+    assert frames["a"].feature == "observation.environment_state"
+    assert (frames["b"].feature, frames["b"].columns) == ("poses", None)
+    assert frames["c"].columns == slice(7, 14)
+    assert (frames["d"].link, frames["d"].event) == ("hand", "close")
+    assert parse_frames([]) is None
+
+
+@pytest.mark.parametrize("texts", [["a="], ["=b"], ["a=b[1]"], ["a=b@"], ["a@b"]])
+def test_a_frame_that_is_none_is_refused(texts):
+    with pytest.raises(DataError, match="is none of NAME, NAME=FEATURE"):
+        parse_frames(texts)
+
+
+@pytest.mark.parametrize("texts", [["deg", "rad"], ["deg", "a=rad"], ["a="], ["=deg"]])
+def test_units_for_all_and_for_some_do_not_mix(texts):
+    with pytest.raises(DataError, match="units are one for all"):
+        parse_units(texts)

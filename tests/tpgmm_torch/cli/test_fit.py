@@ -1,0 +1,92 @@
+"""``tpgmm fit``: what it saves, what it prints, and how it refuses."""
+
+import inspect
+
+import numpy as np
+
+from tests.support.command_line import UPPER_BODY, output, refusal
+from tpgmm_datasets import save_lerobot
+from tpgmm_torch import Demonstration, Poses, TaskParameterizedGMM
+from tpgmm_torch.cli.fit import fit as fit_command
+from tpgmm_torch.operators.text import default_operators, format_operator
+
+
+def test_fit_saves_a_model_and_says_what_it_learned(fitted):
+    folder, text = fitted
+    model = TaskParameterizedGMM.load(folder)
+    assert (model.n_components, model.reg_covar, model.fusion) == (6, 1e-5, "covariance")
+    assert list(model.operators_) == default_operators(("l_hand", "r_hand"), ("bottle",))
+    assert model.frame_names_ == ("bottle",)
+    printed = dict(line.split(maxsplit=1) for line in text.splitlines())
+    assert printed["demonstrations"].startswith("3 of 10.65 to 15.30 s")
+    assert printed["components"] == "6 (full)"
+    assert {"iterations", "log-likelihood", "BIC"} <= printed.keys()
+    assert printed["saved"] == str(folder)
+
+
+def test_fit_takes_operators_as_text(dataset, tmp_path):
+    operators = ["position:l_hand@bottle + orientation:r_hand@l_hand", "canonical"]
+    chosen = [word for text in operators for word in ("--operator", text)]
+    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear")
+    output("fit", dataset, *UPPER_BODY, *chosen, *few, "--out", tmp_path / "model")
+    model = TaskParameterizedGMM.load(tmp_path / "model")
+    assert [format_operator(operator) for operator in model.operators_] == operators
+
+
+def test_fit_without_a_robot_learns_joints(dataset, tmp_path):
+    few = ("--n-components", 3, "--alignment", "none", "--rate", 5)
+    output("fit", dataset, *few, "--out", tmp_path / "model")
+    model = TaskParameterizedGMM.load(tmp_path / "model")
+    assert list(map(format_operator, model.operators_)) == ["canonical"]
+    out = tmp_path / "r.npz"
+    output("reproduce", tmp_path / "model", "--dataset", dataset, "--out", out)
+    assert arrays(out)["joint_names"].tolist() == list(model.kinematics_.joint_names)
+
+
+def arrays(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
+def test_fit_takes_tracked_poses_in_place_of_a_robot(tmp_path):
+    kinematics, time = Poses(("left", "right")), np.arange(30) / 10
+    demonstrations = []
+    for shift in (0.0, 0.1, 0.2):
+        poses = np.zeros((30, 14))
+        poses[:, [3, 10]] = 1.0
+        poses[:, [0, 7]] = np.sin(time)[:, None] + (0.0, shift)
+        demonstrations.append(Demonstration(time, poses, joint_names=kinematics.joint_names))
+    save_lerobot(demonstrations, tmp_path / "hands", fps=10, task="wave")
+    poses = ("--poses", "left", "--poses", "right", "--n-components", 2)
+    operators = ("--operator", "pose:left", "--operator", "pose:right@left")
+    output("fit", tmp_path / "hands", *poses, *operators, "--out", tmp_path / "model")
+    assert TaskParameterizedGMM.load(tmp_path / "model").kinematics_ == kinematics
+    both = refusal("fit", "x", *poses, *UPPER_BODY, "--out", "y")
+    assert "--poses are instead of --robot" in both
+
+
+def test_only_chosen_joints_move(dataset, tmp_path):
+    robot = ("--robot", "upper_body", "--link", "l_hand", "--robot-joint", "l_*")
+    few = ("--n-components", 3, "--rate", 5)
+    output("fit", dataset, *robot, *few, "--out", tmp_path / "model")
+    names = TaskParameterizedGMM.load(tmp_path / "model").kinematics_.joint_names
+    assert len(names) == 7
+    assert all(name.startswith("l_") for name in names)
+    line = refusal("fit", dataset, *robot[:-1], "left_*", "--out", tmp_path / "x")
+    assert "joint 'left_*' is not in the URDF" in line
+
+
+def test_a_file_in_the_way_is_left_alone(dataset, tmp_path):
+    (tmp_path / "file").write_text("")
+    options = ("--n-components", 2, "--rate", 5, "--alignment", "none")
+    line = refusal("fit", dataset, *options, "--out", tmp_path / "file")
+    assert "exists and is not a saved model" in line
+
+
+def test_fit_has_the_estimators_defaults():
+    options = inspect.signature(fit_command).parameters
+    estimator = inspect.signature(TaskParameterizedGMM).parameters
+    shared = options.keys() & estimator.keys() - {"robot", "operators", "device", "dtype"}
+    assert len(shared) > 8
+    for name in shared - {"random_state"}:
+        assert options[name].default == estimator[name].default, name

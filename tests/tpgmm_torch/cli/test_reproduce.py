@@ -1,0 +1,72 @@
+"""``tpgmm reproduce``: the files that it writes."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from tests.support.command_line import output, refusal
+from tpgmm_datasets import demonstrations_from_frame
+from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_torch import TaskParameterizedGMM
+
+
+def arrays(path):
+    with np.load(path) as file:
+        return dict(file)
+
+
+@pytest.mark.parametrize("suffix", ["parquet", "csv", "npz"])
+def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp_path, suffix):
+    out = tmp_path / "new" / f"r.{suffix}"
+    printed = output(
+        "reproduce", fitted[0], "--dataset", dataset, "--episodes", "1:3", "--out", out
+    ).splitlines()
+    assert len(printed) == 3
+    assert all("rad/s^2" in line and "limit" in line for line in printed[:2])
+    assert [path.name for path in out.parent.iterdir()] == [out.name]
+    model = TaskParameterizedGMM.load(fitted[0])
+    names = list(model.kinematics_.joint_names)
+    if suffix == "npz":
+        found = arrays(out)
+        assert found["joint_names"].tolist() == names
+        joints = found["joints"][found["episode"] == 1]
+    elif suffix == "csv":
+        table = pd.read_csv(out, index_col=["episode", "time"])
+        joints = table.loc[1][names].to_numpy()
+    else:
+        found = demonstrations_from_frame(pd.read_parquet(out))
+        assert set(found[1].frames) == {"bottle"}
+        joints = found[1].joints.numpy()
+    arguments = ("--dataset", dataset, "--episodes", "2", "--out", tmp_path / "again.npz")
+    output("reproduce", fitted[0], *arguments)
+    again = arrays(tmp_path / "again.npz")
+    np.testing.assert_allclose(joints, again["joints"], atol=1e-9)
+    np.testing.assert_array_equal(again["time"], model.time_)
+
+
+def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
+    skill, file, out = BottleShaking(), tmp_path / "situations.json", tmp_path / "r.npz"
+    situations = skill.situations(2)
+    items = [
+        {
+            "joints": s.joints.tolist(),
+            "frames": {
+                "bottle": {
+                    "position": s.frames["bottle"].position.tolist(),
+                    "orientation": s.frames["bottle"].orientation.tolist(),
+                }
+            },
+        }
+        for s in situations
+    ]
+    file.write_text(json.dumps(items))
+    output("reproduce", fitted[0], "--situations", file, "--out", out)
+    expected = TaskParameterizedGMM.load(fitted[0]).predict(situations, candidates=False)
+    joints = torch.cat([trajectory.joints for trajectory in expected])
+    np.testing.assert_allclose(arrays(out)["joints"], joints, atol=1e-12)
+    items[1]["frames"] = {"cup": items[1]["frames"]["bottle"]}
+    file.write_text(json.dumps(items))
+    assert "bottle" in refusal("reproduce", fitted[0], "--situations", file, "--out", out)
