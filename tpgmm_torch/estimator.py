@@ -19,7 +19,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch import gaussians, persistence
-from tpgmm_torch.control.compiled import CompiledRegression, check_compiler
+from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.rollout import Synthesis, rollout
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
@@ -33,7 +33,7 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.checkpoints import Checkpoint
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
-from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -382,7 +382,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         now = as_tensor(time, "time").to(like)
         limits = (like, kinematics.upper) if self.keep_limits else None
         if not candidates and not isinstance(state, RobotState):
-            return regression.tick(now, state, known, limits)
+            joints = state if isinstance(state, Tensor) else kinematics.joint_tensor(state)
+            return regression.tick(now, joints, known, limits)
         if not isinstance(state, RobotState):
             state = kinematics.state(state)
         return regression.step(now, state, known, candidates, limits)
@@ -534,15 +535,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         backend = self._backend
         prepared = getattr(self, "_prepared", None)
         if prepared is None or prepared[0] != (key, backend) or prepared[1] is not self.means_:
-            mixtures = [
-                LocalMixture.of(mean, covariance)
+            conditionals = [
+                Conditionals.of(mean, covariance)
                 for mean, covariance in zip(self.means_, self.covariances_, strict=True)
             ]
             log_weights = self.weights_.log()
             make: Any = Regression
             if backend is not None:
                 make = functools.partial(CompiledRegression, backend=backend)
-            fitted = self.kinematics_, self.operators_, mixtures, log_weights
+            fitted = self.kinematics_, self.operators_, conditionals, log_weights
             regression = make(*fitted, *key)
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]

@@ -24,6 +24,7 @@ __all__ = [
     "moment_match",
     "product",
     "pseudo_inverse",
+    "whiten",
 ]
 
 
@@ -64,6 +65,46 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
             "regularisation (reg_covar, or epsilon of the covariance form) gives it some"
         )
     return factor
+
+
+def whiten(covariance: Tensor, right: Tensor, name: str) -> Tensor:
+    """``L^-1 R`` with ``L L^T`` the covariance: residuals in units of their deviations.
+
+    Parameters
+    ----------
+    covariance : Tensor of shape (..., m, m)
+    right : Tensor of shape (..., m, r)
+        ``R``, columns to be whitened.
+    name : str
+        How the error message calls the covariance.
+
+    Returns
+    -------
+    Tensor of shape (..., m, r)
+
+    Raises
+    ------
+    DataError
+        If a covariance is not positive definite. In a compiled graph, which asks nothing of
+        its numbers, the result is not a number then.
+    """
+    if torch.compiler.is_compiling():
+        return _eliminate(covariance, right)
+    factor = cholesky(covariance, name)
+    # transposed, so that the result is stored row by row
+    return torch.linalg.solve_triangular(factor.mT, right.mT, upper=True, left=False).mT
+
+
+def _eliminate(covariance: Tensor, right: Tensor) -> Tensor:
+    """:func:`whiten` row by row: loops that a compiler joins with what stands around them."""
+    size = covariance.shape[-1]
+    matrix, rows = torch.cat((covariance, right), -1), []
+    for left in range(size, 0, -1):  # what is left of the covariance
+        row = matrix[..., 0, :] * torch.rsqrt(matrix[..., 0, :1])
+        rows.append(row[..., left:])
+        below = row[..., 1:left].unsqueeze(-1)
+        matrix = matrix[..., 1:, 1:] - below * row[..., 1:].unsqueeze(-2)
+    return torch.stack(rows, -2)
 
 
 def affine(
@@ -162,15 +203,15 @@ def information(
     >>> precision.tolist()
     [[4.0, 4.0], [4.0, 4.0]]
     """
-    factor = cholesky(covariance, "the covariance of a projected component")
+    name = "the covariance of a projected component"
     if jacobian is None:
-        precision = torch.cholesky_inverse(factor)
+        precision = torch.cholesky_inverse(cholesky(covariance, name))
         vector = precision @ targets
         return precision, vector, targets.mT @ vector
     n = jacobian.shape[-1]
-    batch = common_shape(jacobian.shape[:-2], targets.shape[:-2], factor.shape[:-2])
+    batch = common_shape(jacobian.shape[:-2], targets.shape[:-2], covariance.shape[:-2])
     right = torch.cat((jacobian.expand(*batch, -1, -1), targets.expand(*batch, -1, -1)), dim=-1)
-    white = torch.linalg.solve_triangular(factor, right, upper=False)
+    white = whiten(covariance, right, name)
     gram = white.mT @ white
     return gram[..., :n, :n], gram[..., :n, n:], gram[..., n:, n:]
 
@@ -255,10 +296,11 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     >>> float(mean), float(covariance)
     (0.0, 1.0)
     """
-    mean = (weights[..., None] * means).sum(-2)
-    apart = means - mean[..., None, :]
-    within = (weights[..., None, None] * covariances).sum(-3)
-    return mean, within + (weights[..., None] * apart).mT @ apart
+    mean = (weights.unsqueeze(-2) @ means).squeeze(-2)
+    residual = means - mean.unsqueeze(-2)
+    within = (weights.unsqueeze(-2) @ covariances.flatten(-2)).squeeze(-2)
+    between = (weights.unsqueeze(-1) * residual).mT @ residual
+    return mean, within.unflatten(-1, covariances.shape[-2:]) + between
 
 
 def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:

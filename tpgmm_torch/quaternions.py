@@ -10,6 +10,8 @@ matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; t
 three rows of ``Hbar``, ``Hbar*`` of eq. (11), are :func:`vector_matrix`.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -21,12 +23,14 @@ __all__ = [
     "exp",
     "from_matrix",
     "hemisphere_sign",
+    "hemisphere_signs",
     "identity",
     "left_matrix",
     "log",
     "match_hemisphere",
     "normalize",
     "product",
+    "quaternion_blocks",
     "right_matrix",
     "rotate",
     "slerp",
@@ -218,6 +222,51 @@ def hemisphere_sign(inner: Tensor) -> Tensor:
         1, or -1 where the inner product is negative.
     """
     return torch.copysign(_constant("one", inner.dtype, inner.device), inner)
+
+
+def quaternion_blocks(starts: Sequence[int], size: int) -> Tensor:
+    """Where quaternions stand among coordinates, for :func:`hemisphere_signs`.
+
+    Parameters
+    ----------
+    starts : sequence of int
+        The first coordinate of each of the Q quaternions.
+    size : int
+        The number of coordinates, D.
+
+    Returns
+    -------
+    Tensor of shape (Q, D)
+        1 at the four coordinates of each quaternion, 0 elsewhere; float64.
+    """
+    blocks = torch.zeros(len(starts), size, dtype=torch.float64)
+    for block, start in zip(blocks, starts, strict=True):
+        block[start : start + 4] = 1.0
+    return blocks
+
+
+def hemisphere_signs(x: Tensor, reference: Tensor, blocks: Tensor) -> Tensor:
+    """Signs that bring all quaternions among coordinates to the side of the reference.
+
+    Parameters
+    ----------
+    x, reference : Tensor of shape (..., D)
+        Coordinates, some of them quaternions.
+    blocks : Tensor of shape (Q, D)
+        Of :func:`quaternion_blocks`.
+
+    Returns
+    -------
+    Tensor of shape (..., D)
+        1 or -1; 1 where no quaternion stands.
+
+    Examples
+    --------
+    >>> x, reference = -torch.ones(6), torch.ones(6)
+    >>> hemisphere_signs(x, reference, quaternion_blocks([2], 6).to(x)).tolist()
+    [1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
+    """
+    return 1.0 + (hemisphere_sign((x * reference) @ blocks.mT) - 1.0) @ blocks
 
 
 def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:

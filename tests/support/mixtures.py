@@ -22,7 +22,7 @@ from tpgmm_torch import (
     RobotState,
     Stack,
 )
-from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Estimate, Regression
 
 Rows = Callable[[oracles.At], list[oracles.Row]]
@@ -39,8 +39,8 @@ def random_local(rng: np.random.Generator, n_components: int, centre: Array) -> 
     return oracles.Local(means, scale @ (factors @ factors.mT + 0.2 * np.eye(size)) @ scale)
 
 
-def local_mixture(local: oracles.Local) -> LocalMixture:
-    return LocalMixture.of(torch.from_numpy(local.means), torch.from_numpy(local.covariances))
+def conditionals_of(local: oracles.Local) -> Conditionals:
+    return Conditionals.of(torch.from_numpy(local.means), torch.from_numpy(local.covariances))
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ class Problem:
         return cls(case, kinematics.state(joints), frames, mixtures, weights)
 
     def regression(self, **options: Any) -> Regression:
-        mixtures = [local_mixture(local) for local in self.mixtures]
+        conditionals = [conditionals_of(local) for local in self.mixtures]
         log_weights = torch.from_numpy(self.weights).log()
         kinematics = self.case.world.kinematics
-        return Regression(kinematics, self.case.operators, mixtures, log_weights, **options)
+        return Regression(kinematics, self.case.operators, conditionals, log_weights, **options)
 
     def rows(self, index: tuple[int, ...] = ()) -> list[oracles.Row]:
         return self.case.rows(self.at(index))

@@ -98,6 +98,26 @@ class Frame:
         """The same pose for all of a batch, without copying."""
         return self._from(self.position.expand(*batch, 3), self.orientation.expand(*batch, 4))
 
+    def flatten(self) -> Frame:
+        """The leading dimensions as one."""
+        return self._from(self.position.reshape(-1, 3), self.orientation.reshape(-1, 4))
+
+    @classmethod
+    def stack(cls, frames: Sequence[Frame]) -> Frame:
+        """Poses of B situations as one frame of shape (B,), or (T, B) if any of them moves.
+
+        Parameters
+        ----------
+        frames : sequence of Frame
+            Of shape () or (T,).
+        """
+        steps = [frame.batch_shape for frame in frames if frame.batch_shape]
+        frames = [frame.expand(steps[0] if steps else ()) for frame in frames]
+        return cls._from(
+            torch.stack([frame.position for frame in frames], dim=-2),
+            torch.stack([frame.orientation for frame in frames], dim=-2),
+        )
+
     def __getitem__(self, index: Any) -> Frame:
         """Select along the leading dimensions."""
         index = (*index, slice(None)) if isinstance(index, tuple) else (index, slice(None))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,7 +10,7 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.operators import Linearization
 
-__all__ = ["Projection", "hemispheres"]
+__all__ = ["Projection"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +32,13 @@ class Projection:
 
     @classmethod
     def of(cls, at: Linearization, columns: Tensor, covariance: Tensor) -> Projection:
-        """From local means (and time derivatives) (..., K, D, r) and covariances.
+        """``M mu + c``, its derivatives, and ``M Sigma M^T``.
 
         Parameters
         ----------
         at : Linearization
         columns : Tensor of shape (..., K, D, r)
+            Local means and, for the product activation, their time derivatives.
         covariance : Tensor of shape (..., K, D, D)
         """
         if at.matrix is not None:
@@ -60,27 +60,3 @@ class Projection:
             identity = torch.eye(size, dtype=covariance.dtype, device=covariance.device)
             covariance = covariance + epsilon * identity
         return Projection(None, targets, covariance)
-
-
-def hemispheres(mean: Tensor, present: Tensor, starts: Sequence[int]) -> Tensor:
-    """Signs that bring each mean quaternion to the side of the present one.
-
-    Parameters
-    ----------
-    mean : Tensor of shape (..., K, D)
-    present : Tensor of shape (..., D)
-    starts : sequence of int
-        Where quaternions begin.
-
-    Returns
-    -------
-    Tensor of shape (..., K, D)
-        1 or -1.
-    """
-    batch = gaussians.common_shape(mean.shape[:-2], present.shape[:-1])
-    signs = mean.new_ones(*batch, *mean.shape[-2:])
-    for start in starts:
-        block = slice(start, start + 4)
-        inner = (mean[..., block] * present[..., None, block]).sum(-1, keepdim=True)
-        signs[..., block] = torch.where(inner < 0, -1.0, 1.0)
-    return signs

@@ -15,19 +15,19 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from tpgmm_torch import gaussians
+from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.operators import Linearization, Operator
-from tpgmm_torch.regression.active_components import Windows
-from tpgmm_torch.regression.component_tables import Tables
+from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.regression.active_components import ActiveComponents
+from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.joint_limits import within
-from tpgmm_torch.regression.local_mixtures import LocalMixture
-from tpgmm_torch.regression.projections import Projection, hemispheres
-from tpgmm_torch.regression.task_update import TaskUpdate
+from tpgmm_torch.regression.kalman_update import KalmanUpdate
+from tpgmm_torch.regression.projections import Projection
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Estimate", "Regression"]
+__all__ = ["Components", "Estimate", "Regression"]
 
 #: Robots at a time on a processor, whose cache then holds what is between the operations.
 PART = 512
@@ -42,6 +42,7 @@ class Estimate:
     joints : Tensor of shape (..., n_joints)
         Mean of the fused mixture, the reference q_hat_t.
     covariance : Tensor of shape (..., n_joints, n_joints)
+        Of the fused mixture, within the components and between them.
     activation : Tensor of shape (..., K)
         Mixing weights h_i of the components.
     candidates : tuple of Candidate
@@ -55,6 +56,35 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
+class Components:
+    """Some components of the mixture: those that count.
+
+    Parameters
+    ----------
+    index : Tensor of shape (A,)
+        Which ones they are.
+    marginals : TimeMarginals
+        Their weights and time marginals.
+    conditionals : tuple of Conditionals
+        Of each operator; or of all operators' coordinates at once, where the fusion is a
+        Kalman update.
+    """
+
+    index: Tensor
+    marginals: TimeMarginals
+    conditionals: tuple[Conditionals, ...]
+
+    def select(self, index: Sequence[int]) -> Components:
+        """Some of them, by their place among them."""
+        places = torch.tensor(index, device=self.index.device)
+        return Components(
+            self.index[places],
+            self.marginals.select(places),
+            tuple(one.select(places) for one in self.conditionals),
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Regression:
     """A fitted mixture, ready to be asked for joint references.
 
@@ -62,12 +92,14 @@ class Regression:
     ----------
     kinematics : Kinematics
     operators : sequence of Operator
-    mixtures : sequence of LocalMixture
-        One per operator.
+    conditionals : sequence of Conditionals
+        The components' Gaussians given time, one for each operator.
     log_weights : Tensor of shape (K,)
         Logarithms of the mixing coefficients pi_i.
     fusion : {"information", "covariance"}
+        The form of the product (2).
     activation : {"time", "product"}
+        Whose time marginal the mixing weights h_i come from: the mixture's or the product's.
     epsilon : float
         Added to the diagonal of projected covariances by the covariance form [rad^2].
     prior_std : float
@@ -75,13 +107,13 @@ class Regression:
         no operator determines every joint [rad].
     negligible : float
         Components with less than that share of the largest weight are left out: the mean moves
-        by at most the weight left out times how far apart the components' means are. 0 keeps
+        by at most the weight left out times the distance of the components' means. 0 keeps
         all.
     """
 
     kinematics: Kinematics
     operators: Sequence[Operator]
-    mixtures: Sequence[LocalMixture]
+    conditionals: Sequence[Conditionals]
     log_weights: Tensor
     fusion: str = "information"
     activation: str = "time"
@@ -101,11 +133,7 @@ class Regression:
 
         ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
         """
-        if self._update is None:
-            joints, covariance, activation = self._fused(time, state, frames)
-        else:
-            joints, covariance, activation = self._update(self._tables, time, state, frames)
-        estimate = self.bounded(joints, covariance, activation, bounds)
+        estimate = self._bounded(self._estimate(time, state, frames), bounds)
         if not candidates:
             return estimate
         return replace(estimate, candidates=self.candidates(time, state, frames, estimate))
@@ -117,66 +145,70 @@ class Regression:
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
-        """:meth:`step` from joint vectors: kinematics included, without candidates."""
-        if not isinstance(joints, Tensor):
-            joints = self.kinematics.joint_tensor(joints)
-        counts = [frame.position.numel() // 3 for frame in frames.values()]
-        count = max(joints.numel() // self.kinematics.n_joints, time.numel(), *counts)
-        if count <= PART or time.is_cuda or self._update is None:
-            return self.step(time, self.kinematics.state(joints), frames, False, bounds)
-        return self.bounded(*self._in_parts(self._update, time, joints, frames), bounds)
+        """:meth:`step` from joint vectors: kinematics included, without candidates.
 
-    def _in_parts(
+        Many robots run part by part, of those that are at about the same time: few components
+        count for them.
+        """
+        poses = {name: frames[name] for name in self._frame_names if name in frames}
+        shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
+        batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
+        if batch.numel() <= PART or time.is_cuda:
+            estimate = self._estimate(time, self.kinematics.state(joints), frames)
+            return self._bounded(estimate, bounds)
+        joints = joints.expand(*batch, -1).flatten(0, -2)
+        poses = {name: pose.expand(batch).flatten() for name, pose in poses.items()}
+        time = time.expand(batch).flatten() if time.ndim else time
+        order = time.argsort() if time.ndim else torch.arange(batch.numel())
+        parts = []
+        for part in order.split(PART):
+            state = self.kinematics.state(joints[part])
+            here = {name: pose[part] for name, pose in poses.items()}
+            parts.append(self._estimate(time[part] if time.ndim else time, state, here))
+        back = order.argsort()
+        mean = torch.cat([part.joints for part in parts])[back].unflatten(0, batch)
+        covariance = torch.cat([part.covariance for part in parts])[back].unflatten(0, batch)
+        activation = parts[0].activation
+        if activation.ndim > 1:
+            activation = torch.cat([part.activation for part in parts])[back]
+            activation = activation.unflatten(0, batch)
+        return self._bounded(Estimate(mean, covariance, activation), bounds)
+
+    def fuse(
         self,
-        update: TaskUpdate,
+        components: Components,
         time: Tensor,
-        joints: Tensor,
+        state: RobotState,
         frames: Mapping[str, Frame],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Part by part, of robots that are at about the same time: few components count."""
-        joints = self.kinematics.joint_tensor(joints)
-        names = update.task.references() if update.task is not None else ()
-        poses = {name: frames[name] for name in names if name in frames}
-        shapes = [pose.batch_shape for pose in poses.values()]
-        batch = torch.broadcast_shapes(joints.shape[:-1], time.shape, *shapes)
-        rows = [joints, *(p.position for p in poses.values())]
-        rows += [p.orientation for p in poses.values()]
-        if time.ndim:
-            rows.append(time.unsqueeze(-1))
-        rows = [row.expand(*batch, row.shape[-1]).reshape(-1, row.shape[-1]) for row in rows]
-        if time.ndim:
-            order = rows[-1].squeeze(-1).argsort()
-            rows = [row[order] for row in rows]
-        results = []
-        for start, *given in zip(*(row.split(PART) for row in rows), strict=True):
-            now = given.pop().squeeze(-1) if time.ndim else time
-            pairs = zip(given[: len(poses)], given[len(poses) :], strict=True)
-            here = {name: Frame._from(*p) for name, p in zip(poses, pairs, strict=True)}
-            results.append(update(self._tables, now, self.kinematics.state(start), here))
-        means, covariances, activations = zip(*results, strict=True)
-        back = order.argsort() if time.ndim else slice(None)
-        mean = torch.cat(means)[back].reshape(*batch, -1)
-        covariance = torch.cat(covariances)[back].reshape(*mean.shape, -1)
-        if time.ndim == 0:
-            return mean, covariance, activations[0]
-        return mean, covariance, torch.cat(activations)[back].reshape(*batch, -1)
+        """Eqs (1), (2) and regression: the mixture of some components, fused, given time.
 
-    @staticmethod
-    def bounded(
-        joints: Tensor,
-        covariance: Tensor,
-        activation: Tensor,
-        bounds: tuple[Tensor, Tensor] | None,
-    ) -> Estimate:
-        """The estimate, given that joints keep within bounds if there are some."""
-        if bounds is not None:
-            joints = within(joints, covariance, *bounds)
-        return Estimate(joints, covariance, activation)
+        Returns
+        -------
+        joints : Tensor of shape (..., n_joints)
+        covariance : Tensor of shape (..., n_joints, n_joints)
+        weights : Tensor of shape (..., A)
+            Mixing weights h_i of these components.
+        """
+        if self._update is not None:
+            [stacked] = components.conditionals
+            steps, covariances = self._update(stacked, time, state, frames)
+            log_h = self._log_activation(components, time)
+        else:
+            precision, vector, square = self._sum(components, time, state, frames)
+            steps, covariances = gaussians.from_information(precision, vector[..., 0])
+            if self.activation == "time":
+                log_h = self._log_activation(components, time)
+            else:
+                log_h = self._product_activation(components, time, precision, vector, square)
+        weights = torch.softmax(log_h, -1)
+        step, covariance = gaussians.moment_match(weights, steps, covariances)
+        return state.joints + step, covariance, weights
 
     def expected(self, operator: int, time: Tensor) -> Tensor:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
-        weights = self._time_activation(time).exp()
-        return (weights[..., None] * self.mixtures[operator].at(time)).sum(-2)
+        weights = torch.softmax(self._marginals.log_activation(time.unsqueeze(-1)), -1)
+        return (weights.unsqueeze(-2) @ self.conditionals[operator].at(time)).squeeze(-2)
 
     def candidates(
         self,
@@ -187,161 +219,179 @@ class Regression:
     ) -> tuple[Candidate, ...]:
         """Eq. (1) for each operator, mixed over the components, and each one's share.
 
-        ``estimate`` is what was found at ``time`` from the state q_{t-1}.
+        ``estimate`` is that of ``time`` and the state q_{t-1}.
         """
-        active = self._active(time)
-        weights = estimate.activation[..., active]
-        alone = []
-        for at, mean, _, covariance in self._local(active, time, state, frames):
+        index = self._components_at(time).index
+        weights = estimate.activation[..., index]
+        conditionals = [one.select(index) for one in self.conditionals]
+        means, covariances = [], []
+        for at, mean, _, covariance in self._local(conditionals, time, state, frames):
             # mixing commutes with the affine map, and is less work before it
             mean, covariance = gaussians.moment_match(weights, mean, covariance)
             columns = mean[..., None, :, None]
             one = Projection.of(at, columns, covariance[..., None, :, :]).in_joint_space()
-            step, covariance = one.targets[..., 0, :, 0], one.covariance[..., 0, :, :]
-            covariance = covariance.expand_as(estimate.covariance)
-            alone.append((step.expand_as(estimate.joints), covariance))
-        variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for _, c in alone])
+            means.append((state.joints + one.targets[..., 0, :, 0]).expand_as(estimate.joints))
+            covariances.append(one.covariance[..., 0, :, :].expand_as(estimate.covariance))
+        variances = torch.stack([c.diagonal(dim1=-2, dim2=-1) for c in covariances])
         # where J^+ has no row but rounding, an operator does not touch the joint and has no say
         touched = variances > 1e-12 * variances.amax(-1, keepdim=True)
         precisions = touched / torch.where(touched, variances, 1.0)
         total = precisions.sum(0)
         shares = precisions / torch.where(total > 0, total, 1.0)
-        return tuple(
-            Candidate(state.joints + step, covariance, share)
-            for (step, covariance), share in zip(alone, shares, strict=True)
-        )
-
-    def _time_activation(self, time: Tensor) -> Tensor:
-        """``log h_i(t)`` from pi_i N(t | mu_t, sigma_tt), the time marginal taken once."""
-        mixture = self.mixtures[0]
-        apart = (time[..., None] - mixture.time_mean).square() / mixture.time_variance
-        log_h = self.log_weights - 0.5 * (apart + mixture.time_variance.log())
-        return torch.log_softmax(log_h, dim=-1)
+        return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
-    def _update(self) -> TaskUpdate | None:
+    def _update(self) -> KalmanUpdate | None:
         """The update of a prior over the joints, where that is what is asked for."""
         usual = self.fusion == "information" and self.activation == "time"
-        if not usual or not TaskUpdate.serves(self.operators, self.kinematics):
+        if not usual or not KalmanUpdate.serves(self.operators, self.kinematics):
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return TaskUpdate(self.kinematics, self.operators, self.mixtures, self.log_weights)
+            return KalmanUpdate(self.kinematics, self.operators, self.conditionals)
 
     @cached_property
-    def _windows(self) -> Windows:
-        time = self.mixtures[0]
-        return Windows(self.log_weights, time.time_mean, time.time_variance, self.negligible)
+    def _frame_names(self) -> tuple[str, ...]:
+        return frame_names(self.operators, self.kinematics)
 
     @cached_property
-    def _selected(self) -> dict[tuple[int, ...], Tables]:
+    def _marginals(self) -> TimeMarginals:
+        first = self.conditionals[0]
+        with torch.inference_mode(False):
+            return TimeMarginals.of(self.log_weights, first.time_mean, first.time_variance)
+
+    @cached_property
+    def _components(self) -> Components:
+        """All of them."""
+        conditionals = tuple(self.conditionals)
+        if self._update is not None:
+            conditionals = (self._update.conditionals,)
+        index = torch.arange(len(self.log_weights), device=self.log_weights.device)
+        return Components(index, self._marginals, conditionals)
+
+    @cached_property
+    def _active(self) -> ActiveComponents | None:
+        """Which components count when, where not all do at any time."""
+        learning = self.log_weights.requires_grad or self.conditionals[0].mean.requires_grad
+        if self.activation != "time" or self.negligible == 0 or learning:
+            return None  # while learning, it would cost more than it saves
+        return ActiveComponents(self._marginals, self.negligible)
+
+    @cached_property
+    def _selected(self) -> dict[tuple[int, ...], Components]:
         return {}
 
-    def _active(self, time: Tensor) -> tuple[int, ...]:
-        """Components that count at one instant, or from the first to the last of several."""
-        if self.activation == "time" and self.negligible != 0 and time.ndim == 0:
-            return self._windows.at(time.item())
-        every = tuple(range(len(self.log_weights)))
-        if self.activation != "time" or self.negligible == 0 or len(every) == 1:
-            return every
-        learning = self.log_weights.requires_grad or self.mixtures[0].mean.requires_grad
-        if learning or time.numel() == 0:  # windows would cost more than they save
-            return every
-        return self._windows.between(*(float(bound) for bound in time.detach().aminmax()))
-
-    def _tables(self, time: Tensor) -> Tables:
-        """Of the components that count."""
-        assert self._update is not None
-        active = self._active(time)
+    def _components_at(self, time: Tensor) -> Components:
+        """Those that count at one of the times."""
+        if self._active is None or time.numel() == 0:
+            return self._components
+        if time.ndim == 0:
+            active = self._active.at(time.item())
+        else:
+            counts = self._active.counts(time).flatten(0, -2).any(0)
+            active = tuple(counts.nonzero()[:, 0].tolist())
         if active not in self._selected:
             with torch.inference_mode(False):
-                self._selected[active] = self._select(self._update, active)
+                self._selected[active] = self._select(active)
         return self._selected[active]
 
-    def _select(self, update: TaskUpdate, active: tuple[int, ...]) -> Tables:
-        return update.tables.select(active)
+    def _select(self, active: tuple[int, ...]) -> Components:
+        return self._components.select(active)
 
-    def _fused(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Eq. (2) for operators of any kind, in the form and with the weights asked for."""
-        active = self._active(time)
-        projections = []
-        for at, mean, gain, covariance in self._local(active, time, state, frames):
-            columns = mean.unsqueeze(-1)
-            if self.activation != "time":
-                columns = torch.stack(torch.broadcast_tensors(mean, gain), dim=-1)
-            projections.append(Projection.of(at, columns, covariance))
-        if self.fusion == "covariance":
-            projections = [p.in_joint_space(self.epsilon) for p in projections]
-        precision, vector, square = self._sum(projections, state)
-        if self.activation == "time":
-            log_h = torch.log_softmax(self._time_activation(time)[..., active], dim=-1)
-        else:
-            log_h = self._product_activation(time, precision, vector, square)
-        step, covariances = gaussians.from_information(precision, vector[..., 0])
-        weights = log_h.exp()
-        mean, covariance = gaussians.moment_match(weights, step, covariances)
-        activation = weights.new_zeros(*weights.shape[:-1], len(self.log_weights))
-        activation[..., active] = weights
-        return state.joints + mean, covariance, activation
+    def _log_activation(self, components: Components, time: Tensor) -> Tensor:
+        """``log h_i(t)``, up to a constant, from the components' time marginal, taken once."""
+        log_h = components.marginals.log_activation(time.unsqueeze(-1))
+        if time.ndim and self._active is not None:  # of each time, what it has alone
+            counts = self._active.counts(time)[..., components.index]
+            log_h = log_h.masked_fill(~counts, -torch.inf)
+        return log_h
 
     def _product_activation(
-        self, time: Tensor, precision: Tensor, vector: Tensor, square: Tensor
+        self,
+        components: Components,
+        time: Tensor,
+        precision: Tensor,
+        vector: Tensor,
+        square: Tensor,
     ) -> Tensor:
-        """``log h_i(t)`` from the time marginal of the product, eq. (2)'s own.
+        """``log h_i(t)``, up to a constant, from the time marginal of the product (2).
 
         Integrating the joints out of the product leaves a quadratic in the time t + delta:
         the operators' time marginals plus how much they disagree about the joints.
         """
-        factor = gaussians.cholesky(precision, "the precision of the product")
-        white = torch.linalg.solve_triangular(factor, vector, upper=False)
+        white = gaussians.whiten(precision, vector, "the precision of the product")
         disagreement = square - white.mT @ white
         slope, curvature = disagreement[..., 0, 1], disagreement[..., 1, 1]
-        for mixture in self.mixtures:
-            apart = time[..., None] - mixture.time_mean
-            slope = slope + apart / mixture.time_variance
-            curvature = curvature + 1 / mixture.time_variance
-        log_h = self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
-        return torch.log_softmax(log_h, dim=-1)
+        for one in components.conditionals:
+            slope = slope + (time.unsqueeze(-1) - one.time_mean) / one.time_variance
+            curvature = curvature + 1 / one.time_variance
+        return self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
+
+    def _estimate(
+        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]
+    ) -> Estimate:
+        components = self._components_at(time)
+        joints, covariance, weights = self.fuse(components, time, state, frames)
+        return Estimate(joints, covariance, self._activation(components, weights))
+
+    def _activation(self, components: Components, weights: Tensor) -> Tensor:
+        """The weights of all components; those that do not count have none."""
+        whole = weights.new_zeros(*weights.shape[:-1], len(self.log_weights))
+        return whole.index_add(-1, components.index, weights)
+
+    @staticmethod
+    def _bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
+        """The estimate, given that joints keep within bounds if there are some."""
+        if bounds is None:
+            return estimate
+        joints = within(estimate.joints, estimate.covariance, *bounds)
+        return replace(estimate, joints=joints)
 
     def _local(
         self,
-        active: tuple[int, ...],
+        conditionals: Sequence[Conditionals],
         time: Tensor,
         state: RobotState,
         frames: Mapping[str, Frame],
     ) -> Iterator[tuple[Linearization, Tensor, Tensor, Tensor]]:
         """Each operator here, and means, time derivatives and covariances of components.
 
-        They are those that count, on the side of the present quaternions.
+        Quaternions are on the side of the present ones.
         """
-        mixtures = self.mixtures
-        if len(active) < len(self.log_weights):
-            index = torch.tensor(active, device=time.device)
-            mixtures = [mixture.select(index) for mixture in mixtures]
-        for operator, mixture in zip(self.operators, mixtures, strict=True):
-            mean, gain, covariance = mixture.at(time), mixture.gain, mixture.covariance
+        for operator, one in zip(self.operators, conditionals, strict=True):
+            mean, gain, covariance = one.at(time), one.gain, one.covariance
             starts = operator.quaternion_starts(self.kinematics)
             if starts:
-                signs = hemispheres(mean, operator.coordinates(state, frames), starts)
+                present = operator.coordinates(state, frames).unsqueeze(-2)
+                blocks = quaternions.quaternion_blocks(starts, mean.shape[-1]).to(mean)
+                signs = quaternions.hemisphere_signs(mean, present, blocks)
                 mean, gain = signs * mean, signs * gain
                 covariance = signs[..., None] * covariance * signs[..., None, :]
             yield operator.linearize(state, frames), mean, gain, covariance
 
     def _sum(
-        self, projections: Sequence[Projection], state: RobotState
+        self,
+        components: Components,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Sums over the operators, in terms of the step ``q - q_{t-1}``."""
-        terms = [
-            gaussians.information(p.jacobian, p.targets, p.covariance) for p in projections
-        ]
+        """Sums of the operators' information, in terms of the step ``q - q_{t-1}``."""
+        terms = []
+        local = self._local(components.conditionals, time, state, frames)
+        for at, mean, gain, covariance in local:
+            columns = mean.unsqueeze(-1)
+            if self.activation != "time":
+                columns = torch.stack(torch.broadcast_tensors(mean, gain), dim=-1)
+            one = Projection.of(at, columns, covariance)
+            if self.fusion == "covariance":
+                one = one.in_joint_space(self.epsilon)
+            terms.append(gaussians.information(one.jacobian, one.targets, one.covariance))
         precision, vector, square = (
             sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True)
         )
-        if self.fusion == "information" and not any(
-            o.determines_joints for o in self.operators
-        ):
+        closed = self.fusion == "covariance" or any(o.determines_joints for o in self.operators)
+        if not closed:
             like = state.joints
             identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
             precision = precision + identity / self.prior_std**2

@@ -11,8 +11,8 @@ from torch.distributions import MultivariateNormal
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
-from tpgmm_torch import Frame, Kinematics, Operator, RobotState
-from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch import Frame, Kinematics, Operator, RobotState, quaternions
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Regression
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
@@ -55,7 +55,7 @@ def regression(
         # time stands first, so conditioning on it leaves the other rows of the factor
         first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
-        local.append(LocalMixture(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
+        local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
     return Regression(
         kinematics,
         operators,
@@ -80,12 +80,11 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
     """
     points = []
     for j, operator in enumerate(model.operators):
-        local = operator.coordinates(samples.state, samples.poses).clone()
+        local = operator.coordinates(samples.state, samples.poses)
         expected = model.expected(j, samples.time)
-        for start in operator.quaternion_starts(model.kinematics):
-            block = slice(start, start + 4)
-            inner = (local[:, block] * expected[:, block]).sum(1, keepdim=True)
-            local[:, block] = torch.where(inner < 0, -local[:, block], local[:, block])
+        starts = operator.quaternion_starts(model.kinematics)
+        blocks = quaternions.quaternion_blocks(starts, local.shape[1]).to(local)
+        local = local * quaternions.hemisphere_signs(local, expected, blocks)
         points.append(torch.cat((samples.time[:, None], local), dim=1))
     return points
 

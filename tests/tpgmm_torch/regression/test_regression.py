@@ -16,13 +16,13 @@ from tests.support.mixtures import (
     Problem,
     assert_close,
     assert_equal_estimates,
-    local_mixture,
+    conditionals_of,
     times,
 )
-from tests.support.worlds import OBJECT
+from tests.support.worlds import OBJECT, upper_body
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression.local_mixtures import LocalMixture
+from tpgmm_torch.regression.conditionals import Conditionals
 
 EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 ACTIVATIONS = pytest.mark.parametrize("activation", ["time", "product"])
@@ -130,7 +130,7 @@ def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
     problem = Problem.of(CASES["both hands"], 1)
     now = torch.tensor(0.8, dtype=torch.float64), problem.state, problem.frames
     linear, offset = problem.rows()[0].linear_and_offset(problem.state.joints.numpy())
-    mu = local_mixture(problem.mixtures[0]).at(now[0])[0].numpy()
+    mu = conditionals_of(problem.mixtures[0]).at(now[0])[0].numpy()
     limit = torch.from_numpy(linear @ mu + offset)
     distances = [
         float((problem.regression(prior_std=std).step(*now).joints - limit).norm())
@@ -198,7 +198,7 @@ def test_expected_coordinates_are_those_of_regression_in_the_local_space():
 # Signs, batches, precision, gradients
 
 
-def flipped(local: LocalMixture, starts: tuple[int, ...]) -> LocalMixture:
+def flipped(local: Conditionals, starts: tuple[int, ...]) -> Conditionals:
     signs = torch.ones_like(local.mean[0])
     for start in starts:
         signs[start : start + 4] = -1
@@ -216,12 +216,12 @@ def test_signs_of_quaternions_mean_nothing(name, activation):
     plain = regression.step(times(2), problem.state, problem.frames, candidates=True)
     mixtures = [
         flipped(mixture, operator.quaternion_starts(regression.kinematics))
-        for mixture, operator in zip(regression.mixtures, regression.operators, strict=True)
+        for mixture, operator in zip(regression.conditionals, regression.operators, strict=True)
     ]
     state = problem.case.world.flipped(problem.state)
     pose = problem.frames[OBJECT]
     frames = {OBJECT: Frame(pose.position, -pose.orientation)}
-    other = replace(regression, mixtures=mixtures)
+    other = replace(regression, conditionals=mixtures)
     for step in (
         other.step(times(2), problem.state, problem.frames, candidates=True),
         regression.step(times(2), state, problem.frames, candidates=True),
@@ -235,14 +235,14 @@ def test_each_component_has_its_own_sign():
     problem = Problem.of(CASES["the paper's"], 3)
     regression = problem.regression()
     plain = regression.step(times(), problem.state, problem.frames)
-    first = flipped(regression.mixtures[0], BOTH_HANDS.quaternion_starts(None))
-    mixed = LocalMixture(
+    first = flipped(regression.conditionals[0], BOTH_HANDS.quaternion_starts(None))
+    mixed = Conditionals(
         *(
-            torch.cat((getattr(first, name)[:1], getattr(regression.mixtures[0], name)[1:]))
+            torch.cat((getattr(first, name)[:1], getattr(regression.conditionals[0], name)[1:]))
             for name in ("mean", "gain", "covariance", "time_mean", "time_variance")
         )
     )
-    other = replace(regression, mixtures=[mixed, regression.mixtures[1]])
+    other = replace(regression, conditionals=[mixed, regression.conditionals[1]])
     assert_equal_estimates(other.step(times(), problem.state, problem.frames), plain)
 
 
@@ -300,9 +300,9 @@ def test_single_precision_stays_single_and_near(name, fusion, activation):
     rounded = replace(
         regression,
         kinematics=kinematics,
-        mixtures=[
-            LocalMixture(*(value.float() for value in vars(mixture).values()))
-            for mixture in regression.mixtures
+        conditionals=[
+            Conditionals(*(value.float() for value in vars(mixture).values()))
+            for mixture in regression.conditionals
         ],
         log_weights=regression.log_weights.float(),
     ).step(
@@ -322,7 +322,7 @@ def test_single_precision_stays_single_and_near(name, fusion, activation):
 def test_gradients_are_those_of_finite_differences(name, fusion, activation):
     problem = Problem.of(CASES[name], 2)
     regression = problem.regression(fusion=fusion, activation=activation, epsilon=EPSILON)
-    mixture, pose = regression.mixtures[0], problem.frames[OBJECT]
+    mixture, pose = regression.conditionals[0], problem.frames[OBJECT]
     factor = torch.linalg.cholesky(mixture.covariance)
     joints = problem.state.joints.clone()
     inputs = times(), mixture.mean, factor, joints, pose.position, pose.orientation
@@ -336,7 +336,9 @@ def test_gradients_are_those_of_finite_differences(name, fusion, activation):
         orientation: Tensor,
     ) -> tuple[Tensor, ...]:
         learned = replace(mixture, mean=mean, covariance=factor @ factor.mT)
-        estimate = replace(regression, mixtures=[learned, *regression.mixtures[1:]]).step(
+        estimate = replace(
+            regression, conditionals=[learned, *regression.conditionals[1:]]
+        ).step(
             time,
             regression.kinematics.state(joints),
             {OBJECT: Frame(position, orientation)},
@@ -353,7 +355,79 @@ def test_a_component_without_variance_is_refused_with_advice():
     problem = Problem.of(CASES["canonical"], 2)
     regression = problem.regression()
     flat = replace(
-        regression.mixtures[0], covariance=torch.zeros_like(regression.mixtures[0].covariance)
+        regression.conditionals[0],
+        covariance=torch.zeros_like(regression.conditionals[0].covariance),
     )
     with pytest.raises(DataError, match=r"projected component .*2 of 2 .*reg_covar"):
-        replace(regression, mixtures=[flat]).step(times(), problem.state, problem.frames)
+        replace(regression, conditionals=[flat]).step(times(), problem.state, problem.frames)
+
+
+# Candidates: each operator's own estimate, and its share of each joint (fig. 6)
+
+
+@EVERY_CASE
+@FUSIONS
+def test_candidates_are_each_operators_own_projection(case, fusion):
+    problem = Problem.of(case, 3, 2)
+    estimate = problem.regression(fusion=fusion).step(
+        times(2), problem.state, problem.frames, candidates=True
+    )
+    assert len(estimate.candidates) == len(case.operators)
+    for index in range(2):
+        time, joints = float(times(2)[index]), problem.state.joints[index].numpy()
+        activation = estimate.activation[index].numpy()
+        rows = problem.rows((index,))
+        for each, row, local in zip(estimate.candidates, rows, problem.mixtures, strict=True):
+            mean, covariance = oracles.candidate(time, joints, row, local, activation)
+            assert_close(each.mean[index], mean)
+            assert_close(each.covariance[index], covariance)
+
+
+def test_candidates_are_not_computed_unless_asked_for():
+    problem = Problem.of(CASES["the paper's"], 2)
+    assert problem.regression().step(times(), problem.state, problem.frames).candidates == ()
+
+
+def shares(case: Case, *batch: int) -> Tensor:
+    problem = Problem.of(case, 3, *batch)
+    estimate = problem.regression().step(
+        times(*batch), problem.state, problem.frames, candidates=True
+    )
+    return torch.stack([candidate.share for candidate in estimate.candidates])
+
+
+@pytest.mark.parametrize("name", ["canonical", "the paper's", "three", "poses in two frames"])
+def test_shares_are_fractions_of_the_marginal_precisions(name):
+    problem = Problem.of(CASES[name], 3, 2)
+    estimate = problem.regression().step(
+        times(2), problem.state, problem.frames, candidates=True
+    )
+    variances = [c.covariance.diagonal(dim1=-2, dim2=-1) for c in estimate.candidates]
+    fractions = shares(CASES[name], 2)
+    assert bool(((fractions >= 0) & (fractions <= 1)).all())
+    assert_close(fractions.sum(0), np.ones(problem.state.joints.shape))
+    for one, other in itertools.combinations(range(len(variances)), 2):
+        ratio = variances[other] / variances[one]
+        seen = (fractions[one] > 0) & (fractions[other] > 0)
+        assert_close((fractions[one] / fractions[other])[seen], ratio[seen])
+
+
+def test_a_joint_that_an_operator_does_not_touch_gets_no_share_of_it():
+    left, both, everything = shares(CASES["three"], 2)
+    names = upper_body().joint_names
+    right_arm = [name.startswith("r_") for name in names]
+    assert bool((left[:, right_arm] == 0).all())
+    assert bool((left[:, [not right for right in right_arm]] > 0).all())
+    waist = [name.startswith("waist") for name in names]
+    # the waist carries both hands: it does not move one relative to the other
+    assert bool((both[:, waist] == 0).all())
+    assert bool((everything > 0).all())
+
+
+def test_a_joint_that_no_operator_touches_has_no_shares_and_no_nan():
+    case = CASES["two that leave joints free"]
+    alone = Case(case.world, case.operators[:1], lambda at: case.rows(at)[:1])
+    [share] = shares(alone)
+    right_arm = [name.startswith("r_") for name in upper_body().joint_names]
+    assert bool((share[right_arm] == 0).all())
+    assert bool((share[[not right for right in right_arm]] == 1).all())

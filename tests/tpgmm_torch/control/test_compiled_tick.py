@@ -18,7 +18,7 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.control.compiled import PART
+from tpgmm_torch.control.compiled_tick import PART
 from tpgmm_torch.exceptions import DataError, DependencyError, NotFittedError, ShapeError
 
 URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="lower"/>
@@ -151,10 +151,12 @@ def test_more_components_than_the_graph_knows_run_as_before():
     plain, compiled = (fitted().set_params(negligible=1e-2) for _ in range(2))
     compiled.compile("aot_eager")
     regression = compiled.regression()
-    assert regression._windows.largest < compiled.n_components
+    assert regression._largest < compiled.n_components
     tables = []
-    graph = regression._graphs[torch.Size([2])]
-    regression._graphs[torch.Size([2])] = lambda inputs: tables.append(inputs) or graph(inputs)
+    graph = regression._graphs[torch.Size([1, 2])]
+    regression._graphs[torch.Size([1, 2])] = lambda inputs: (
+        tables.append(inputs) or graph(inputs)
+    )
     for time, served in ((0.4, 1), (50.0, 1), (0.5, 2)):
         assert_same(compiled.step(time, [0.2, 0.5], cup()), plain.step(time, [0.2, 0.5], cup()))
         assert len(tables) == served
@@ -162,8 +164,8 @@ def test_more_components_than_the_graph_knows_run_as_before():
 
 def test_a_direction_without_variance_is_an_error_and_no_number():
     model = fitted().compile("aot_eager")
-    tables = model.regression()._update.tables
-    tables.tasks.mul_(-1)
+    covariance = model.regression()._update.conditionals.covariance
+    covariance[:, :-2, :-2].mul_(-1)
     model.regression()._selected.clear()
     with pytest.raises(DataError, match="covariance of the tasks is not positive definite"):
         model.step(0.5, [0.2, 0.5], cup())

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.mixtures import CASES, Problem, local_mixture, random_local, times
+from tests.support.mixtures import CASES, Problem, conditionals_of, random_local, times
 from tpgmm_torch import Canonical, Frame, Stack
-from tpgmm_torch.regression.active_components import Windows
+from tpgmm_torch.regression.kalman_update import KalmanUpdate
 from tpgmm_torch.regression.regression import PART
-from tpgmm_torch.regression.task_update import TaskUpdate
 
 
 class Joints(Canonical):
@@ -42,8 +41,8 @@ def test_two_operators_of_the_joints_are_one_prior():
     problem = Problem.of(CASES["the paper's"], 3)
     plain = problem.regression()
     more = random_local(np.random.default_rng(5), 3, problem.state.joints.numpy())
-    mixtures = [*plain.mixtures, local_mixture(more)]
-    twice = replace(plain, operators=[*plain.operators, Canonical()], mixtures=mixtures)
+    conditionals = [*plain.conditionals, conditionals_of(more)]
+    twice = replace(plain, operators=[*plain.operators, Canonical()], conditionals=conditionals)
     summed = [Joints() if type(o) is Canonical else o for o in twice.operators]
     at = times(), problem.state, problem.frames
     assert_same(twice.step(*at), replace(twice, operators=summed).step(*at))
@@ -52,11 +51,11 @@ def test_two_operators_of_the_joints_are_one_prior():
 def test_a_mixture_of_another_kind_is_left_to_the_sum():
     case = CASES["the paper's"]
     kinematics = case.world.kinematics
-    assert TaskUpdate.serves(case.operators, kinematics)
-    assert not TaskUpdate.serves(case.operators[:1], kinematics)
-    assert not TaskUpdate.serves([Stack(Canonical()), Canonical()], kinematics)
+    assert KalmanUpdate.serves(case.operators, kinematics)
+    assert not KalmanUpdate.serves(case.operators[:1], kinematics)
+    assert not KalmanUpdate.serves([Stack(Canonical()), Canonical()], kinematics)
     poses = CASES["poses in two frames"]
-    assert not TaskUpdate.serves([*poses.operators, Canonical()], poses.world.kinematics)
+    assert not KalmanUpdate.serves([*poses.operators, Canonical()], poses.world.kinematics)
 
 
 @pytest.mark.parametrize("alike", [True, False], ids=["one time", "own times"])
@@ -85,11 +84,15 @@ def test_float32_is_float64_to_its_own_precision():
     problem = Problem.of(CASES["the paper's"], 4, 3)
     double = problem.regression()
     robot = problem.case.world.kinematics.to(torch.float32)
-    mixtures = [
-        type(m)(*(getattr(m, f).float() for f in m.__annotations__)) for m in double.mixtures
+    conditionals = [
+        type(m)(*(getattr(m, f).float() for f in m.__annotations__))
+        for m in double.conditionals
     ]
     single = replace(
-        double, kinematics=robot, mixtures=mixtures, log_weights=double.log_weights.float()
+        double,
+        kinematics=robot,
+        conditionals=conditionals,
+        log_weights=double.log_weights.float(),
     )
     frames = {
         name: Frame(f.position.float(), f.orientation.float())
@@ -104,42 +107,3 @@ def test_float32_is_float64_to_its_own_precision():
         actual.covariance.double(), expected.covariance, rtol=1e-3, atol=1e-5
     )
     torch.linalg.cholesky(actual.covariance)
-
-
-# Which components count
-
-
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("negligible", [1e-9, 1e-3])
-def test_what_windows_leave_out_is_negligible_everywhere(seed, negligible):
-    rng = np.random.default_rng(seed)
-    means = torch.from_numpy(rng.uniform(0, 10, 12))
-    variances = torch.from_numpy(10 ** rng.uniform(-4, 0, 12))
-    log_weights = torch.from_numpy(rng.dirichlet(np.ones(12))).log()
-    windows = Windows(log_weights, means, variances, negligible)
-    instants = torch.from_numpy(rng.uniform(-8, 18, 2000))
-    apart = (instants[:, None] - means).square() / variances
-    log_h = log_weights - 0.5 * (apart + variances.log())
-    shares = torch.exp(log_h - log_h.amax(1, keepdim=True))
-    fewer = 0
-    for instant, share in zip(instants.tolist(), shares, strict=True):
-        left_out = sorted(set(range(12)) - set(windows.at(instant)))
-        assert bool((share[left_out] < negligible).all())
-        fewer += len(left_out)
-    assert fewer > 1000
-    assert windows.largest < 12 or negligible < 1e-3
-
-
-def test_a_span_of_time_counts_what_its_windows_count():
-    means = torch.linspace(0, 10, 11, dtype=torch.float64)
-    windows = Windows(torch.zeros(11), means, torch.full((11,), 0.04), 1e-9)
-    between = set(windows.between(3.0, 5.0))
-    assert {3, 4, 5} <= between < set(range(11))
-    for instant in np.linspace(3, 5, 50):
-        assert set(windows.at(float(instant))) <= between
-    assert windows.between(-100, 5) == windows.at(1e9) == tuple(range(11))
-
-
-def test_keeping_all_keeps_all():
-    means = torch.tensor([0.0, 100.0])
-    assert Windows(torch.zeros(2), means, torch.ones(2), 0).at(0.0) == (0, 1)

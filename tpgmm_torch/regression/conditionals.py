@@ -1,0 +1,126 @@
+"""Components conditioned on time: what they weigh, and what they say of coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+
+__all__ = ["Conditionals", "TimeMarginals"]
+
+
+class _OfComponents:
+    """Tensors whose first dimension counts components."""
+
+    def select(self, components: Tensor) -> Self:
+        """Only some of the components, by their indices."""
+        return type(self)(*(tensor[components] for tensor in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class TimeMarginals(_OfComponents):
+    """The time marginals ``pi_i N(t | mu_t,i, Sigma_tt,i)`` of K components.
+
+    Parameters
+    ----------
+    log_peak : Tensor of shape (K,)
+        What of their logarithms does not depend on time, ``log pi_i - log(Sigma_tt,i) / 2``.
+    mean : Tensor of shape (K,)
+        ``mu_t,i`` [s].
+    precision : Tensor of shape (K,)
+        ``1 / Sigma_tt,i`` [1/s^2].
+    """
+
+    log_peak: Tensor
+    mean: Tensor
+    precision: Tensor
+
+    @classmethod
+    def of(cls, log_weights: Tensor, mean: Tensor, variance: Tensor) -> TimeMarginals:
+        """From mixing coefficients pi_i and moments, each of shape (K,)."""
+        return cls(log_weights - 0.5 * variance.log(), mean, 1 / variance)
+
+    def log_activation(self, time: Tensor) -> Tensor:
+        """``log h_i(t)``, (..., K), up to a constant that the components share.
+
+        Parameters
+        ----------
+        time : Tensor of shape (..., 1), or (..., K) for times of each component's own
+        """
+        elapsed = time - self.mean
+        return torch.addcmul(self.log_peak, self.precision, elapsed.square(), value=-0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Conditionals(_OfComponents):
+    """K Gaussians over time and D coordinates, conditioned on time.
+
+    Parameters
+    ----------
+    mean, gain : Tensor of shape (K, D)
+        ``E[x | t] = mean + gain (t - time_mean)``.
+    covariance : Tensor of shape (K, D, D)
+        Of the coordinates given time, which it does not depend on.
+    time_mean, time_variance : Tensor of shape (K,)
+        The time marginals [s], [s^2].
+    """
+
+    mean: Tensor
+    gain: Tensor
+    covariance: Tensor
+    time_mean: Tensor
+    time_variance: Tensor
+
+    @classmethod
+    def of(cls, means: Tensor, covariances: Tensor) -> Conditionals:
+        """Condition on the first coordinate: shapes (K, 1 + D) and (K, 1 + D, 1 + D)."""
+        gain, covariance = gaussians.condition(means, covariances, 1)
+        return cls(means[:, 1:], gain[..., 0], covariance, means[:, 0], covariances[:, 0, 0])
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Conditionals]) -> Conditionals:
+        """The coordinates of all parts side by side, which are independent given time."""
+        time = parts[0].time_mean, parts[0].time_variance
+        sizes = [part.mean.shape[-1] for part in parts]
+        covariance = parts[0].mean.new_zeros(len(time[0]), sum(sizes), sum(sizes))
+        start = 0
+        for part, size in zip(parts, sizes, strict=True):
+            block = slice(start, start + size)
+            covariance[:, block, block] = part.covariance
+            start += size
+        mean = torch.cat([part.recentred(time[0]) for part in parts], -1)
+        return cls(mean, torch.cat([part.gain for part in parts], -1), covariance, *time)
+
+    @classmethod
+    def product(cls, parts: Sequence[Conditionals]) -> Conditionals:
+        """The product (2) of Gaussians over the same coordinates, component by component.
+
+        Raises
+        ------
+        DataError
+            If a covariance is singular.
+        """
+        if len(parts) == 1:
+            return parts[0]
+        like, time = parts[0].mean, (parts[0].time_mean, parts[0].time_variance)
+        # in float64, as narrow directions lose digits soonest
+        covariances = torch.stack([part.covariance.double() for part in parts])
+        means = torch.stack([part.recentred(time[0]).double() for part in parts])
+        gains = torch.stack([part.gain.double() for part in parts])
+        gain, _ = gaussians.product(gains, covariances)
+        mean, covariance = gaussians.product(means, covariances)
+        return cls(mean.to(like), gain.to(like), covariance.to(like), *time)
+
+    def recentred(self, time_mean: Tensor) -> Tensor:
+        """Conditional means at a time of each component's own: shapes (K,) and (K, D)."""
+        return self.mean + self.gain * (time_mean - self.time_mean).unsqueeze(-1)
+
+    def at(self, time: Tensor) -> Tensor:
+        """Conditional means at times of shape (...): a tensor of shape (..., K, D)."""
+        elapsed = time.unsqueeze(-1) - self.time_mean
+        return torch.addcmul(self.mean, self.gain, elapsed.unsqueeze(-1))

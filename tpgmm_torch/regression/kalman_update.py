@@ -1,0 +1,158 @@
+"""The joints' Gaussian corrected by the tasks: the information form as a Kalman update.
+
+Where the joints have an operator of their own (:class:`Canonical`), its conditional
+``N(m, C)`` given time is a prior over the joints that does not depend on the robot, and each
+task ``J (q - q_{t-1}) = M x + c`` with ``x ~ N(mu, S)`` is a measurement of it. The product (2)
+of the projected Gaussians is then, by the matrix inversion lemma, the Kalman update
+
+    H = M S M^T + J C J^T,   r = M mu + c - J (m - q_{t-1}),
+    q = m + C J^T H^-1 r,    C - C J^T H^-1 J C,
+
+with as many dimensions to factorise as the tasks have (12 for two hands) in place of as many as
+there are joints, no pseudo-inverse and no epsilon.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians, quaternions
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.operators import (
+    AbsoluteOrientation,
+    AbsolutePosition,
+    Canonical,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+
+__all__ = ["KalmanUpdate"]
+
+#: Operators whose M has full row rank at every state, so that S is as definite as what was
+#: learned. An operator of another kind may claim to know a direction exactly by mistake, which
+#: the sum of precisions refuses and this form would not notice.
+TASKS = (AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation)
+
+
+class KalmanUpdate:
+    """The update of the joints' operator by all others.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    operators : sequence of Operator
+        At least one of them is :class:`Canonical`.
+    conditionals : sequence of Conditionals
+        One per operator.
+
+    Attributes
+    ----------
+    task : Stack or None
+        All operators but those of the joints.
+    conditionals : Conditionals
+        Of the tasks' D coordinates and, behind them, the n joints.
+    """
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        operators: Sequence[Operator],
+        conditionals: Sequence[Conditionals],
+    ) -> None:
+        for one in conditionals:
+            name = "the covariance of a projected component"
+            gaussians.cholesky(one.covariance.double(), name)
+        pairs = list(zip(operators, conditionals, strict=True))
+        tasks = [operator for operator, _ in pairs if type(operator) is not Canonical]
+        local = [one for operator, one in pairs if type(operator) is not Canonical]
+        priors = [one for operator, one in pairs if type(operator) is Canonical]
+        self.task = Stack(*tasks) if tasks else None
+        self.conditionals = Conditionals.stacked([*local, Conditionals.product(priors)])
+        starts = self.task.quaternion_starts(kinematics) if self.task is not None else ()
+        blocks = quaternions.quaternion_blocks(
+            starts, self.conditionals.mean.shape[-1] - kinematics.n_joints
+        )
+        self._blocks = blocks.to(self.conditionals.mean) if starts else None
+
+    @staticmethod
+    def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
+        """Whether these operators can be fused in this way.
+
+        Parameters
+        ----------
+        operators : sequence of Operator
+        kinematics : Kinematics
+            Where the joint vector holds quaternions, what the joints' operator says depends on
+            the present state.
+        """
+        if kinematics.quaternion_starts or not any(type(o) is Canonical for o in operators):
+            return False
+        tasks = [operator for operator in operators if type(operator) is not Canonical]
+        leaves = Stack(*tasks).leaves if tasks else ()
+        return all(type(leaf) in TASKS for leaf in leaves)
+
+    def __call__(
+        self,
+        conditionals: Conditionals,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+    ) -> tuple[Tensor, Tensor]:
+        """What A components say of the joints, in terms of the step ``q - q_{t-1}``.
+
+        Parameters
+        ----------
+        conditionals : Conditionals
+            Some of :attr:`conditionals`, or all.
+        time : Tensor of shape () or (...)
+        state : RobotState
+        frames : mapping of str to Frame
+
+        Returns
+        -------
+        steps : Tensor of shape (..., A, n)
+        covariances : Tensor of shape (..., A, n, n)
+        """
+        if self.task is None:
+            steps = conditionals.at(time) - state.joints.unsqueeze(-2)
+            return steps, conditionals.covariance
+        at = self.task.linearize(state, frames)
+        assert at.jacobian is not None and at.matrix is not None
+        batch = gaussians.common_shape(
+            at.jacobian.shape[:-2],
+            at.matrix.shape[:-2],
+            at.displacement.shape[:-1],
+            time.shape or state.joints.shape[:-1],
+        )
+        # components stand in front of the batch: of each, all robots enter one product
+        ones, n = [1] * len(batch), state.joints.shape[-1]
+        mean = conditionals.at(time.expand(batch) if time.ndim else time.view(ones))
+        mean, covariance = mean.movedim(-2, 0), conditionals.covariance
+        shape, width = (len(mean), *batch, -1, -1), mean.shape[-1] - n
+        matrix = at.matrix
+        if self._blocks is not None:
+            present = at.present
+            if present is None:
+                present = self.task.coordinates(state, frames)
+            # of q and -q, which are one rotation, the mean is the one that is nearer
+            local = mean.narrow(-1, 0, width)
+            signs = quaternions.hemisphere_signs(local, present, self._blocks)
+            matrix = matrix * signs.unsqueeze(-2)
+        # tasks and joints are one vector (x, q - q_{t-1}), on which r = [M, -J] (x, ...) + c
+        mean = mean - torch.nn.functional.pad(state.joints, (width, 0))
+        rows = torch.cat((matrix.expand(shape), -at.jacobian.expand(shape)), -1)
+        residual = rows @ mean.unsqueeze(-1) + at.displacement.unsqueeze(-1)
+        cross = (rows.flatten(1, -2) @ covariance).view_as(rows)
+        right = torch.cat((cross.narrow(-1, width, n), residual), -1)
+        white = gaussians.whiten(cross @ rows.mT, right, "the covariance of the tasks")
+        gain, residual = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
+        steps = mean.narrow(-1, width, n) - (gain.mT @ residual).squeeze(-1)
+        prior = covariance[:, width:, width:].unflatten(0, (-1, *ones))
+        return steps.movedim(0, -2), (prior - gain.mT @ gain).movedim(0, -3)
