@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.trajectories import Candidate, Trajectory
@@ -35,6 +36,7 @@ __all__ = [
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
+    "Controller",
     "Demonstration",
     "Estimate",
     "Frame",
@@ -53,6 +55,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "control.controller": ("Controller",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),

@@ -20,7 +20,8 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, persistence
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
-from tpgmm_torch.control.rollout import Synthesis, rollout
+from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -389,7 +390,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         return regression.step(now, state, known, candidates, limits)
 
     def compile(self, backend: str = "inductor", n_robots: int = 1) -> Self:
-        """Make :meth:`step`, :meth:`synthesis` and :meth:`predict` one compiled graph.
+        """Make :meth:`step`, :meth:`controller` and :meth:`predict` one compiled graph.
 
         Kinematics, operators and fusion of a tick run as one graph, compiled ahead of time by
         AOTInductor; what they give is the same. There is a graph for one robot and one for
@@ -432,18 +433,20 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise
         return self
 
-    def synthesis(self, joints: Any) -> Synthesis:
-        """The loop of :meth:`predict`, to be stepped by a controller.
+    def controller(self, joints: Any, frames: Mapping[str, Frame] | None = None) -> Controller:
+        """The skill, to be run tick by tick.
 
         Parameters
         ----------
         joints : array-like of shape (..., n_joints)
             Start postures.
+        frames : mapping of str to Frame, optional
+            Object poses, of shapes that broadcast with the batch; a step may be given others.
 
         Returns
         -------
-        Synthesis
-            Its ``step(time, frames)`` finds the next ``reference``.
+        Controller
+            Its ``step(dt)`` finds the next ``reference``.
 
         Raises
         ------
@@ -451,8 +454,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             If the postures do not fit the robot.
         """
         self._check_fitted()
-        start = self.kinematics_.joint_tensor(joints)
-        return Synthesis(self.regression(), start, self.blend, self.keep_limits)
+        return Controller(
+            self.regression(),
+            joints,
+            frames,
+            begin=float(self.time_[0]),
+            end=float(self.time_[-1]),
+            blend=self.blend,
+            keep_limits=self.keep_limits,
+        )
 
     def sample(
         self,

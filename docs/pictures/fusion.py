@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import Situation, TaskParameterizedGMM
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.control.rollout import stacked
 from tpgmm_torch.metrics import largest_acceleration
 
 __all__ = ["draw"]
@@ -34,7 +33,7 @@ def draw(out: Path) -> None:
     situations = [
         Situation(one.joints, one.frames, time) for one in skill.situations(N_SITUATIONS, 1000)
     ]
-    bottles = stacked([situation.frames["bottle"] for situation in situations])
+    bottles = Frame.stack([situation.frames["bottle"] for situation in situations])
     model = TaskParameterizedGMM(30, bottle_operators(), skill.robot).fit(aligned)
 
     def measure() -> tuple[float, float]:

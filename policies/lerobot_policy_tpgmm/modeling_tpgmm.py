@@ -18,14 +18,13 @@ from lerobot_policy_tpgmm.configuration_tpgmm import (
     TPGMMConfig,
     state_features,
 )
-from lerobot_policy_tpgmm.control import ControlLoop
 from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.policy_files import read_tensors, write_files
 from lerobot_policy_tpgmm.training.learner import Learner
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import Controller, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
 
@@ -204,7 +203,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
-        self._loop: ControlLoop | None = None
+        self._controller: Controller | None = None
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -227,9 +226,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError, ShapeError
             If the observation is not what the policy was made for.
         """
-        if self._loop is None:
-            self._loop = self._begin(batch)
-        return self.joints.action(self._step(self._loop, batch))
+        if self._controller is None:
+            self._controller = self._begin(batch)
+        return self.joints.action(self._step(self._controller, batch))
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -244,27 +243,48 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         -------
         Tensor of shape (B, chunk_size, n_action)
         """
-        ahead = self._begin(batch) if self._loop is None else self._loop.copy()
+        begun = self._controller
+        ahead = self._begin(batch) if begun is None else begun.copy()
         references = [self._step(ahead, batch)]
         while len(references) < self.config.chunk_size:
-            references.append(ahead.step())
+            ahead.step(1 / self.config.rate)
+            references.append(ahead.reference)
         return self.joints.action(torch.stack(references, dim=1))
 
-    def _begin(self, batch: Mapping[str, Tensor]) -> ControlLoop:
+    def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
-        return ControlLoop(
-            self.to_estimator(),
-            self._observed(batch),
-            self.frames.frames(batch),
-            1 / self.config.rate,
-            self.config.largest_start_gap,
-        )
+        model = self.to_estimator()
+        return model.controller(self._observed(batch), self.frames.frames(batch))
 
-    def _step(self, loop: ControlLoop, batch: Mapping[str, Tensor]) -> Tensor:
-        if self.config.follow_frames:
-            loop.frames = self.frames.frames(batch)
+    def _step(self, controller: Controller, batch: Mapping[str, Tensor]) -> Tensor:
+        """The references (B, n_joints) of the next action."""
+        start, first = controller.reference, controller.estimate is None
+        frames = self.frames.frames(batch) if self.config.follow_frames else None
         measured = self._observed(batch) if self.config.feedback == "observation" else None
-        return loop.step(measured)
+        if measured is not None and measured.shape != start.shape:
+            raise ShapeError(
+                f"the episode began with {len(start)} robots, now there are {len(measured)}: "
+                "call reset() between episodes"
+            )
+        estimate = controller.step(1 / self.config.rate, measured, frames)
+        if first:
+            self._check_start(start, estimate.joints)
+        return controller.reference
+
+    def _check_start(self, start: Tensor, wanted: Tensor) -> None:
+        """Refuse to move robots that stand far from where the skill begins."""
+        largest, gap = self.config.largest_start_gap, (wanted - start).abs()
+        if largest is None or not bool((gap > largest).any()):
+            return
+        row, joint = divmod(int(gap.argmax()), gap.shape[1])
+        raise DataError(
+            f"joint {self.kinematics.joint_names[joint]!r} of robot {row} stands at "
+            f"{float(start[row, joint]):.4g} rad, but the skill begins at "
+            f"{float(wanted[row, joint]):.4g} rad: the order of the state's entries "
+            "(--policy.state_names) or their unit (--policy.units) is wrong, or the robot has "
+            f"to be brought to the start first. Further than {largest} rad is refused "
+            "(--policy.largest_start_gap, null for any)"
+        )
 
     def _observed(self, batch: Mapping[str, Tensor]) -> Tensor:
         if OBS_STATE not in batch:

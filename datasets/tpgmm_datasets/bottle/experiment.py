@@ -30,6 +30,7 @@ from tpgmm_datasets.writer import save_lerobot
 from tpgmm_torch import (
     Canonical,
     Demonstration,
+    Frame,
     Operator,
     RelativeOrientation,
     RelativePosition,
@@ -39,7 +40,6 @@ from tpgmm_torch import (
     Trajectory,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
-from tpgmm_torch.control.rollout import stacked
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity, sinusoid
 
 __all__ = ["BottleExperiment", "bottle_operators"]
@@ -246,7 +246,7 @@ class _Measure:
         starts = torch.stack([situation.joints for situation in situations])
         position, orientation = self.skill.grasp_error(
             joints[:, self.contact],
-            stacked([situation.frames["bottle"] for situation in situations]),
+            Frame.stack([situation.frames["bottle"] for situation in situations]),
         )
         shoulders = torch.stack(
             [self.skill.shoulders(trajectory) for trajectory in trajectories]

@@ -3,15 +3,15 @@
 import copy
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tests.support.mixtures import CASES, Case, Problem, assert_close, times
+from tests.support.mixtures import CASES, Case, Problem, assert_close
 from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
-from tpgmm_torch.control.rollout import Synthesis, minimum_jerk, rollout, stacked
+from tpgmm_torch.control.minimum_jerk import minimum_jerk
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.regression.regression import Regression
 
 NAMES = ["the paper's", "poses in two frames"]
@@ -52,28 +52,6 @@ def assert_same(a: Trajectory, b: Trajectory) -> None:
         assert_close(one.mean, other.mean)
         assert_close(one.covariance, other.covariance)
         assert_close(one.share, other.share)
-
-
-# The fade
-
-
-def test_minimum_jerk_goes_from_zero_to_one():
-    ends = torch.tensor([-1.0, 0.0, 0.5, 1.0, 2.0], dtype=torch.float64)
-    assert minimum_jerk(ends).tolist() == [0.0, 0.0, 0.5, 1.0, 1.0]
-
-
-def test_minimum_jerk_rises_symmetrically():
-    u = torch.linspace(0, 1, 101, dtype=torch.float64)
-    assert bool((minimum_jerk(u).diff() > 0).all())
-    assert_close(minimum_jerk(u) + minimum_jerk(1 - u), np.ones(101))
-
-
-def test_minimum_jerk_is_at_rest_at_both_ends():
-    u = torch.tensor([0.0, 1.0], dtype=torch.float64, requires_grad=True)
-    value = minimum_jerk(u)
-    for _ in range(2):
-        [value] = torch.autograd.grad(value.sum(), u, create_graph=True)
-        assert_close(value.detach(), np.zeros(2))
 
 
 # The loop
@@ -164,30 +142,18 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
     regression, time = problem.regression(activation=activation), grid()
     given = situations(problem, time, time, moves=moves)
     trajectories = run(regression, given)
-    together = {OBJECT: stacked([item.frames[OBJECT] for item in given])}
-    loop = Synthesis(regression, problem.state.joints, 0.5, False)
+    together = {OBJECT: Frame.stack([item.frames[OBJECT] for item in given])}
+    joints = problem.state.joints
     for k, now in enumerate(time):
         here = {name: pose[k] if moves else pose for name, pose in together.items()}
-        estimate = loop.step(now, here, candidates=True)
+        state = case.world.kinematics.state(joints)
+        estimate = regression.step(now, state, here, candidates=True)
+        joints = torch.stack([trajectory.joints[k] for trajectory in trajectories])
         for row, trajectory in enumerate(trajectories):
             for one, other in zip(trajectory.candidates, estimate.candidates, strict=True):
                 assert_close(one.mean[k], other.mean[row])
                 assert_close(one.covariance[k], other.covariance[row])
                 assert_close(one.share[k], other.share[row])
-
-
-@EVERY_WORLD
-def test_what_was_measured_may_stand_for_the_last_reference(case: Case):
-    problem = Problem.of(case, 3, 2)
-    regression, kinematics = problem.regression(), case.world.kinematics
-    loop = Synthesis(regression, problem.state.joints, 0.0, False)
-    for time in grid():
-        measured = loop.reference + 0.01
-        loop.step(time, problem.frames, kinematics.retract(measured))
-        expected = regression.step(
-            time, kinematics.state(kinematics.retract(measured)), problem.frames
-        )
-        assert_close(loop.reference, kinematics.retract(expected.joints))
 
 
 # The start
@@ -225,36 +191,6 @@ def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
 
 
 # Limits
-
-
-def test_inside_its_bounds_a_step_is_what_it_was():
-    problem = Problem.of(CASES["the paper's"], 3, 2)
-    now = times(2), problem.state, problem.frames
-    plain = problem.regression().step(*now)
-    bounds = plain.joints - 1e-9, plain.joints + 1e-9
-    assert torch.equal(problem.regression().step(*now, bounds=bounds).joints, plain.joints)
-
-
-@pytest.mark.parametrize("width", [0.01, 0.1])
-def test_joints_at_a_bound_stand_and_the_others_take_over(width):
-    problem = Problem.of(CASES["the paper's"], 3, 2)
-    now = times(2), problem.state, problem.frames
-    plain = problem.regression().step(*now)
-    lower, upper = problem.state.joints - width, problem.state.joints + width
-    bounded = problem.regression().step(*now, bounds=(lower, upper)).joints
-    assert bool(((bounded >= lower) & (bounded <= upper)).all())
-    for index in range(2):
-        mean, covariance = plain.joints[index], plain.covariance[index]
-        low, high = lower[index], upper[index]
-        joints, stands = mean.clone(), torch.zeros(17, dtype=torch.bool)
-        while bool((beyond := ((joints < low) | (joints > high)) & ~stands).any()):
-            joints = torch.where(beyond, joints.clamp(low, high), joints)
-            stands |= beyond
-            inverse = torch.linalg.inv(covariance[stands][:, stands])
-            gain = covariance[~stands][:, stands] @ inverse
-            joints[~stands] = mean[~stands] + gain @ (joints[stands] - mean[stands])
-        assert int(stands.sum()) > 0
-        assert_close(bounded[index], joints, 1e-6)
 
 
 def test_references_keep_the_limits_of_position_and_speed():
