@@ -123,3 +123,15 @@ def test_a_stack_knows_what_its_members_need():
 def test_a_stack_has_the_tolerances_of_its_members():
     stack = Stack(AbsolutePosition("l_hand"), Canonical(0.01))
     assert stack.tolerances(upper_body()) == (0.0,) * 3 + (0.01,) * 17
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_joints_stacked_with_joints_keep_their_type(dtype):
+    robot = upper_body().to(dtype=dtype)
+    state = robot.state(torch.linspace(-0.5, 0.5, 17, dtype=dtype).expand(2, 17))
+    at = Stack(Canonical(), Canonical()).linearize(state, {})
+    identity = torch.eye(17, dtype=dtype)
+    assert at.jacobian.dtype == at.matrix.dtype == at.displacement.dtype == dtype
+    assert torch.equal(at.jacobian, torch.cat((identity, identity)).expand(2, -1, -1))
+    assert torch.equal(at.matrix, torch.block_diag(identity, identity).expand(2, -1, -1))
+    assert torch.equal(at.displacement, -torch.cat((state.joints, state.joints), dim=-1))

@@ -15,7 +15,7 @@ from tpgmm_torch import (
     Stack,
 )
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators.text import format_operator, parse_operator
+from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
 
 OPERATORS = [
     Canonical(),
@@ -68,3 +68,22 @@ def test_an_operator_of_ones_own_goes_by_its_repr():
 def test_parsed_operators_fit_the_robot_they_name():
     operator = parse_operator("pose:l_hand@r_hand + canonical")
     assert operator.dimension(upper_body()) == 3 + 4 + 17
+
+
+@pytest.mark.parametrize(
+    ("links", "frames", "expected"),
+    [
+        ([], ["bottle"], ["canonical"]),
+        (["hand"], [], ["pose:hand", "canonical"]),
+        (
+            ["left", "right"],
+            ["bottle", "cup"],
+            [
+                "pose:left@bottle + pose:right@bottle + pose:left@cup + pose:right@cup",
+                "canonical",
+            ],
+        ),
+    ],
+)
+def test_by_default_all_links_are_seen_from_all_frames(links, frames, expected):
+    assert default_operators(links, frames) == [parse_operator(text) for text in expected]
