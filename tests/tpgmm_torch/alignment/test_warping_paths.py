@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tpgmm_torch.alignment import warping_paths
 from tpgmm_torch.alignment.warping_paths import (
     barycenter,
     medoid,
@@ -177,3 +178,42 @@ def test_rounds_of_the_barycenter_lower_the_cost_until_they_do_not():
     costs = [cost(barycenter(family, family[0], rounds)) for rounds in (1, 2, 3, 30, 31)]
     assert cost(family[0]) > costs[0] > costs[1] > costs[2] >= costs[3] == costs[4]
     np.testing.assert_array_equal(barycenter([family[0], family[0]], family[0], 5), family[0])
+
+
+@pytest.mark.parametrize("steps, expected", [(1, 4), (2, 4), (3, 0), (4, 3)])
+def test_the_window_of_the_medoid_is_a_fraction_of_the_duration(steps, expected):
+    # two peaks have the distance 0 if the window lets one reach the other
+    peaks = np.array([13, 10, 16, 20, 24, 24])
+    family = list((np.arange(41) == peaks[:, None]).astype(float)[:, :, None])
+    reached = (np.abs(peaks[:, None] - peaks) <= steps).sum(axis=0)
+    assert expected == np.argmax(reached)
+    assert medoid(family, steps / 40) == expected
+
+
+def test_where_a_window_reaches_no_end_there_is_no_path():
+    path, cost = warping_path(np.zeros((9, 1)), np.zeros((3, 1)), window=2)
+    assert cost == np.inf
+    assert path.shape == (0, 2) and path.dtype == np.intp
+
+
+@pytest.mark.parametrize("options", [{}, {"window": 5, "penalty": 0.1}])
+def test_the_barycenter_is_averaged_until_a_round_gains_less_than_a_thousandth(
+    options, monkeypatch
+):
+    rng = np.random.default_rng(4)
+    family = [rng.standard_normal((n, 2)).cumsum(axis=0) for n in (30, 31, 29, 30)]
+    rounds = []
+
+    def recorded(average, sequence, **given):
+        path, cost = warping_path(average, sequence, **given)
+        if sequence is family[0]:
+            rounds.append(0.0)
+        rounds[-1] += cost
+        return path, cost
+
+    monkeypatch.setattr(warping_paths, "warping_path", recorded)
+    last = barycenter(family, family[0], 100, **options)
+    gains = 1 - np.divide(rounds[1:], rounds[:-1])
+    assert len(gains) > 3 and (gains[:-1] > 1e-3).all() and gains[-1] <= 1e-3
+    # the average of the round that gained nothing is not taken
+    np.testing.assert_array_equal(barycenter(family, family[0], len(gains), **options), last)
