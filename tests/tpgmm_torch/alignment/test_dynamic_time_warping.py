@@ -334,3 +334,16 @@ def test_smoothing_covers_its_seconds_on_both_sides():
     np.testing.assert_allclose(smooth[far], sharp[far], rtol=0, atol=0.02)
     near = (abs(even - 2) < 0.3) | (abs(even - 3) < 0.3)
     assert np.abs(smooth - sharp)[near].max() > 0.05
+
+
+@pytest.mark.parametrize("window, steps", [(0.0724, 1), (0.0776, 2), (0.12, 2), (0.01, 1)])
+def test_the_window_is_the_nearest_number_of_steps_of_the_reference(window, steps):
+    # two peaks, on twenty steps, are matched if the window lets one reach the other
+    peaks = [(np.arange(21.0) == peak)[:, None] * 1.0 for peak in (8, 8 + steps, 9 + steps)]
+    own, near, far = (Demonstration(np.arange(21.0), peak) for peak in peaks)
+    warping = DynamicTimeWarping(
+        0, features=["joints"], penalty=0.0, smoothing=0.0, window=window
+    )
+    assert (
+        warping.fit([own, near]).distortions_[1] < 0.1 < warping.fit([own, far]).distortions_[1]
+    )
