@@ -78,15 +78,15 @@ class JointFeatures(nn.Module):
         entry = {joint: name for name, joint in in_state.items()}
         state = [_scale(units, entry[joint], joint) for joint in joint_names]
         action = [_scale(units, name, in_action[name]) for name in action_names]
-        self._register("columns", [self.state_names.index(entry[j]) for j in joint_names])
-        self._register("order", [self.joint_names.index(in_action[n]) for n in action_names])
-        self._register("scale", [[s.factor, s.offset] for s in state])
-        self._register("back", [[s.factor, s.offset] for s in action])
-
-    def _register(self, name: str, values: list[Any]) -> None:
-        kind = torch.long if isinstance(values[0], int) else torch.float64
-        # they follow from the configuration: not in the file
-        self.register_buffer(name, torch.tensor(values, dtype=kind), persistent=False)
+        buffers = {
+            "columns": torch.tensor([self.state_names.index(entry[j]) for j in joint_names]),
+            "order": torch.tensor([self.joint_names.index(in_action[n]) for n in action_names]),
+            "scale": torch.tensor([(s.factor, s.offset) for s in state], dtype=torch.float64),
+            "back": torch.tensor([(s.factor, s.offset) for s in action], dtype=torch.float64),
+        }
+        for name, buffer in buffers.items():
+            # they follow from the configuration: not in the file
+            self.register_buffer(name, buffer, persistent=False)
 
     def joints(self, state: Tensor) -> Tensor:
         """Joint vectors (B, n_joints) in the model's order and units.

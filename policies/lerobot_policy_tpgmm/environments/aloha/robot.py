@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import torch
+from scipy.spatial.transform import Rotation
 
 from tpgmm_torch import (
     Canonical,
@@ -21,7 +21,6 @@ from tpgmm_torch import (
     RelativePosition,
     Robot,
     Stack,
-    quaternions,
 )
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
@@ -167,21 +166,13 @@ def _add_body(robot: ElementTree.Element, model: Any, body: Any, side: str) -> N
     parent = model.body(int(body.parentid[0])).name
     ElementTree.SubElement(joint, "parent", link=parent)
     ElementTree.SubElement(joint, "child", link=body.name)
-    angles = _text(_roll_pitch_yaw(body.quat))
-    ElementTree.SubElement(joint, "origin", xyz=_text(body.pos), rpy=angles)
+    turn = Rotation.from_quat(np.roll(body.quat, -1))  # scipy puts the real part last
+    roll_pitch_yaw = turn.as_euler("xyz")
+    ElementTree.SubElement(joint, "origin", xyz=_text(body.pos), rpy=_text(roll_pitch_yaw))
     if moving is not None:
         lower, upper = (repr(float(limit)) for limit in moving.range)
         ElementTree.SubElement(joint, "axis", xyz=_text(moving.axis))
         ElementTree.SubElement(joint, "limit", lower=lower, upper=upper)
-
-
-def _roll_pitch_yaw(quaternion: Any) -> list[float]:
-    """Rotations about the fixed x, then y, then z axis; no gimbal lock stands in the model."""
-    matrix = quaternions.to_matrix(quaternions.normalize(torch.from_numpy(quaternion))).numpy()
-    roll = np.arctan2(matrix[2, 1], matrix[2, 2])
-    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[2, 1], matrix[2, 2]))
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-    return [float(roll), float(pitch), float(yaw)]
 
 
 def _text(values: Any) -> str:
