@@ -5,11 +5,8 @@ import subprocess
 import sys
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
-import torch
-from gym_aloha import constants
 from gym_aloha.utils import sample_box_pose, sample_insertion_pose
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs import make_env
@@ -17,7 +14,6 @@ from lerobot.envs.factory import make_env_config
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
 
 import lerobot_policy_tpgmm.environments  # noqa: F401  registers
-from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, SIDES, aloha_robot
 from lerobot_policy_tpgmm.environments.aloha.state import AlohaStateEnv
 from tpgmm_torch.exceptions import TPGMMError
 
@@ -176,33 +172,6 @@ def test_an_episode_takes_8_seconds_at_every_rate():
     env.reset(seed=0)
     ends = [env.step(HOME)[3] for _ in range(80)]
     assert ends == [False] * 79 + [True]
-
-
-def test_robot_is_the_one_of_the_physics():
-    assert list(JOINTS) == constants.JOINTS
-    robot = aloha_robot()
-    assert robot.joint_names == JOINTS
-    model = mujoco.MjModel.from_xml_path(
-        str(constants.ASSETS_DIR / "bimanual_viperx_insertion.xml")
-    )
-    data = mujoco.MjData(model)
-    joints = np.random.default_rng(0).uniform(-1.5, 1.5, (5, 14))
-    state = robot.state(joints)
-    for row, values in enumerate(joints):
-        data.qpos[:6], data.qpos[8:14] = values[:6], values[7:13]
-        mujoco.mj_kinematics(model, data)
-        for side in SIDES:
-            body = data.body(f"vx300s_{side}/gripper_link")
-            tip = body.xpos + 0.14 * body.xmat.reshape(3, 3)[:, 0]
-            assert state[row].position(f"{side}_gripper").numpy() == pytest.approx(tip)
-            alike = state[row].orientation(f"{side}_gripper") @ torch.from_numpy(body.xquat)
-            assert abs(alike) == pytest.approx(1)
-    limits = AlohaStateEnv().action_space
-    arms = np.isfinite(robot.lower.numpy())
-    assert robot.lower.numpy()[arms] == pytest.approx(limits.low[arms])
-    assert robot.upper.numpy()[arms] == pytest.approx(limits.high[arms])
-    assert limits.low[~arms].tolist() == [0, 0]
-    assert limits.high[~arms].tolist() == [1, 1]
 
 
 def test_lerobot_makes_the_environment():

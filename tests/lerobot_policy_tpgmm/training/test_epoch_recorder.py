@@ -1,0 +1,56 @@
+"""Episodes from shuffled batches: what does not belong is refused."""
+
+import pytest
+import torch
+
+from tests.support.training import (
+    WAVES,
+    dataset,
+    epoch,
+    fresh,
+    waves_set,
+)
+from tpgmm_torch.exceptions import DataError
+
+
+@pytest.fixture(scope="module")
+def waves(tmp_path_factory):
+    return waves_set(tmp_path_factory.mktemp("waves") / "set")
+
+
+def changed(batch: dict, key: str, value: float, row: int = 3) -> dict:
+    values = batch[key].clone()
+    values[row] = value
+    return {**batch, key: values}
+
+
+def test_frames_that_change_are_refused(waves):
+    data = dataset(waves)
+    policy, [batch, *_] = fresh(data, **WAVES), epoch(data, 10)
+    policy.forward(batch)
+    policy.forward(batch)
+    number = int(batch["episode_index"][3])
+    with pytest.raises(DataError, match=f"of episode {number} has other values"):
+        policy.forward(changed(batch, "observation.state", 0.5))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda b: changed(b, "observation.state", torch.nan), "observation.state holds NaN"),
+        (lambda b: changed(b, "action", torch.inf), "action holds NaN or inf"),
+        (lambda b: changed(b, "timestamp", 7.0), "timestamp 7 s. Resample the set"),
+        (lambda b: changed(b, "index", 4000), "no frame 4000 in episode"),
+        (lambda b: changed(b, "episode_index", 9), "in episode 9"),
+        (lambda b: {k: v for k, v in b.items() if k != "index"}, "needs 'index'"),
+        (
+            lambda b: {k: v for k, v in b.items() if k != "observation.state"},
+            "needs .observation.state",
+        ),
+    ],
+)
+def test_bad_batches_are_refused(waves, change, message):
+    data = dataset(waves)
+    policy, [batch, *_] = fresh(data, **WAVES), epoch(data, 10)
+    with pytest.raises(DataError, match=message):
+        policy.forward(change(batch))
