@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["EpochRecorder", "RecordedEpisode", "episode_ranges", "located"]
+__all__ = ["EpochRecorder", "episode_ranges", "located"]
 
 #: What is kept of a frame.
 COLUMNS = (OBS_STATE, OBS_ENV_STATE)
@@ -67,60 +66,6 @@ def located(batch: Mapping[str, Any], ranges: Mapping[int, range]) -> tuple[Tens
     return episodes, indices - starts
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedEpisode:
-    """The frames of one episode that have come so far.
-
-    Parameters
-    ----------
-    seen : Tensor of shape (T,)
-        Whether the frame has come.
-    columns : dict of str to Tensor of shape (T, ...)
-        ``observation.state``, and ``observation.environment_state`` where there is one.
-    """
-
-    seen: Tensor
-    columns: dict[str, Tensor]
-
-    @classmethod
-    def empty(cls, length: int, like: Mapping[str, Tensor]) -> RecordedEpisode:
-        """No frames yet, of a number to come; their columns are like those of a batch."""
-        columns = {
-            key: column.new_zeros(length, *column.shape[1:]) for key, column in like.items()
-        }
-        return cls(torch.zeros(length, dtype=torch.bool), columns)
-
-    def fill(self, number: int, steps: Tensor, columns: Mapping[str, Tensor]) -> bool:
-        """Take frames in, and say whether one of them was there before.
-
-        Parameters
-        ----------
-        number : int
-            Of the episode, for errors.
-        steps : Tensor of shape (B,)
-        columns : mapping of str to Tensor of shape (B, ...)
-
-        Raises
-        ------
-        DataError
-            If a frame that was there has other values.
-        """
-        repeated = self.seen[steps]
-        for key, column in columns.items():
-            differs = (self.columns[key][steps] != column).reshape(len(steps), -1).any(1)
-            changed = repeated & differs
-            if changed.any():
-                raise DataError(
-                    f"{key} of frame {int(steps[changed][0])} of episode {number} has other "
-                    "values than when it came before: a tpgmm policy learns the data as they "
-                    "are, without random transforms"
-                )
-            self.columns[key][steps] = column
-        self.seen[steps] = True
-        return bool(repeated.any())
-
-
-@dataclass(eq=False)
 class EpochRecorder:
     """Keeps each frame once, and knows when all are there.
 
@@ -134,17 +79,13 @@ class EpochRecorder:
         The global indices of the frames of each episode, from :func:`episode_ranges`.
     fps : float
         Frames per second.
-
-    Attributes
-    ----------
-    episodes : dict of int to RecordedEpisode
-        Those of which a frame has come.
     """
 
-    ranges: Mapping[int, range]
-    fps: float
-    episodes: dict[int, RecordedEpisode] = field(default_factory=dict, init=False)
-    _batch_size: int = field(default=0, init=False)
+    def __init__(self, ranges: Mapping[int, range], fps: float) -> None:
+        self.ranges, self.fps = ranges, fps
+        self._seen = torch.zeros(max(r.stop for r in ranges.values()), dtype=torch.bool)
+        self._columns: dict[str, Tensor] = {}
+        self._batch_size = 0
 
     def record(self, batch: Mapping[str, Any]) -> bool:
         """Keep the frames of a batch.
@@ -167,16 +108,26 @@ class EpochRecorder:
         """
         numbers, steps = located(batch, self.ranges)
         self._check(batch, numbers, steps)
-        columns = {key: batch[key].detach().cpu() for key in COLUMNS if key in batch}
         self._batch_size = max(self._batch_size, len(steps))
-        repeated = False
-        for number in numbers.unique().tolist():
-            rows = numbers == number
-            part = {key: column[rows] for key, column in columns.items()}
-            if number not in self.episodes:
-                self.episodes[number] = RecordedEpisode.empty(len(self.ranges[number]), part)
-            repeated |= self.episodes[number].fill(number, steps[rows], part)
-        return repeated
+        indices = batch["index"].detach().cpu().flatten()
+        repeated = self._seen[indices]
+        for key in COLUMNS:
+            if key not in batch:
+                continue
+            column = batch[key].detach().cpu()
+            if key not in self._columns:
+                self._columns[key] = column.new_zeros(len(self._seen), *column.shape[1:])
+            kept = self._columns[key]
+            changed = repeated & (kept[indices] != column).reshape(len(steps), -1).any(1)
+            if changed.any():
+                raise DataError(
+                    f"{key} of frame {int(steps[changed][0])} of episode "
+                    f"{int(numbers[changed][0])} has other values than when it came before: a "
+                    "tpgmm policy learns the data as they are, without random transforms"
+                )
+            kept[indices] = column
+        self._seen[indices] = True
+        return bool(repeated.any())
 
     def _check(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> None:
         """Whether values are finite, and frames come at their time."""
@@ -197,26 +148,31 @@ class EpochRecorder:
             )
 
     @property
-    def n_frames(self) -> int:
-        """Number of frames that have come."""
-        return sum(int(episode.seen.sum()) for episode in self.episodes.values())
+    def episodes(self) -> dict[int, dict[str, Tensor]]:
+        """The columns, of shape (T, ...), of each episode of which a frame has come."""
+        return {
+            number: {key: c[frames.start : frames.stop] for key, c in self._columns.items()}
+            for number, frames in self.ranges.items()
+            if self._seen[frames.start : frames.stop].any()
+        }
 
     @property
     def complete(self) -> bool:
         """Whether there are episodes, all of them without gaps."""
-        return 0 < self.n_frames == self._expected
+        return 0 < int(self._seen.sum()) == self._expected
 
     @property
     def _expected(self) -> int:
+        """Number of frames of these episodes."""
         return sum(len(self.ranges[number]) for number in self.episodes)
 
     def __str__(self) -> str:
         """What is there, and how many steps of training are needed."""
-        if not self.episodes:
+        n_episodes, n_frames = len(self.episodes), self._expected
+        if not n_episodes:
             return "no frame has come yet"
-        steps = math.ceil(self._expected / self._batch_size)
         return (
-            f"{self.n_frames} of the {self._expected} frames of {len(self.episodes)} episodes "
-            f"have come: with batch_size={self._batch_size} an epoch takes at least {steps} "
-            "steps"
+            f"{int(self._seen.sum())} of the {n_frames} frames of {n_episodes} episodes have "
+            f"come: with batch_size={self._batch_size} an epoch takes at least "
+            f"{math.ceil(n_frames / self._batch_size)} steps"
         )

@@ -149,9 +149,9 @@ class Learner:
     def _finish(self, recorder: EpochRecorder) -> None:
         """Align what was recorded, and learn it unless the policy is fitted already."""
         config, mixture = self._config, self._mixture
-        numbers = sorted(recorder.episodes)
-        columns = {number: recorder.episodes[number].columns for number in numbers}
-        demonstrations = [self._demonstration(columns[number]) for number in numbers]
+        episodes = recorder.episodes
+        numbers = sorted(episodes)
+        demonstrations = [self._demonstration(episodes[number]) for number in numbers]
         kinematics = self._kinematics.to(device="cpu")
         aligner = alignment(config.alignment, kinematics, config.alignment_features)
         aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
@@ -168,7 +168,7 @@ class Learner:
         log.info(message)
         self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
-            self._first[number] = {key: c[0].clone() for key, c in columns[number].items()}
+            self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
         self.regularization = self._regularization(aligned, kinematics)
         self._learned, self._recorder = set(numbers), None
 
