@@ -229,13 +229,7 @@ class TPGMMConfig(StatePolicyConfig):
         return rate
 
     def kinematics(self) -> Kinematics | None:
-        """The robot that ``robot`` describes, None for joints alone.
-
-        Raises
-        ------
-        ModelFileError, DataError, UnknownNameError
-            If it cannot be built.
-        """
+        """The robot that ``robot`` describes, None for joints alone."""
         if self.robot is None or isinstance(self.robot, dict):
             return None if self.robot is None else decode(self.robot)
         urdf, links = self.robot, self.links
@@ -244,13 +238,7 @@ class TPGMMConfig(StatePolicyConfig):
         return Robot.from_urdf(urdf, links, joints=self.joints, coordinates=self.coordinates)
 
     def decoded_operators(self) -> list[Operator] | None:
-        """The operators that ``operators`` describes; None if it says nothing.
-
-        Raises
-        ------
-        ModelFileError, DataError
-            If one cannot be built.
-        """
+        """The operators that ``operators`` describes; None if it says nothing."""
         if self.operators is None:
             return None
         return [
@@ -277,13 +265,7 @@ class TPGMMConfig(StatePolicyConfig):
         return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
 
     def validate_features(self) -> None:
-        """Check that there are a state and an action.
-
-        Raises
-        ------
-        DataError
-            If one is missing.
-        """
+        """Check that there are a state and an action."""
         for key, feature in (
             (OBS_STATE, self.robot_state_feature),
             (ACTION, self.action_feature),

@@ -53,11 +53,6 @@ def check_rate(batch: Mapping[str, Any], rate: float) -> None:
         Observations.
     rate : float
         Of the policy [1/s].
-
-    Raises
-    ------
-    DataError
-        If the rates differ.
     """
     if CONTROL_RATE not in batch:
         return

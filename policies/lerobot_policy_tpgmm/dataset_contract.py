@@ -27,11 +27,6 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
     """Complete the configuration of a policy that is to be trained, from its data set.
 
     What is given stays; robot and operators become descriptions that need no file.
-
-    Raises
-    ------
-    DataError, ModelFileError, UnknownNameError
-        If something does not fit.
     """
     for key, field in NAMES.items():
         if getattr(config, field) is None:
@@ -63,13 +58,7 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
 
 
 def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
-    """Whether a fitted policy and a data set are about the same signals.
-
-    Raises
-    ------
-    DataError
-        If names, order or rate differ.
-    """
+    """Whether a fitted policy and a data set are about the same signals."""
     for key, field in NAMES.items():
         expected, names = getattr(config, field), _names(dataset.features, key)
         if expected and names and list(expected) != names:

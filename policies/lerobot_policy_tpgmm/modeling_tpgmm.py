@@ -188,13 +188,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return policy.eval().to(config.device)
 
     def to_estimator(self) -> TaskParameterizedGMM:
-        """The fitted model that the policy is.
-
-        Raises
-        ------
-        NotFittedError
-            If it is not fitted.
-        """
+        """The fitted model that the policy is."""
         device = self.mixture.time.device
         kinematics = self.kinematics.to(device=device)
         model = self.config.estimator(kinematics, list(self.operators))

@@ -94,11 +94,6 @@ class JointFeatures(nn.Module):
         Parameters
         ----------
         state : Tensor of shape (B, n_state)
-
-        Raises
-        ------
-        ShapeError
-            If it has another size.
         """
         if state.ndim != 2 or state.shape[-1] != len(self.state_names):
             raise ShapeError(
@@ -133,11 +128,6 @@ class FrameFeatures:
         A whole ``observation.environment_state``.
     n_environment : int, optional
         Its size, if that is known otherwise than from the names.
-
-    Raises
-    ------
-    DataError, ShapeError, UnknownNameError
-        If a place is none.
     """
 
     def __init__(

@@ -30,11 +30,6 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
     render_mode : {"rgb_array"}, optional
     picture_size : (int, int)
         Width and height.
-
-    Raises
-    ------
-    DataError
-        If there is no such render mode.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -86,13 +81,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
 
 
 def finite_vector(name: str, values: ArrayLike, length: int) -> NDArray[np.float64]:
-    """A copy of ``length`` finite values.
-
-    Raises
-    ------
-    ShapeError, DataError
-        If they are something else; the message calls them by ``name``.
-    """
+    """A copy of ``length`` finite values."""
     vector = np.array(values, dtype=np.float64)
     if vector.shape != (length,):
         raise ShapeError(f"{name} needs {length} values, shape ({length},), got {vector.shape}")

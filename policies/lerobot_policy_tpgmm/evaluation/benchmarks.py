@@ -225,13 +225,7 @@ BENCHMARKS: dict[str, type[Benchmark]] = {
 def benchmark(
     name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
 ) -> Benchmark:
-    """A benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`.
-
-    Raises
-    ------
-    UnknownNameError
-        If there is none.
-    """
+    """A benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`."""
     if name not in BENCHMARKS:
         raise UnknownNameError("environment", name, "the comparison", BENCHMARKS)
     return BENCHMARKS[name](rate, options)

@@ -66,11 +66,6 @@ class Settings:
         ----------
         condition : str
             ``nominal``, or disturbances joined by ``+``.
-
-        Raises
-        ------
-        UnknownNameError
-            If the environment has no such disturbance.
         """
         benchmark = self.benchmark()
         disturbances, options = benchmark.disturbances, benchmark.options

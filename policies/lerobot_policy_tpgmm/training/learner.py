@@ -281,13 +281,7 @@ class Learner:
 
 
 def check_one_process() -> None:
-    """Refuse a training that is shared among processes.
-
-    Raises
-    ------
-    DataError
-        If there are several: each would see a part of the demonstrations.
-    """
+    """Refuse a training that is shared among processes."""
     if distributed.is_available() and distributed.is_initialized():
         processes = distributed.get_world_size()
         if processes > 1:

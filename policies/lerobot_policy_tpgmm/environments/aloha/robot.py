@@ -55,11 +55,6 @@ def aloha_operators(task: str, orientation: bool = True) -> list[Operator]:
     orientation : bool, default=True
         False leaves the grippers' orientations out.
 
-    Raises
-    ------
-    UnknownNameError
-        If there is no such task.
-
     Notes
     -----
     The grippers have a subspace each. Stacked into one they would be correlated, and among a

@@ -191,11 +191,6 @@ class AlohaStateEnv(StateEnv):
         ----------
         action : array of shape (14,)
             In the order of ``joint_names``; what is out of reach is clipped.
-
-        Raises
-        ------
-        DataError
-            If it has another shape or is not finite.
         """
         self._rules.before_step(finite_vector("action", action, len(JOINTS)), self._physics)
         self._steps += 1

@@ -189,11 +189,6 @@ class BottleScene:
             Where the joints should be now and at the end of the next ``n`` time steps [rad].
         torques : ndarray of shape (n, 17), optional
             From outside, during each time step [N m].
-
-        Raises
-        ------
-        DataError
-            If the simulation diverges.
         """
         model, data, n = self.model, self.data, self._n
         control = references[1:] + self._lead * np.diff(references, axis=0) / TIMESTEP

@@ -49,11 +49,6 @@ class Episodes:
         ----------
         path : str or Path
             Its folder.
-
-        Raises
-        ------
-        DataError
-            If the folder holds no such set.
         """
         import pyarrow.dataset
 
@@ -92,13 +87,7 @@ class Episodes:
             yield tuple(column[start:end] for column in self.columns.values())
 
     def first(self, n: int) -> Episodes:
-        """The first ``n`` episodes.
-
-        Raises
-        ------
-        DataError
-            If there are fewer.
-        """
+        """The first ``n`` episodes."""
         if not 1 <= n <= len(self):
             raise DataError(f"{n} episodes are asked for, there are {len(self)}")
         columns = {name: column[: self.bounds[n]] for name, column in self.columns.items()}

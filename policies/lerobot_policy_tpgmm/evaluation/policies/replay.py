@@ -113,13 +113,7 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.select_action(batch)[:, None]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """There is no loss.
-
-        Raises
-        ------
-        NotImplementedError
-            Always.
-        """
+        """There is no loss."""
         raise NotImplementedError("the nearest demonstration is kept, not trained")
 
     def get_optim_params(self) -> Any:
