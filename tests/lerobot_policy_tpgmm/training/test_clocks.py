@@ -1,24 +1,16 @@
 """At which time of the model the frames of episodes stand."""
 
 import numpy as np
-import pytest
 import torch
 
 from lerobot_policy_tpgmm.training.clocks import Clock
 from tests.support.training import (
     FPS,
     WAVES,
-    dataset,
     trained,
-    waves_set,
 )
 from tpgmm_datasets import load_lerobot
 from tpgmm_torch.alignment import DynamicTimeWarping
-
-
-@pytest.fixture(scope="module")
-def waves(tmp_path_factory):
-    return dataset(waves_set(tmp_path_factory.mktemp("waves") / "set"))
 
 
 def test_clocks():

@@ -5,17 +5,10 @@ import torch
 
 from tests.support.training import (
     WAVES,
-    dataset,
     epoch,
     fresh,
-    waves_set,
 )
 from tpgmm_torch.exceptions import DataError
-
-
-@pytest.fixture(scope="module")
-def waves(tmp_path_factory):
-    return waves_set(tmp_path_factory.mktemp("waves") / "set")
 
 
 def changed(batch: dict, key: str, value: float, row: int = 3) -> dict:
@@ -25,8 +18,7 @@ def changed(batch: dict, key: str, value: float, row: int = 3) -> dict:
 
 
 def test_frames_that_change_are_refused(waves):
-    data = dataset(waves)
-    policy, [batch, *_] = fresh(data, **WAVES), epoch(data, 10)
+    policy, [batch, *_] = fresh(waves, **WAVES), epoch(waves, 10)
     policy.forward(batch)
     policy.forward(batch)
     number = int(batch["episode_index"][3])
@@ -50,7 +42,6 @@ def test_frames_that_change_are_refused(waves):
     ],
 )
 def test_bad_batches_are_refused(waves, change, message):
-    data = dataset(waves)
-    policy, [batch, *_] = fresh(data, **WAVES), epoch(data, 10)
+    policy, [batch, *_] = fresh(waves, **WAVES), epoch(waves, 10)
     with pytest.raises(DataError, match=message):
         policy.forward(change(batch))

@@ -11,26 +11,13 @@ from tests.support.training import (
     dataset,
     epoch,
     fresh,
-    handlings_set,
     resumed,
     trained,
-    waves_set,
 )
 from tpgmm_datasets import load_lerobot
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
-
-
-@pytest.fixture(scope="module")
-def waves(tmp_path_factory):
-    return waves_set(tmp_path_factory.mktemp("waves") / "set")
-
-
-@pytest.fixture(scope="module")
-def handlings(tmp_path_factory):
-    return handlings_set(tmp_path_factory.mktemp("handlings") / "set")
-
 
 # What is learned
 
@@ -45,53 +32,53 @@ def handlings(tmp_path_factory):
     ],
 )
 def test_an_epoch_of_batches_is_what_the_estimator_learns(waves, alignment, aligner):
-    demonstrations = load_lerobot(waves)
+    demonstrations = load_lerobot(waves.root)
     if aligner is not None:
         demonstrations = aligner.fit_transform(demonstrations)
     model = TaskParameterizedGMM(**WAVES).fit(demonstrations)
-    policy = trained(dataset(waves), alignment=alignment, **WAVES)
+    policy = trained(waves, alignment=alignment, **WAVES)
     same(policy.to_estimator(), model, 1e-12)
     assert torch.equal(policy.to_estimator().time_, model.time_)
     assert policy.config.n_steps == len(model.time_) and policy.config.fps == FPS
 
 
 def test_frames_and_quaternions_are_learned(handlings):
-    demonstrations = DynamicTimeWarping(robot=HANDS).fit_transform(load_lerobot(handlings))
+    demonstrations = DynamicTimeWarping(robot=HANDS).fit_transform(load_lerobot(handlings.root))
     options = {"n_components": 5, "operators": list(HANDLING), "robot": HANDS}
     model = TaskParameterizedGMM(**options).fit(demonstrations)
-    policy = trained(dataset(handlings), **HANDLINGS)
+    policy = trained(handlings, **HANDLINGS)
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(demonstrations[:1]) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-6)
 
 
 def test_a_policy_can_be_of_float32(waves):
-    demonstrations = LinearTimeNormalization().fit_transform(load_lerobot(waves))
+    demonstrations = LinearTimeNormalization().fit_transform(load_lerobot(waves.root))
     options = {**WAVES, "dtype": "float32"}
     model = TaskParameterizedGMM(**options).fit(demonstrations)
-    policy = trained(dataset(waves), alignment="linear", **options)
+    policy = trained(waves, alignment="linear", **options)
     same(policy.to_estimator(), model, 1e-6)
-    loss, _ = policy.train().forward(epoch(dataset(waves), 16)[0])
+    loss, _ = policy.train().forward(epoch(waves, 16)[0])
     loss.backward()
     assert loss.dtype == policy.mixture.means[0].grad.dtype == torch.float32
 
 
 def test_the_features_of_the_alignment_are_configured(waves):
     aligner = DynamicTimeWarping(features=["directions"])
-    model = TaskParameterizedGMM(**WAVES).fit(aligner.fit_transform(load_lerobot(waves)))
-    policy = trained(dataset(waves), alignment_features=["directions"], **WAVES)
+    model = TaskParameterizedGMM(**WAVES).fit(aligner.fit_transform(load_lerobot(waves.root)))
+    policy = trained(waves, alignment_features=["directions"], **WAVES)
     same(policy.to_estimator(), model, 1e-12)
 
 
 def test_episodes_that_are_held_out_are_not_learned(waves):
-    held_out = dataset(waves, [1, 3])
-    policy = fresh(dataset(waves, [0, 2]), alignment="linear", **WAVES)
-    for batch in epoch(dataset(waves, [0, 2]), 16):
+    held_out = dataset(waves.root, [1, 3])
+    policy = fresh(dataset(waves.root, [0, 2]), alignment="linear", **WAVES)
+    for batch in epoch(dataset(waves.root, [0, 2]), 16):
         policy.forward(batch)
     policy.eval()
     [loss, *_] = [policy.forward(batch)[0] for batch in epoch(held_out, 16)]
     assert loss.isfinite()
-    aligned = LinearTimeNormalization().fit_transform(load_lerobot(waves, episodes=[0, 2]))
+    aligned = LinearTimeNormalization().fit_transform(load_lerobot(waves.root, episodes=[0, 2]))
     same(policy.to_estimator(), TaskParameterizedGMM(**WAVES).fit(aligned), 1e-12)
 
 
@@ -99,20 +86,18 @@ def test_episodes_that_are_held_out_are_not_learned(waves):
 
 
 def test_the_fit_comes_when_a_frame_comes_again(waves):
-    data = dataset(waves)
-    policy = fresh(data, **WAVES)
-    for batch in epoch(data, 32):
+    policy = fresh(waves, **WAVES)
+    for batch in epoch(waves, 32):
         loss, _ = policy.forward(batch)
         assert loss == 0 and not policy.mixture.fitted
-    loss, _ = policy.forward(epoch(data, 32, seed=1)[0])
+    loss, _ = policy.forward(epoch(waves, 32, seed=1)[0])
     assert policy.mixture.fitted and loss != 0
 
 
 def test_evaluating_and_saving_fit_too(waves, tmp_path):
-    data = dataset(waves)
     for end in (lambda policy: policy.eval(), lambda policy: policy.save_pretrained(tmp_path)):
-        policy = fresh(data, **WAVES)
-        for batch in epoch(data, 32):
+        policy = fresh(waves, **WAVES)
+        for batch in epoch(waves, 32):
             policy.forward(batch)
         end(policy)
         assert policy.mixture.fitted
@@ -120,35 +105,33 @@ def test_evaluating_and_saving_fit_too(waves, tmp_path):
 
 
 def test_optimizers_leave_a_policy_alone_that_collects(waves, tmp_path):
-    data = dataset(waves)
-    trained(data, **WAVES).save_pretrained(tmp_path)
-    again = resumed(tmp_path, data)
+    trained(waves, **WAVES).save_pretrained(tmp_path)
+    again = resumed(tmp_path, waves)
     optimizer = torch.optim.AdamW(again.parameters(), lr=0.1, weight_decay=0.1)
     for parameter in again.parameters():
         parameter.grad = torch.ones_like(parameter)
     optimizer.step()  # now it has momentum
     optimizer.zero_grad()
     before = [parameter.clone() for parameter in again.parameters()]
-    loss, _ = again.forward(epoch(data, 32)[0])
+    loss, _ = again.forward(epoch(waves, 32)[0])
     loss.backward()
     optimizer.step()
     assert all(map(torch.equal, before, again.parameters()))
 
 
 def test_too_few_steps_are_refused_with_the_number_needed(waves, tmp_path):
-    data = dataset(waves)
-    policy = fresh(data, **WAVES)
+    policy = fresh(waves, **WAVES)
     with pytest.raises(DataError, match="no frame has come yet"):
         policy.save_pretrained(tmp_path)
-    for batch in epoch(data, 10)[:-1]:
+    for batch in epoch(waves, 10)[:-1]:
         policy.forward(batch)
     needed = r"120 of the 123 frames of 4 episodes .* batch_size=10 .* at least 13 steps"
     with pytest.raises(DataError, match=needed + ".*--steps"):
         policy.save_pretrained(tmp_path)
     policy.eval()
     with pytest.raises(NotFittedError, match=needed + ".*--eval_steps"):
-        policy.forward(epoch(data, 10)[0])
-    policy.train().forward(epoch(data, 10)[-1])
+        policy.forward(epoch(waves, 10)[0])
+    policy.train().forward(epoch(waves, 10)[-1])
     policy.save_pretrained(tmp_path)
 
 
@@ -156,19 +139,17 @@ def test_too_few_steps_are_refused_with_the_number_needed(waves, tmp_path):
 
 
 def test_frames_in_order_are_refused(waves):
-    data = dataset(waves)
-    policy = fresh(data, **WAVES)
-    rows = torch.utils.data.default_collate([data[i] for i in range(28)])
+    policy = fresh(waves, **WAVES)
+    rows = torch.utils.data.default_collate([waves[i] for i in range(28)])
     policy.forward(rows)
     policy.eval()  # the first episode is complete
     policy.train()
     with pytest.raises(DataError, match=r"episodes \[1\] came after .* shuffle"):
-        policy.forward(torch.utils.data.default_collate([data[i] for i in range(28, 40)]))
+        policy.forward(torch.utils.data.default_collate([waves[i] for i in range(28, 40)]))
 
 
 def test_several_processes_are_refused(waves, monkeypatch):
-    data = dataset(waves)
-    policy, [batch, *_] = fresh(data, **WAVES), epoch(data, 10)
+    policy, [batch, *_] = fresh(waves, **WAVES), epoch(waves, 10)
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
     with pytest.raises(DataError, match=r"one process, this run has 2.*--num_processes=1"):
@@ -176,8 +157,7 @@ def test_several_processes_are_refused(waves, monkeypatch):
 
 
 def test_a_policy_that_knows_no_data_set_cannot_be_trained(waves, tmp_path):
-    data = dataset(waves)
-    trained(data, **WAVES).save_pretrained(tmp_path)
-    policy = type(fresh(data, **WAVES)).from_pretrained(tmp_path)
+    trained(waves, **WAVES).save_pretrained(tmp_path)
+    policy = type(fresh(waves, **WAVES)).from_pretrained(tmp_path)
     with pytest.raises(DataError, match="dataset_meta="):
-        policy.forward(epoch(data, 10)[0])
+        policy.forward(epoch(waves, 10)[0])

@@ -9,28 +9,15 @@ from tests.support.skills import same
 from tests.support.training import (
     HANDLINGS,
     WAVES,
-    dataset,
     epoch,
     fresh,
-    handlings_set,
     resumed,
     trained,
-    waves_set,
 )
 from tpgmm_datasets import load_lerobot
 from tpgmm_torch.exceptions import DataError
 
 LOSSES = ("likelihood", "imitation")
-
-
-@pytest.fixture(scope="module")
-def waves(tmp_path_factory):
-    return dataset(waves_set(tmp_path_factory.mktemp("waves") / "set"))
-
-
-@pytest.fixture(scope="module")
-def handlings(tmp_path_factory):
-    return dataset(handlings_set(tmp_path_factory.mktemp("handlings") / "set"))
 
 
 def gradient(policy, batch) -> dict[str, torch.Tensor]:
