@@ -47,10 +47,6 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
     name : str
         How the error message calls them.
 
-    Returns
-    -------
-    Tensor of shape (..., D, D)
-
     Raises
     ------
     DataError
@@ -114,17 +110,10 @@ def affine(
 
     Parameters
     ----------
-    mean : Tensor of shape (..., D)
-    covariance : Tensor of shape (..., D, D)
-    linear : Tensor of shape (..., n, D)
-        ``A``, of any shape and rank.
-    offset : Tensor of shape (..., n)
-        ``b``.
-
-    Returns
-    -------
-    mean : Tensor of shape (..., n)
-    covariance : Tensor of shape (..., n, n)
+    mean, covariance : Tensor of shape (..., D) and (..., D, D)
+        Of x.
+    linear, offset : Tensor of shape (..., n, D) and (..., n)
+        ``A``, of any rank, and ``b``.
     """
     return (linear @ mean[..., None])[..., 0] + offset, linear @ covariance @ linear.mT
 
@@ -134,14 +123,8 @@ def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
 
     Parameters
     ----------
-    means : Tensor of shape (P, ..., n)
-    covariances : Tensor of shape (P, ..., n, n)
-        Positive definite.
-
-    Returns
-    -------
-    mean : Tensor of shape (..., n)
-    covariance : Tensor of shape (..., n, n)
+    means, covariances : Tensor of shape (P, ..., n) and (P, ..., n, n)
+        Of the factors; positive definite.
 
     Raises
     ------
@@ -217,18 +200,12 @@ def information(
 
 
 def from_information(precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of the Gaussian of that precision matrix and information vector.
+    """Mean ``precision^-1 vector`` and covariance ``precision^-1`` of a Gaussian.
 
     Parameters
     ----------
-    precision : Tensor of shape (..., n, n)
-    vector : Tensor of shape (..., n)
-
-    Returns
-    -------
-    mean : Tensor of shape (..., n)
-        ``precision^-1 vector``.
-    covariance : Tensor of shape (..., n, n)
+    precision, vector : Tensor of shape (..., n, n) and (..., n)
+        Precision matrix and information vector.
 
     Raises
     ------
@@ -247,9 +224,8 @@ def condition(mean: Tensor, covariance: Tensor, n_inputs: int) -> tuple[Tensor, 
 
     Parameters
     ----------
-    mean : Tensor of shape (..., D)
-        Only its shape matters: gain and covariance do not depend on it.
-    covariance : Tensor of shape (..., D, D)
+    mean, covariance : Tensor of shape (..., D) and (..., D, D)
+        Of inputs and outputs; of the mean only the shape matters.
     n_inputs : int
         How many of the leading coordinates are inputs.
 
@@ -280,8 +256,8 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     ----------
     weights : Tensor of shape (..., K)
         Sum to one.
-    means : Tensor of shape (..., K, D)
-    covariances : Tensor of shape (..., K, D, D)
+    means, covariances : Tensor of shape (..., K, D) and (..., K, D, D)
+        Of the components.
 
     Returns
     -------
@@ -304,18 +280,14 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
 
 
 def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
-    """Log-density of Gaussians given by the Cholesky factors of their covariances.
+    """Log-density of Gaussians at ``x``.
 
     Parameters
     ----------
-    x : Tensor of shape (..., D)
-    mean : Tensor of shape (..., D)
+    x, mean : Tensor of shape (..., D)
+        Points and means.
     factor : Tensor of shape (..., D, D)
-        Lower Cholesky factors.
-
-    Returns
-    -------
-    Tensor of shape (...)
+        Lower Cholesky factors of the covariances.
     """
     white = torch.linalg.solve_triangular(factor, (x - mean)[..., None], upper=False)[..., 0]
     half_log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -326,15 +298,8 @@ def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
 def pseudo_inverse(matrix: Tensor) -> Tensor:
     """The Moore-Penrose inverse ``J^+``, of eq. (1)'s A and b.
 
-    Parameters
-    ----------
-    matrix : Tensor of shape (..., m, n)
-
-    Returns
-    -------
-    Tensor of shape (..., n, m)
-        Where all matrices are well conditioned, ``J^T (J J^T)^-1``: a singular value
-        decomposition takes some ten times as long.
+    Where every ``matrix`` (..., m, n) is well conditioned it is ``J^T (J J^T)^-1``: a singular
+    value decomposition takes some ten times as long.
 
     Examples
     --------
@@ -350,10 +315,7 @@ def pseudo_inverse(matrix: Tensor) -> Tensor:
             inverse = torch.cholesky_inverse(factor)
             # as many digits go as the condition number has: at most a third of them
             most = torch.finfo(matrix.dtype).eps ** (-1 / 3)
-            if bool((_size(gram) * _size(inverse) < most).all()):
+            norms = map(torch.linalg.matrix_norm, (gram.detach(), inverse.detach()))
+            if bool((math.prod(norms) < most).all()):
                 return matrix.mT @ inverse
     return torch.linalg.pinv(matrix)
-
-
-def _size(matrix: Tensor) -> Tensor:
-    return torch.linalg.matrix_norm(matrix.detach())

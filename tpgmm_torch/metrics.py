@@ -27,15 +27,8 @@ __all__ = [
 def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
     """Root mean square joint difference over equal time grids [rad].
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-    demonstration : Demonstration
-        Its joints may have another order, if they are named.
-
-    Returns
-    -------
-    float
+    The joints of the ``demonstration`` may have another order than those of the
+    ``trajectory``, if they are named.
 
     Raises
     ------
@@ -48,12 +41,12 @@ def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
             f"the trajectory has shape {tuple(trajectory.joints.shape)}, "
             f"the demonstration {tuple(wanted.shape)}"
         )
-    apart = trajectory.joints.to(wanted) - wanted
-    return float(apart.square().mean().sqrt())
+    residual = trajectory.joints.to(wanted) - wanted
+    return float(residual.square().mean().sqrt())
 
 
 def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
-    """Minus the joint RMSE of reproductions in the situations of held-out demonstrations.
+    """Minus the joint RMSE of reproductions in the situations of held-out demonstrations [rad].
 
     For ``cross_val_score(..., scoring=reproduction_scorer)`` and ``GridSearchCV``; unlike the
     likelihood it compares models with different operators.
@@ -63,29 +56,18 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
     estimator : TaskParameterizedGMM
         Fitted.
     X : sequence of Demonstration
+        Held out.
     y : ignored
         Here for scikit-learn.
-
-    Returns
-    -------
-    float
-        [rad]; higher is better.
     """
     demonstrations = check_demonstrations(X)
     trajectories = estimator.predict(demonstrations, candidates=False)
-    errors = [
-        joint_rmse(trajectory, demonstration)
-        for trajectory, demonstration in zip(trajectories, demonstrations, strict=True)
-    ]
-    return -float(np.mean(errors))
+    errors = map(joint_rmse, trajectories, demonstrations)
+    return -float(np.mean(list(errors)))
 
 
 def largest_velocity(motion: Trajectory | Demonstration) -> float:
-    """Largest joint speed by first differences [rad/s].
-
-    Parameters
-    ----------
-    motion : Trajectory or Demonstration
+    """Largest joint speed of a ``motion`` by first differences [rad/s].
 
     Examples
     --------
@@ -97,11 +79,7 @@ def largest_velocity(motion: Trajectory | Demonstration) -> float:
 
 
 def largest_acceleration(motion: Trajectory | Demonstration) -> float:
-    """Largest joint acceleration by second differences [rad/s^2].
-
-    Parameters
-    ----------
-    motion : Trajectory or Demonstration
+    """Largest joint acceleration of a ``motion`` by second differences [rad/s^2].
 
     Examples
     --------
@@ -145,13 +123,8 @@ def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
 
     Parameters
     ----------
-    time : array-like of shape (T,)
-        Seconds.
-    signal : array-like of shape (T,)
-
-    Returns
-    -------
-    Sinusoid
+    time, signal : array-like of shape (T,)
+        In seconds, and in any unit.
 
     Raises
     ------

@@ -28,7 +28,7 @@ OPERATORS = ("tab:red", "tab:green", "tab:blue", "tab:orange", "tab:purple")
 
 
 def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Figure:
-    """A new figure of panels one above the other with a common time axis.
+    """A new matplotlib figure of panels one above the other with a common time axis.
 
     It belongs to no window, so it works without a display and needs no closing.
 
@@ -40,10 +40,6 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
         Above all of them.
     width, height : float
         Of the figure, and of one panel [inch].
-
-    Returns
-    -------
-    matplotlib Figure
 
     Raises
     ------
@@ -71,14 +67,7 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
 
 
 def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
-    """Mark phases of the skill: a grey band with its name for each.
-
-    Parameters
-    ----------
-    axes : matplotlib Axes
-    spans : mapping of str to (float, float)
-        Start and end of each phase [s].
-    """
+    """Mark phases on ``axes``: a grey band with its name for each of the ``spans`` [s]."""
     for name, (start, end) in spans.items():
         axes.axvspan(start, end, color="0.9", zorder=0, linewidth=0)
         axes.annotate(
@@ -101,13 +90,10 @@ def plot_components(
 
     Parameters
     ----------
-    axes : matplotlib Axes
-    model : TaskParameterizedGMM
-        Fitted.
-    operator : int
-        Index j of the operator.
-    column : int
-        Index of the local coordinate, time not counted.
+    axes, model : matplotlib Axes, TaskParameterizedGMM
+        Where to draw, and what; fitted.
+    operator, column : int
+        Which operator, and which of its local coordinates, time not counted.
     """
     from matplotlib.patches import Ellipse
 
@@ -135,9 +121,8 @@ def plot_local(
 
     Parameters
     ----------
-    axes : matplotlib Axes
-    model : TaskParameterizedGMM
-        Fitted; its operators define the coordinates.
+    axes, model : matplotlib Axes, TaskParameterizedGMM
+        Where to draw; the model is fitted, and its operators define the coordinates.
     operator, column : int
         Which operator, and which of its coordinates.
     demonstrations : sequence of Demonstration
@@ -171,9 +156,8 @@ def plot_candidates(
 
     Parameters
     ----------
-    axes : matplotlib Axes
-    trajectory : Trajectory
-        With candidates.
+    axes, trajectory : matplotlib Axes, Trajectory
+        Where to draw, and what; with candidates.
     joint : str
         Name of the joint.
     labels : sequence of str

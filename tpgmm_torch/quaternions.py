@@ -3,7 +3,8 @@
 Quaternions are ``(w, x, y, z)`` in the last dimension, of unit norm, multiplied by the
 Hamilton product; ``product(a, b)`` is the rotation ``b`` followed by the rotation ``a``,
 both in the fixed (world) frame. ``eps`` and ``-eps`` are one rotation. All functions take
-any leading batch dimensions, broadcast, and are differentiable.
+any leading batch dimensions, broadcast, and are differentiable: ``a``, ``b``, ``q`` and
+``reference`` are tensors of shape (..., 4), vectors of shape (..., 3).
 
 The paper (Silvério et al., Humanoids 2018) writes ``H+`` and ``Hbar`` for the quaternion
 matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; the lower
@@ -92,31 +93,12 @@ def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
-    """The quaternion of no rotation, ``(1, 0, 0, 0)``.
-
-    Parameters
-    ----------
-    dtype : torch.dtype, default=torch.float64
-    device : torch.device or str, default="cpu"
-
-    Returns
-    -------
-    Tensor of shape (4,)
-    """
+    """The quaternion of no rotation, ``(1, 0, 0, 0)``, of that ``dtype`` on that ``device``."""
     return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype, device=device)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product ``a * b`` (eq. 18).
-
-    Parameters
-    ----------
-    a, b : Tensor of shape (..., 4)
-        Quaternions (w, x, y, z).
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
 
     Examples
     --------
@@ -128,73 +110,30 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def conjugate(q: Tensor) -> Tensor:
-    """The conjugate ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
-    """
+    """The conjugate ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion ``q``."""
     return q * _constant("conjugate", q.dtype, q.device)
 
 
 def left_matrix(q: Tensor) -> Tensor:
-    """``H+(q)`` of eq. (20): ``product(q, b) == left_matrix(q) @ b``.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4, 4)
-    """
+    """``H+(q)`` of eq. (20), (..., 4, 4): ``product(q, b) == left_matrix(q) @ b``."""
     return (q @ _constant("left", q.dtype, q.device)).unflatten(-1, (4, 4))
 
 
 def right_matrix(q: Tensor) -> Tensor:
-    """``Hbar(q)`` of eq. (20): ``product(a, q) == right_matrix(q) @ a``.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4, 4)
-    """
+    """``Hbar(q)`` of eq. (20), (..., 4, 4): ``product(a, q) == right_matrix(q) @ a``."""
     return (q @ _constant("right", q.dtype, q.device)).unflatten(-1, (4, 4))
 
 
 def vector_matrix(q: Tensor) -> Tensor:
-    """``Hbar*(q)`` of eq. (11): the lower three rows of :func:`right_matrix`.
+    """``Hbar*(q)`` of eq. (11), (..., 3, 4): the lower three rows of :func:`right_matrix`.
 
     ``vector_matrix(q) @ a`` is the vector part of ``a * q``.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 3, 4)
     """
     return (q @ _constant("vector", q.dtype, q.device)).unflatten(-1, (3, 4))
 
 
 def normalize(q: Tensor) -> Tensor:
-    """Scale to unit norm.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
+    """Scale ``q`` to unit norm.
 
     Raises
     ------
@@ -208,18 +147,13 @@ def normalize(q: Tensor) -> Tensor:
 
 
 def hemisphere_sign(inner: Tensor) -> Tensor:
-    """The sign that brings a quaternion into the hemisphere of a reference.
+    """The sign, 1 or -1, that brings a quaternion into the hemisphere of a reference.
 
     Parameters
     ----------
     inner : Tensor
         Inner products of quaternions with their references; the real parts, where the
         reference is no rotation.
-
-    Returns
-    -------
-    Tensor of the shape of ``inner``
-        1, or -1 where the inner product is negative.
     """
     return torch.copysign(_constant("one", inner.dtype, inner.device), inner)
 
@@ -270,17 +204,7 @@ def hemisphere_signs(x: Tensor, reference: Tensor, blocks: Tensor) -> Tensor:
 
 
 def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:
-    """Choose the sign of each quaternion so that it lies on the side of ``reference``.
-
-    Parameters
-    ----------
-    q, reference : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
-        ``q`` or ``-q``, whichever has a non-negative inner product with ``reference``.
-    """
+    """``q`` or ``-q``, whichever has a non-negative inner product with ``reference``."""
     return q * hemisphere_sign((q * reference).sum(-1, keepdim=True))
 
 
@@ -308,15 +232,7 @@ def continuous(q: Tensor, dim: int = -2) -> Tensor:
 
 
 def exp(rotation_vector: Tensor) -> Tensor:
-    """Unit quaternion of a rotation vector (axis times angle, rad).
-
-    Parameters
-    ----------
-    rotation_vector : Tensor of shape (..., 3)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
+    """Unit quaternion of a ``rotation_vector`` (axis times angle, rad).
 
     Examples
     --------
@@ -338,14 +254,6 @@ def log(q: Tensor) -> Tensor:
 
     ``q`` and ``-q`` give the same vector, the shorter of the two ways; at half a turn, where
     both are equally long, opposite ones.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 3)
     """
     q = q * hemisphere_sign(q[..., :1])
     real, vector = q[..., :1], q[..., 1:]
@@ -378,18 +286,7 @@ def slerp(a: Tensor, b: Tensor, fraction: Tensor | float) -> Tensor:
 
 
 def rotate(q: Tensor, vector: Tensor) -> Tensor:
-    """Rotate vectors: ``R(q) v``.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-        Unit quaternions.
-    vector : Tensor of shape (..., 3)
-
-    Returns
-    -------
-    Tensor of shape (..., 3)
-    """
+    """Rotate a ``vector`` by ``q``: ``R(q) v``."""
     real, axis = q[..., :1], q[..., 1:]
     axis, vector = torch.broadcast_tensors(axis, vector)
     twice = 2.0 * torch.linalg.cross(axis, vector)
@@ -397,16 +294,7 @@ def rotate(q: Tensor, vector: Tensor) -> Tensor:
 
 
 def to_matrix(q: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions.
-
-    Parameters
-    ----------
-    q : Tensor of shape (..., 4)
-
-    Returns
-    -------
-    Tensor of shape (..., 3, 3)
-    """
+    """Rotation matrices (..., 3, 3) of unit quaternions ``q``."""
     pairs = (q[..., :, None] * q[..., None, :]).flatten(-2)
     return (pairs @ _constant("rotation", q.dtype, q.device)).unflatten(-1, (3, 3))
 
@@ -420,10 +308,7 @@ def from_matrix(matrix: Tensor) -> Tensor:
     Parameters
     ----------
     matrix : Tensor of shape (..., 3, 3)
-
-    Returns
-    -------
-    Tensor of shape (..., 4)
+        Rotation matrices.
 
     Raises
     ------

@@ -45,6 +45,7 @@ def retime(
     Parameters
     ----------
     demonstration : Demonstration
+        Of at least two time steps.
     path : Tensor of shape (N,)
         Strictly increasing fractional time steps of the demonstration.
     time : Tensor of shape (N,)
@@ -63,9 +64,9 @@ def retime(
     lower = path.floor().long().clamp(0, len(demonstration) - 2)
     fraction = path - lower
     if interpolation == "cubic":
-        own = seconds(demonstration)
-        spline = CubicSpline(own, as_array(demonstration.joints))
-        instants = np.interp(path.numpy(), np.arange(len(own)), own)
+        before = seconds(demonstration)
+        spline = CubicSpline(before, as_array(demonstration.joints))
+        instants = np.interp(path.numpy(), np.arange(len(before)), before)
         joints = torch.from_numpy(spline(instants)).to(demonstration.joints)
     else:
         joints = _lerp(demonstration.joints, lower, fraction)
@@ -80,14 +81,14 @@ def retime(
         else frame
         for name, frame in demonstration.frames.items()
     }
-    at = steps_at(demonstration, np.array(list(demonstration.events.values()))).tolist()
-    reached = {
+    steps = steps_at(demonstration, np.array(list(demonstration.events.values()))).tolist()
+    events = {
         name: float(np.interp(step, path.numpy(), time.numpy()))
-        for name, step in zip(demonstration.events, at, strict=True)
+        for name, step in zip(demonstration.events, steps, strict=True)
         if step <= path[-1] + 1e-9
     }
     time = time.to(demonstration.time)
-    return Demonstration(time, joints, frames, demonstration.joint_names, reached)
+    return Demonstration(time, joints, frames, demonstration.joint_names, events)
 
 
 def _lerp(values: Tensor, lower: Tensor, fraction: Tensor) -> Tensor:
@@ -122,12 +123,7 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
     def fit_transform(
         self, X: Sequence[Demonstration], y: object = None
     ) -> list[Demonstration]:
-        """Fit, and align the same demonstrations without warping them again.
-
-        Returns
-        -------
-        list of Demonstration
-        """
+        """Fit, and align the same demonstrations without warping them again."""
         X = check_demonstrations(X)
         self.fit(X, y)
         pairs = zip(self._checked(X), self.paths_, strict=True)
@@ -182,13 +178,8 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
         return demonstrations if names is None else [d.reordered(names) for d in demonstrations]
 
     def _warped(self, demonstration: Demonstration, path: Tensor) -> Demonstration:
-        return retime(
-            demonstration,
-            path,
-            self.time_,
-            quaternion_columns(demonstration, self.robot),
-            self.interpolation,
-        )
+        blocks = quaternion_columns(demonstration, self.robot)
+        return retime(demonstration, path, self.time_, blocks, self.interpolation)
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

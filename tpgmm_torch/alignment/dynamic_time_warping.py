@@ -143,17 +143,7 @@ class DynamicTimeWarping(Alignment):
         self.interpolation = interpolation
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
-        """Choose the reference and warp the demonstrations onto it.
-
-        Parameters
-        ----------
-        X : sequence of Demonstration
-        y : ignored
-            Here for scikit-learn.
-
-        Returns
-        -------
-        self
+        """Choose the reference and warp the demonstrations ``X`` onto it; ``y`` is ignored.
 
         Raises
         ------

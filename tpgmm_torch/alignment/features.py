@@ -32,34 +32,28 @@ CONSTANT = 1e-9
 def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[int]]:
     """Where the joints hold unit quaternions, which is so for recorded poses.
 
-    Parameters
-    ----------
-    demonstration : Demonstration
-    robot : Kinematics or None
-
     Returns
     -------
     list of list of int
-        Four columns of ``demonstration.joints`` for each quaternion.
+        Four columns of ``demonstration.joints`` for each quaternion of the ``robot``.
 
     Raises
     ------
     ShapeError, UnknownNameError
         If the demonstration does not have the robot's joints.
     """
-    blocks = [range(start, start + 4) for start in getattr(robot, "quaternion_starts", ())]
-    names = demonstration.joint_names
-    if not blocks:
+    starts = getattr(robot, "quaternion_starts", ())
+    if not starts:
         return []
-    if names is None:
-        if demonstration.n_joints != robot.n_joints:
-            raise ShapeError(
-                f"the demonstration has {demonstration.n_joints} joints without names, the "
-                f"robot has {robot.n_joints}: {robot.joint_names}"
-            )
-        return [list(block) for block in blocks]
+    if demonstration.joint_names is None and demonstration.n_joints != robot.n_joints:
+        raise ShapeError(
+            f"the demonstration has {demonstration.n_joints} joints without names, the "
+            f"robot has {robot.n_joints}: {robot.joint_names}"
+        )
     demonstration.reordered(robot.joint_names)  # names a joint that is missing
-    return [[names.index(robot.joint_names[k]) for k in block] for block in blocks]
+    names = list(demonstration.joint_names or robot.joint_names)
+    columns = [names.index(name) for name in robot.joint_names]
+    return [columns[start : start + 4] for start in starts]
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +71,7 @@ class AlignmentFeatures:
     names : tuple of str
         The groups in use.
     robot : Kinematics or None
+        Gives the link positions.
     columns : mapping of str to ndarray of bool
         Which columns of each group are not constant.
     scales : mapping of str to float
@@ -103,18 +98,14 @@ class AlignmentFeatures:
 
         Parameters
         ----------
-        demonstrations : sequence of Demonstration
-        robot : Kinematics, optional
+        demonstrations, robot : sequence of Demonstration, Kinematics or None
+            What to compare.
         names : sequence of str, optional
             By default all but those seen from a frame: away from the object that the motion
             is about, they differ between demonstrations at equal phase.
         weights : mapping of str to float, optional
             0 leaves a group out. By default 3 for the directions, and for n others
             ``n ** -0.5`` each.
-
-        Returns
-        -------
-        AlignmentFeatures
 
         Raises
         ------

@@ -35,10 +35,8 @@ class LinearTimeNormalization(Alignment):
     ----------
     time_ : Tensor of shape (n_steps,)
         Common time grid, from 0 [s].
-    paths_ : list of Tensor of shape (n_steps,)
-        For each demonstration of ``fit``, its fractional time step at each time of the grid.
-    joint_names_ : tuple of str or None
-        Order of the joints.
+    paths_, joint_names_ : list of Tensor of shape (n_steps,), tuple of str or None
+        As in :class:`Alignment`.
 
     Examples
     --------
@@ -70,19 +68,7 @@ class LinearTimeNormalization(Alignment):
         self.robot = robot
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
-        """Learn the common duration and grid.
-
-        Parameters
-        ----------
-        X : sequence of Demonstration
-            At least two time steps each.
-        y : ignored
-            Here for scikit-learn.
-
-        Returns
-        -------
-        self
-        """
+        """Learn the common duration and grid from demonstrations ``X``; ``y`` is ignored."""
         self._validate_params()
         demonstrations = check_demonstrations(X)
         self.joint_names_ = demonstrations[0].joint_names

@@ -6,6 +6,7 @@ demonstrations. The accumulated costs come from dtaidistance.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,14 +16,7 @@ from numpy.typing import NDArray
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DependencyError
 
-__all__ = [
-    "barycenter",
-    "medoid",
-    "moving_average",
-    "resample",
-    "warping_map",
-    "warping_path",
-]
+__all__ = ["barycenter", "medoid", "moving_average", "resample", "warping_map", "warping_path"]
 
 Floats = NDArray[np.floating[Any]]
 
@@ -52,20 +46,11 @@ def resample(values: Array, time: Floats, grid: Floats) -> Array:
 
 
 def moving_average(values: Array, width: int) -> Array:
-    """Smooth along the first axis with a Hann kernel; the ends stay where they are.
+    """Smooth ``values`` (T,) or (T, D) along the first axis with a Hann kernel; the ends stay.
 
     Beyond the ends the sequence is continued by its point reflection, so a monotone
-    sequence stays monotone and a straight line stays itself.
-
-    Parameters
-    ----------
-    values : ndarray of shape (T,) or (T, D)
-    width : int
-        Half the number of samples that the kernel covers; 0 changes nothing.
-
-    Returns
-    -------
-    ndarray
+    sequence stays monotone and a straight line stays itself. ``width`` is half the number of
+    samples that the kernel covers; 0 changes nothing.
     """
     width = min(width, len(values) - 1)
     if width < 1:
@@ -91,8 +76,8 @@ def warping_path(
 
     Parameters
     ----------
-    reference : ndarray of shape (N, D)
-    source : ndarray of shape (M, D)
+    reference, source : ndarray of shape (N, D) and (M, D)
+        The sequences.
     window : int, optional
         Matched indices differ by at most this.
     penalty : float, default=0.0
@@ -145,17 +130,11 @@ def _backtrack(costs: Array, i: int, j: int, penalty: float) -> NDArray[np.intp]
 
 
 def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
-    """Turn a path into an increasing function of the reference index.
+    """Turn a ``path`` (L, 2) into an increasing function of the reference index.
 
     Each reference index gets the mean of the source indices matched with it. What a path
-    leaves is a staircase, whose steps would be bursts of speed: a moving average removes
-    them. The ends of the path are kept.
-
-    Parameters
-    ----------
-    path : ndarray of shape (L, 2)
-    width : int, default=0
-        Of :func:`moving_average`, in reference indices.
+    leaves is a staircase, whose steps would be bursts of speed: a moving average of that
+    ``width`` removes them. The ends of the path are kept.
 
     Returns
     -------
@@ -175,12 +154,9 @@ def medoid(sequences: Sequence[Array], window: float | None = None) -> int:
     Parameters
     ----------
     sequences : sequence of ndarray of shape (T_m, D)
+        At least one.
     window : float, optional
         As a fraction of the duration.
-
-    Returns
-    -------
-    int
     """
     if len(sequences) < 3:
         return 0
@@ -192,10 +168,8 @@ def medoid(sequences: Sequence[Array], window: float | None = None) -> int:
     band = None if window is None else 1 + max(1, round(window * (steps - 1)))
     distance = _dtaidistance().distance_fast
     total = np.zeros(len(short))
-    for i, first in enumerate(short):
-        for j in range(i):
-            apart = distance(first, short[j], window=band)
-            total[[i, j]] += apart
+    for i, j in itertools.combinations(range(len(short)), 2):
+        total[[i, j]] += distance(short[i], short[j], window=band)
     return int(np.argmin(total))
 
 
@@ -210,16 +184,13 @@ def barycenter(
     Parameters
     ----------
     sequences : sequence of ndarray of shape (T_m, D)
+        At least one.
     start : ndarray of shape (N, D)
         First guess, usually the medoid.
     n_iter : int, default=10
         Largest number of rounds.
     **options
         Passed to :func:`warping_path`.
-
-    Returns
-    -------
-    ndarray of shape (N, D)
 
     References
     ----------

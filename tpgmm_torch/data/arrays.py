@@ -30,10 +30,6 @@ def as_tensor(values: Any, name: str) -> Tensor:
     name : str
         How the error message calls it.
 
-    Returns
-    -------
-    Tensor
-
     Raises
     ------
     DataError

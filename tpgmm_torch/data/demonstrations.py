@@ -1,7 +1,7 @@
-"""What goes into a model: frames, demonstrations and new situations.
+"""What goes into a model: demonstrations and new situations.
 
-SI units and radians; quaternions (w, x, y, z). Everything given as numpy array, list or
-tensor is copied once into tensors, by default of float64; nothing is modified in place.
+Times are in seconds, joints in radians (or metres, where they slide). Everything given is
+copied once into tensors, see :mod:`tpgmm_torch.data.arrays`; nothing is modified in place.
 """
 
 from __future__ import annotations
@@ -55,18 +55,24 @@ def _checked_frames(
     return MappingProxyType(frames)
 
 
+def _set(frozen: object, **attributes: Any) -> None:
+    """Set attributes of a frozen dataclass while it is made."""
+    for name, value in attributes.items():
+        object.__setattr__(frozen, name, value)
+
+
 class _PlainFrames:
     """Pickle the read-only views of frames and events as plain dicts."""
 
     def __getstate__(self) -> dict[str, Any]:
-        return {
-            k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in vars(self).items()
-        }
+        state = vars(self).items()
+        return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in state}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        for key, value in state.items():
-            value = MappingProxyType(value) if isinstance(value, dict) else value
-            object.__setattr__(self, key, value)
+        _set(
+            self,
+            **{k: MappingProxyType(v) if isinstance(v, dict) else v for k, v in state.items()},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,11 +138,9 @@ class Demonstration(_PlainFrames):
                     f"event {name!r} at {at} s lies outside the demonstration, "
                     f"{time[0]:.6g} to {time[-1]:.6g} s"
                 )
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "joints", joints)
-        object.__setattr__(self, "frames", _checked_frames(self.frames, len(time)))
-        object.__setattr__(self, "joint_names", names)
-        object.__setattr__(self, "events", MappingProxyType(events))
+        frames = _checked_frames(self.frames, len(time))
+        kept = MappingProxyType(events)
+        _set(self, time=time, joints=joints, frames=frames, joint_names=names, events=kept)
 
     def __len__(self) -> int:
         """Number of time steps T."""
@@ -167,7 +171,7 @@ class Demonstration(_PlainFrames):
     def reordered(self, joint_names: Sequence[str]) -> Demonstration:
         """The same demonstration with its joint columns in the order of ``joint_names``.
 
-        Other columns are left out. Without names of its own its order is trusted.
+        Other columns are left out. Without names, the order is trusted.
 
         Raises
         ------
@@ -225,10 +229,8 @@ class Situation(_PlainFrames):
                 f"the start posture has shape (n_joints,), got {tuple(joints.shape)}"
             )
         time = None if self.time is None else _checked_time(self.time)
-        length = None if time is None else len(time)
-        object.__setattr__(self, "joints", joints)
-        object.__setattr__(self, "time", time)
-        object.__setattr__(self, "frames", _checked_frames(self.frames, length))
+        frames = _checked_frames(self.frames, None if time is None else len(time))
+        _set(self, time=time, joints=joints, frames=frames)
 
     @classmethod
     def of(cls, demonstration: Demonstration) -> Situation:
@@ -239,15 +241,12 @@ class Situation(_PlainFrames):
 def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
     """Check what a user passes as ``X``: a non-empty sequence of like demonstrations.
 
-    Returns
-    -------
-    list of Demonstration
-        With their joints in the order of the first that names them.
+    Their joints are brought into the order of the first that names them.
 
     Raises
     ------
     DataError
-        If it is something else, empty, or its members differ in joints or frames.
+        If ``demonstrations`` are something else, empty, or differ in joints or frames.
     """
     if isinstance(demonstrations, Demonstration):
         raise DataError("expected a list of demonstrations, got one: wrap it, [demonstration]")

@@ -64,18 +64,17 @@ class Frame:
         else:
             orientation = as_tensor(orientation, "the frame's orientation").to(position)
         expected = (*position.shape[:-1], 4)
-        if tuple(orientation.shape) != expected:
+        if orientation.shape != expected:
             raise ShapeError(
                 f"a frame with position of shape {tuple(position.shape)} needs an orientation "
                 f"of shape {expected}, got {tuple(orientation.shape)}"
             )
         norm = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
         excess = norm.detach() - 1
-        worst = excess.abs().max() if norm.numel() else torch.zeros(())
-        if worst > UNIT_NORM_TOLERANCE:
+        if bool((excess.abs() > UNIT_NORM_TOLERANCE).any()):
             raise DataError(
-                "a frame's orientation must be a unit quaternion (w, x, y, z): "
-                f"a norm is off by {worst:.3g}, the tolerance is {UNIT_NORM_TOLERANCE}"
+                "a frame's orientation must be a unit quaternion (w, x, y, z): a norm is off "
+                f"by {excess.abs().max():.3g}, the tolerance is {UNIT_NORM_TOLERANCE}"
             )
         # what is of unit norm but for rounding stays as it is, bit for bit
         rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps
@@ -90,9 +89,8 @@ class Frame:
 
     def to(self, *args: Any, **kwargs: Any) -> Frame:
         """A copy on another device or of another dtype, like :meth:`torch.Tensor.to`."""
-        return self._from(
-            self.position.to(*args, **kwargs), self.orientation.to(*args, **kwargs)
-        )
+        parts = (part.to(*args, **kwargs) for part in (self.position, self.orientation))
+        return self._from(*parts)
 
     def expand(self, batch: Sequence[int]) -> Frame:
         """The same pose for all of a batch, without copying."""
@@ -125,9 +123,8 @@ class Frame:
 
     def inverse_transform(self, point: Tensor) -> Tensor:
         """``R^T (x - p)``: points (..., 3) of the base frame, seen from this frame."""
-        return quaternions.rotate(
-            quaternions.conjugate(self.orientation), point - self.position
-        )
+        turn = quaternions.conjugate(self.orientation)
+        return quaternions.rotate(turn, point - self.position)
 
     def transform(self, point: Tensor) -> Tensor:
         """``R x + p``: points (..., 3) of this frame, seen from the base frame."""

@@ -29,10 +29,6 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
     joint_names : sequence of str
         Order of the joints, ``model.kinematics_.joint_names``.
 
-    Returns
-    -------
-    list of Situation
-
     Raises
     ------
     DataError
@@ -97,10 +93,10 @@ def _joints(joints: Any, names: Sequence[str]) -> Any:
 
 
 def _check_keys(item: Any, what: str, required: set[str], optional: set[str]) -> None:
-    known = sorted(required | optional)
+    allowed = sorted(required | optional)
     if not isinstance(item, dict):
-        raise DataError(f"{what} is an object with {known}, got {item!r}")
+        raise DataError(f"{what} is an object with {allowed}, got {item!r}")
     for key in required - item.keys():
         raise DataError(f"{what} lacks {key!r}")
     for key in item.keys() - required - optional:
-        raise DataError(f"{what} has {key!r}, which is none of {known}")
+        raise DataError(f"{what} has {key!r}, which is none of {allowed}")

@@ -81,7 +81,7 @@ class Operator(ABC):
 
     Subclass it for an operator of your own: give :meth:`dimension`, :meth:`linearize` and
     :meth:`coordinates`; make it a frozen dataclass, and ``clone``, ``repr``, ``==``, ``pickle``
-    and grid search work. An operator that is known by its ``A`` and ``b`` (Definition 1 of the
+    and grid search work. An operator given by its ``A`` and ``b`` (Definition 1 of the
     paper) returns ``Linearization(None, A, b - state.joints)``; where ``A`` is singular it
     needs ``fusion="covariance"``.
     """
@@ -92,19 +92,7 @@ class Operator(ABC):
 
     @abstractmethod
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """``J``, ``M``, ``c`` at the state q_{t-1}.
-
-        Parameters
-        ----------
-        state : RobotState
-            Of any batch shape.
-        frames : mapping of str to Frame
-            Of batch shapes that broadcast with the state's.
-
-        Returns
-        -------
-        Linearization
-        """
+        """``J``, ``M``, ``c`` at the state q_{t-1}; frames of shapes that broadcast with it."""
 
     @abstractmethod
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
@@ -156,19 +144,7 @@ class Operator(ABC):
         return (inverse @ at.displacement[..., None])[..., 0] + state.joints
 
     def local(self, demonstration: Demonstration, kinematics: Kinematics) -> Tensor:
-        """The local data set X^(j) of one demonstration.
-
-        Parameters
-        ----------
-        demonstration : Demonstration
-        kinematics : Kinematics
-            Whose joints the demonstration has.
-
-        Returns
-        -------
-        Tensor of shape (T, D)
-            Quaternions are continuous along the demonstration.
-        """
+        """The local data set X^(j) of a demonstration, (T, D), its quaternions continuous."""
         demonstration = demonstration.reordered(kinematics.joint_names)
         state = kinematics.state(demonstration.joints)
         frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
@@ -211,9 +187,8 @@ def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[
 
     Parameters
     ----------
-    operators : sequence of Operator
-    kinematics : Kinematics
-        Its links are no frames.
+    operators, kinematics : sequence of Operator, Kinematics
+        What refers to frames, and whose links are none.
     """
     references = (name for operator in operators for name in operator.references())
     return tuple(dict.fromkeys(name for name in references if name not in kinematics.links))

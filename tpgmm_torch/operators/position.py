@@ -89,16 +89,14 @@ class RelativePosition(Operator):
         reference = Reference.of(self.frame, state, frames)
         position = state.position(self.link)
         jacobian = state.linear_jacobian(self.link)
-        apart = reference.frame.position - position
+        displacement = reference.frame.position - position
         if reference.linear_jacobian is not None and reference.angular_jacobian is not None:
             swing = torch.linalg.cross(
-                -apart[..., :, None].expand_as(reference.angular_jacobian),
-                reference.angular_jacobian,
-                dim=-2,
+                reference.angular_jacobian, displacement[..., None], dim=-2
             )
             jacobian = jacobian - reference.linear_jacobian + swing
         matrix = quaternions.to_matrix(reference.frame.orientation)
-        return Linearization(jacobian, matrix, apart)
+        return Linearization(jacobian, matrix, displacement)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``R_t^T (x_t - p_t)``."""

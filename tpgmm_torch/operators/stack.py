@@ -25,8 +25,8 @@ class Stack(Operator):
 
     Their local coordinates stand side by side in one Gaussian, so that correlations between
     them are learned, and they share one pseudo-inverse: with joints in common (a waist that
-    carries both arms) this differs from projecting each alone. Eq. (17) prints two block rows
-    where the Jacobian of eq. (16) has four: those of the orientations are zero.
+    carries both arms) this differs from projecting each by itself. Eq. (17) prints two block
+    rows where the Jacobian of eq. (16) has four: those of the orientations are zero.
 
     Parameters
     ----------

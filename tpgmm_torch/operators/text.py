@@ -35,7 +35,7 @@ GRAMMAR = (
 
 
 def parse_operator(text: str) -> Operator:
-    """The operator that a text stands for.
+    """The operator that a text stands for; a :class:`Stack` if there are several.
 
     Parameters
     ----------
@@ -43,11 +43,6 @@ def parse_operator(text: str) -> Operator:
         One term, or several joined by ``+``. A term is ``canonical``, or ``position``,
         ``orientation`` or ``pose`` (both), a colon and a link; ``@`` and the name of a frame
         or of another link make it relative.
-
-    Returns
-    -------
-    Operator
-        A :class:`Stack` if there are several.
 
     Raises
     ------
@@ -77,13 +72,7 @@ def _term(term: str, text: str) -> list[Operator]:
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
-    """All links seen from all frames (from the base without frames) as one stack; the joints.
-
-    Parameters
-    ----------
-    links, frames : sequence of str
-        Their names.
-    """
+    """All ``links`` seen from all ``frames`` (or from the base) as one stack; the joints."""
     references = [f"@{name}" for name in frames] or [""]
     poses = [f"pose:{link}{reference}" for reference in references for link in links]
     texts = [" + ".join(poses), "canonical"] if poses else ["canonical"]
@@ -98,10 +87,6 @@ def format_operator(operator: Operator) -> str:
     operator : Operator
         Operators that have no such text, like a user's own, are given by their ``repr``. The
         gain of orientations is left out.
-
-    Returns
-    -------
-    str
 
     Examples
     --------

@@ -13,13 +13,9 @@ __all__ = ["JointSpace"]
 
 
 class JointSpace(Kinematics):
-    """A joint vector and nothing else: enough for :class:`Canonical` alone.
+    """Joints of those ``joint_names`` and nothing else: enough for :class:`Canonical` alone.
 
-    Parameters
-    ----------
-    joint_names : sequence of str
-    dtype : torch.dtype, default=torch.float64
-    device : str, default="cpu"
+    ``dtype`` and ``device`` are those of its states.
     """
 
     def __init__(
@@ -36,14 +32,9 @@ class JointSpace(Kinematics):
     def state(self, joints: Any) -> RobotState:
         """The state with no link in it; see :meth:`Kinematics.state`."""
         joints = self.joint_tensor(joints)
-        batch = joints.shape[:-1]
-        return RobotState(
-            joints,
-            (),
-            joints.new_zeros(*batch, 0, 3),
-            joints.new_zeros(*batch, 0, 4),
-            joints.new_zeros(*batch, 0, 6, self.n_joints),
-        )
+        shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
+        parts = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
+        return RobotState(joints, (), *parts)
 
     def config(self) -> dict[str, Any]:
         """What :meth:`from_config` needs, ready for JSON."""

@@ -82,23 +82,18 @@ def reduce(
     joints: Mapping[str, int],
     locked: Mapping[str, float],
 ) -> MovingTree:
-    """Reduce a description to what moves ``links`` with respect to ``base``.
+    """Reduce the description ``model`` to what moves ``links`` with respect to ``base``.
 
     Parameters
     ----------
-    model : UrdfModel
-    base : str
-        The link that stands still.
+    model, base : UrdfModel, str
+        The description, and its link that stands still.
     links : sequence of (str, ndarray of shape (4, 4))
         The wanted poses: a link and a pose in it.
     joints : mapping of str to int
         Position in the joint vector of each actuated joint that is used.
     locked : mapping of str to float
         Values at which all other actuated joints stand [rad or m].
-
-    Returns
-    -------
-    MovingTree
 
     Raises
     ------
@@ -109,9 +104,12 @@ def reduce(
     places = {base: Attachment(-1, np.eye(4))}
     steps = _steps_from(model, base)
     for link, _ in links:
-        for joint, near, far in _way(steps, base, link):
-            if far not in places:
-                places[far] = _cross(model, joint, near, places[near], joints, locked, frames)
+        way = [link]
+        while way[-1] not in places:
+            way.append(steps[way[-1]][1])
+        for far in reversed(way[:-1]):
+            joint, near = steps[far]
+            places[far] = _cross(model, joint, near, places[near], joints, locked, frames)
     attached = [
         Attachment(places[link].frame, places[link].pose @ pose) for link, pose in links
     ]
@@ -133,18 +131,6 @@ def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]
                 steps[far] = joint, near
                 front.append(far)
     return steps
-
-
-def _way(
-    steps: Mapping[str, tuple[UrdfJoint, str]], base: str, link: str
-) -> list[tuple[UrdfJoint, str, str]]:
-    """Joint, near link and far link of each step from the base to ``link``."""
-    way = []
-    while link != base:
-        joint, near = steps[link]
-        way.append((joint, near, link))
-        link = near
-    return way[::-1]
 
 
 def _cross(
@@ -188,10 +174,8 @@ def _motion(kind: str, axis: Array, value: float) -> Array:
     if kind == "prismatic":
         matrix[:3, 3] = value * axis
         return matrix
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn = math.sin(value) * cross + (1.0 - math.cos(value)) * (cross @ cross)
-    matrix[:3, :3] += turn
+    cross = np.cross(axis, np.eye(3)).T
+    matrix[:3, :3] += math.sin(value) * cross + (1.0 - math.cos(value)) * (cross @ cross)
     return matrix
 
 

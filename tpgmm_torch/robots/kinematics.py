@@ -26,12 +26,7 @@ DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 
 def dtype_named(name: Any) -> torch.dtype:
-    """The dtype of a robot by name.
-
-    Parameters
-    ----------
-    name : str
-        ``"float32"`` or ``"float64"``.
+    """The dtype of a robot by ``name``, ``"float32"`` or ``"float64"``.
 
     Raises
     ------
@@ -91,21 +86,18 @@ class RobotState:
         return self.jacobians[..., self._index(link), 3:, :]
 
     def orientation_map(self, link: str, gain: float) -> tuple[Tensor, Tensor, Tensor]:
-        """What it takes to turn a link to a wanted orientation ``eps`` (eq. 11).
+        """What it takes to turn a ``link`` to a wanted orientation ``eps`` (eq. 11).
 
-        Parameters
-        ----------
-        link : str
-        gain : float
-            2 for the whole rotation vector to first order, 1 for the text of eq. (7).
+        ``jacobian (q - q_{t-1}) = matrix eps + offset``: here the Jacobian is ``J_o``, the
+        matrix ``gain * Hbar*(conj eps_{t-1})``, the offset 0. A ``gain`` of 2 asks for the
+        whole rotation vector to first order, 1 is the text of eq. (7).
 
         Returns
         -------
         jacobian : Tensor of shape (..., m, n_joints)
         matrix : Tensor of shape (..., m, 4)
         offset : Tensor of shape (..., m)
-            Such that ``jacobian (q - q_{t-1}) = matrix eps + offset``. Here m = 3, the
-            Jacobian is ``J_o``, the matrix ``gain * Hbar*(conj eps_{t-1})``, the offset 0.
+            Here m = 3.
         """
         orientation = self.orientation(link)
         matrix = gain * quaternions.vector_matrix(quaternions.conjugate(orientation))
@@ -177,16 +169,9 @@ class Kinematics(abc.ABC):
 
     @abc.abstractmethod
     def state(self, joints: Any) -> RobotState:
-        """Run the kinematics.
+        """Run the kinematics at ``joints``, array-like of shape (..., n_joints).
 
-        Parameters
-        ----------
-        joints : array-like of shape (..., n_joints)
-            Any leading dimensions; :meth:`joint_tensor` converts and checks.
-
-        Returns
-        -------
-        RobotState
+        :meth:`joint_tensor` converts and checks them.
         """
 
     def retract(self, joints: Tensor) -> Tensor:

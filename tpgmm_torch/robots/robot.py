@@ -28,9 +28,8 @@ __all__ = ["Kinematics", "Robot", "RobotState"]
 class Robot(Kinematics):
     """A robot described by a URDF; made by :meth:`from_urdf`.
 
-    All links come from one pass through the tree, so that arms which
-    share a waist share its columns in the stacked Jacobian. Two robots are equal if their
-    descriptions and settings are; the device does not count.
+    Arms which share a waist share its columns in the stacked Jacobian. Two robots are equal if
+    their descriptions and settings are; the device does not count.
     """
 
     @classmethod
@@ -69,13 +68,8 @@ class Robot(Kinematics):
         tools : mapping of str to (str, Frame), optional
             New links by name, each with its parent link and its pose there; also
             ``(parent, position, quaternion)``.
-        dtype : torch.dtype, default=torch.float64
-            Or float32.
-        device : torch.device or str, default="cpu"
-
-        Returns
-        -------
-        Robot
+        dtype, device : torch.dtype, torch.device or str
+            Of the states; float64 (or float32) on the CPU by default.
 
         Raises
         ------

@@ -28,20 +28,8 @@ class PosesState(RobotState):
     def orientation_map(self, link: str, gain: float) -> tuple[Tensor, Tensor, Tensor]:
         """The exact map: the quaternion's coordinates become those of the wanted one.
 
-        Parameters
-        ----------
-        link : str
-        gain : float
-            Without effect, as nothing is linearised.
-
-        Returns
-        -------
-        jacobian : Tensor of shape (..., 4, n_joints)
-            Selects the quaternion's columns.
-        matrix : Tensor of shape (..., 4, 4)
-            The identity.
-        offset : Tensor of shape (..., 4)
-            ``-eps_{t-1}``.
+        Nothing is linearised, so that the gain has no effect: the Jacobian (..., 4, n_joints)
+        selects the quaternion's columns, the matrix is the identity, the offset ``-eps_{t-1}``.
 
         Raises
         ------
@@ -70,8 +58,8 @@ class Poses(Kinematics):
         Names of the bodies.
     orientation : bool, default=True
         Whether the joint vector holds quaternions; otherwise positions alone.
-    dtype : torch.dtype, default=torch.float64
-    device : torch.device or str, default="cpu"
+    dtype, device : torch.dtype, torch.device or str
+        Of the states; float64 on the CPU by default.
 
     Examples
     --------
@@ -139,7 +127,7 @@ class Poses(Kinematics):
 
     @classmethod
     def joints(cls, poses: Mapping[str, Frame], orientation: bool = True) -> Tensor:
-        """The joint vectors of recorded poses.
+        """The joint vectors (T, n_joints), or (n_joints,), of recorded poses.
 
         Parameters
         ----------

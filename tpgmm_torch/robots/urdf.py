@@ -149,10 +149,6 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     source : str, bytes or path
         A path, or the text itself (bytes, or a string that begins with ``<``).
 
-    Returns
-    -------
-    UrdfModel
-
     Raises
     ------
     DataError
@@ -261,12 +257,6 @@ def _numbers(
     return values
 
 
-def _number(
-    element: ElementTree.Element, joint: str, tag: str, attribute: str, default: float
-) -> float:
-    return float(_numbers(element, joint, tag, attribute, (default,))[0])
-
-
 def placement(xyz: Array, rpy: Array) -> Array:
     """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis.
 
@@ -274,10 +264,6 @@ def placement(xyz: Array, rpy: Array) -> Array:
     ----------
     xyz, rpy : ndarray of shape (3,)
         Metres, radians.
-
-    Returns
-    -------
-    ndarray of shape (4, 4)
     """
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     matrix = np.eye(4)
@@ -296,11 +282,11 @@ def _limits(element: ElementTree.Element, name: str, kind: str) -> tuple[float, 
     # a <limit> that gives only effort and velocity says nothing about the range
     ranged = limit is not None and ("lower" in limit.attrib or "upper" in limit.attrib)
     if ranged and kind != "continuous":
-        lower = _number(element, name, "limit", "lower", 0.0)
-        upper = _number(element, name, "limit", "upper", 0.0)
+        [lower] = _numbers(element, name, "limit", "lower", (0.0,)).tolist()
+        [upper] = _numbers(element, name, "limit", "upper", (0.0,)).tolist()
     velocity = math.inf
     if limit is not None and "velocity" in limit.attrib:
-        velocity = _number(element, name, "limit", "velocity", 0.0)
+        [velocity] = _numbers(element, name, "limit", "velocity", (0.0,)).tolist()
     if lower > upper or velocity < 0:
         raise DataError(
             f"joint {name!r} has the limits lower={lower:g}, upper={upper:g}, "
@@ -316,11 +302,9 @@ def _mimic(element: ElementTree.Element, name: str) -> Mimic | None:
     leader = mimic.get("joint")
     if not leader:
         raise DataError(f"joint {name!r}: <mimic> does not name a joint")
-    return Mimic(
-        leader,
-        _number(element, name, "mimic", "multiplier", 1.0),
-        _number(element, name, "mimic", "offset", 0.0),
-    )
+    [multiplier] = _numbers(element, name, "mimic", "multiplier", (1.0,)).tolist()
+    [offset] = _numbers(element, name, "mimic", "offset", (0.0,)).tolist()
+    return Mimic(leader, multiplier, offset)
 
 
 def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:

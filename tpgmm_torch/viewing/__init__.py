@@ -4,10 +4,9 @@ Needs the extra ``view`` (viser). :func:`write_motion` makes one HTML file that 
 anywhere; :class:`LiveView` serves the same scene, in which objects can be moved by hand.
 """
 
-from tpgmm_torch.viewing.ellipsoids import ellipsoids
 from tpgmm_torch.viewing.live import LiveView
 from tpgmm_torch.viewing.recording import write_motion
-from tpgmm_torch.viewing.scene import MotionScene
+from tpgmm_torch.viewing.scene import MotionScene, ellipsoids
 from tpgmm_torch.viewing.visuals import Shape, link_shapes
 
 __all__ = ["LiveView", "MotionScene", "Shape", "ellipsoids", "link_shapes", "write_motion"]

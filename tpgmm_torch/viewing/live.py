@@ -28,7 +28,7 @@ class LiveView:
     """Serve motions to a browser; a context manager.
 
     The page has a time line, a choice of situations, and a handle on every object that stands
-    still: where it is let go, the skill is reproduced anew.
+    still: where it is let go, the skill is reproduced again.
 
     Parameters
     ----------
@@ -103,34 +103,17 @@ class LiveView:
         self._resources.close()
 
     def show(self, index: int) -> None:
-        """Show one of the situations.
-
-        Parameters
-        ----------
-        index : int
-        """
+        """Show the situation of that ``index``."""
         self._reproduce(self._situations[index])
 
     def move_frame(self, name: str, frame: Frame) -> None:
-        """Put an object elsewhere in the situation that is shown, and reproduce anew.
-
-        Parameters
-        ----------
-        name : str
-        frame : Frame
-        """
+        """Put an object elsewhere in the situation that is shown, and reproduce again."""
         with self._lock:
             frames = {**self.situation.frames, name: frame}
             self._reproduce(replace(self.situation, frames=frames))
 
     def run(self, seconds: float = math.inf) -> None:
-        """Play the motion again and again.
-
-        Parameters
-        ----------
-        seconds : float, default=inf
-            For how long.
-        """
+        """Play the motion again and again, for so many ``seconds``."""
         last = time.monotonic()
         end = last + seconds
         while last < end:

@@ -16,8 +16,7 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.viewing.ellipsoids import STANDARD_DEVIATIONS
-from tpgmm_torch.viewing.scene import COLORS, MotionScene
+from tpgmm_torch.viewing.scene import COLORS, STANDARD_DEVIATIONS, MotionScene
 
 __all__ = ["viser_server", "write_motion"]
 
@@ -41,10 +40,8 @@ def write_motion(
     ----------
     path : str or Path
         The file; replaced if it exists.
-    model : TaskParameterizedGMM
-        Fitted, with a robot or with tracked poses.
-    situation : Situation
-        What to reproduce for.
+    model, situation : TaskParameterizedGMM, Situation
+        What to reproduce, and for what; fitted, with a robot or with tracked poses.
     demonstrations : sequence of Demonstration, default=()
         Whose paths are drawn beside it.
     meshes : Path, optional
@@ -81,18 +78,7 @@ def write_motion(
 
 @contextmanager
 def viser_server(host: str, port: int) -> Iterator[Any]:
-    """A viser server that stops in the end.
-
-    Parameters
-    ----------
-    host : str
-        Address that it listens on.
-    port : int
-        0 for any that is free.
-
-    Yields
-    ------
-    viser.ViserServer
+    """A viser server on ``host`` and ``port`` (0 for any that is free) that stops in the end.
 
     Raises
     ------

@@ -12,23 +12,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.viewing.body import whole_body
-from tpgmm_torch.viewing.ellipsoids import ellipsoids
-from tpgmm_torch.viewing.solids import add_solid, unit_sphere
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.viewing.visuals import Shape, whole_body
 
-__all__ = ["COLORS", "MotionScene"]
+__all__ = ["COLORS", "STANDARD_DEVIATIONS", "MotionScene", "ellipsoids"]
 
 COLORS = {
     "demonstrations": (120, 120, 120),
     "reproduction": (214, 39, 40),
     "covariance": (31, 119, 180),
 }
+#: Half axes of the ellipsoids, in standard deviations.
+STANDARD_DEVIATIONS = 2.0
 #: Ellipsoids along a path, and pieces of a demonstrated path.
 ELLIPSOIDS, PIECES = 40, 150
 #: Half axes of ellipsoids that would be too thin to be drawn [m].
@@ -94,16 +96,7 @@ class MotionScene:
         self.time: Array = np.zeros(0)
 
     def show(self, situation: Situation) -> Trajectory:
-        """Reproduce the skill in a situation and draw it, in place of the one before.
-
-        Parameters
-        ----------
-        situation : Situation
-
-        Returns
-        -------
-        Trajectory
-        """
+        """Reproduce the skill in a situation and draw it, in place of the one before."""
         [trajectory] = self._model.predict([situation], candidates=False)
         steps = _steps(trajectory.time.cpu(), self._fps)
         state = self._body.state(trajectory.joints.cpu()[steps])
@@ -124,13 +117,7 @@ class MotionScene:
         return trajectory
 
     def move_to(self, picture: int) -> None:
-        """Put everything that moves where it is at an instant.
-
-        Parameters
-        ----------
-        picture : int
-            Index into ``time``.
-        """
+        """Put everything that moves where it is at ``time[picture]``."""
         for handle, pose in zip(self._links, self._link_poses[picture], strict=True):
             _place(handle, pose)
         for name, poses in self._frame_poses.items():
@@ -175,7 +162,7 @@ class MotionScene:
             handle = self._axes(f"/robot/{_node(link)}", 0.04, link in self._of_interest)
             self._links.append(handle)
             for number, shape in enumerate(self._shapes.get(link, ())):
-                add_solid(self._scene, f"{handle.name}/{number}", shape)
+                _add_solid(self._scene, f"{handle.name}/{number}", shape)
 
     def _draw_demonstrations(self) -> None:
         """Paths, and where objects stood, small: why paths differ."""
@@ -208,7 +195,7 @@ class MotionScene:
     def _draw_ellipsoids(
         self, link: str, centres: Array, half_axes: Array, turns: Array
     ) -> None:
-        vertices, faces = unit_sphere()
+        vertices, faces = _unit_sphere()
         self._scene.add_batched_meshes_simple(
             f"/covariance/{_node(link)}",
             vertices,
@@ -292,3 +279,71 @@ def _place(handle: Any, pose: Array) -> None:
 def _node(name: str) -> str:
     """A name as one step of a path in the scene."""
     return name.replace("/", "_")
+
+
+def ellipsoids(state: RobotState, covariance: Tensor, link: str) -> tuple[Tensor, Tensor]:
+    """Contours of the covariance of a link's position, ``J_p Sigma J_p^T`` to first order.
+
+    Parameters
+    ----------
+    state : RobotState
+        At the reproduction's joints, of leading shape (...).
+    covariance : Tensor of shape (..., n_joints, n_joints)
+        Of the joints, :attr:`Trajectory.covariance`.
+    link : str
+        Of the robot.
+
+    Returns
+    -------
+    half_axes : Tensor of shape (..., 3)
+        ``STANDARD_DEVIATIONS`` standard deviations along the principal axes, ascending [m].
+    orientations : Tensor of shape (..., 4)
+        Unit quaternions that turn x, y, z into the principal axes.
+    """
+    jacobian = state.linear_jacobian(link)
+    variances, axes = torch.linalg.eigh(jacobian @ covariance @ jacobian.mT)
+    # eigenvectors have a sign to choose: the one that makes them a rotation
+    axes = torch.cat(
+        (axes[..., :2], axes[..., 2:] * torch.linalg.det(axes)[..., None, None]), -1
+    )
+    half_axes = STANDARD_DEVIATIONS * variances.clamp(min=0).sqrt()
+    return half_axes, quaternions.from_matrix(axes)
+
+
+def _add_solid(scene: Any, name: str, shape: Shape) -> Any:
+    """Add a shape below the node of its link; a file that cannot be read is a DataError."""
+    turn = torch.from_numpy(np.ascontiguousarray(shape.pose[:3, :3]))
+    placed: dict[str, Any] = {
+        "position": shape.pose[:3, 3],
+        "wxyz": quaternions.from_matrix(turn).numpy(),
+        "color": shape.color,
+        "opacity": None if shape.opacity >= 1 else shape.opacity,
+    }
+    match shape.kind:
+        case "box":
+            return scene.add_box(name, dimensions=shape.size, **placed)
+        case "sphere":
+            return scene.add_icosphere(name, *shape.size, **placed)
+        case "cylinder":
+            radius, length = shape.size
+            return scene.add_cylinder(name, radius, length, **placed)
+    vertices, faces = _mesh(shape)
+    return scene.add_mesh_simple(name, vertices, faces, **placed)
+
+
+def _unit_sphere() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (V, 3) and triangles (F, 3) of a ball of radius 1."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
+def _mesh(shape: Shape) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(shape.file)
+        return np.asarray(mesh.vertices) * shape.size, np.asarray(mesh.faces)
+    except Exception as error:  # whatever a reader of one of many formats raises
+        raise DataError(f"the mesh {shape.file} cannot be read: {error}") from error

@@ -15,12 +15,15 @@ from typing import Literal
 from xml.etree import ElementTree
 
 import numpy as np
+import torch
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.urdf import UrdfModel, placement
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfModel, placement, read_urdf
 
-__all__ = ["Color", "Shape", "link_shapes"]
+__all__ = ["Color", "Shape", "link_shapes", "whole_body"]
 
 Color = tuple[int, int, int]
 
@@ -36,15 +39,14 @@ class Shape:
     Parameters
     ----------
     kind : {"box", "cylinder", "sphere", "mesh"}
+        What it is.
     size : tuple of float
         Edges of a box; radius and length (along z) of a cylinder; radius of a sphere [m];
         scale of a mesh.
     pose : ndarray of shape (4, 4)
         In the link; the centre of a primitive.
-    color : tuple of int
-        Red, green, blue, 0 to 255.
-    opacity : float
-        0 to 1.
+    color, opacity : tuple of int, float
+        Red, green, blue, 0 to 255; 0 to 1.
     file : Path, optional
         Of a mesh.
     """
@@ -58,19 +60,15 @@ class Shape:
 
 
 def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[Shape]]:
-    """The shapes of every link that has any.
+    """The shapes of every link that has any, by name, in the link's frame.
 
     Parameters
     ----------
     model : UrdfModel
+        Whose ``<visual>`` elements count.
     meshes : Path, optional
         Folder with the mesh files. Of a name like ``package://robot/meshes/hand.stl`` the
         longest end counts that exists there. Without a folder meshes become sticks.
-
-    Returns
-    -------
-    dict of str to list of Shape
-        By name of the link, in the link's frame.
 
     Raises
     ------
@@ -186,3 +184,39 @@ def _stick(end: Array) -> Shape:
     pose[:3, :3] = np.column_stack((x, np.cross(z, x), z))
     pose[:3, 3] = end / 2
     return Shape("cylinder", (float(np.clip(STICK * length, THINNEST, THICKEST)), length), pose)
+
+
+def whole_body(
+    kinematics: Kinematics, meshes: Path | None = None
+) -> tuple[Kinematics, Mapping[str, Sequence[Shape]]]:
+    """All links that can be seen: their kinematics in float64 on the CPU, and their shapes.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+        Of a model; its links come first. A :class:`Robot` knows its URDF; of any other only
+        the links are seen.
+    meshes : Path, optional
+        Folder with the files of the robot's meshes.
+    """
+    if not isinstance(kinematics, Robot):
+        return kinematics.to(torch.float64, "cpu"), {}
+    config = kinematics.config() | {"dtype": "float64"}
+    urdf = read_urdf(config["urdf"])
+    held = _held_by(urdf, config["base"])
+    shapes = {link: s for link, s in link_shapes(urdf, meshes).items() if link in held}
+    config["links"] += [link for link in shapes if link not in kinematics.links]
+    return Robot.from_config(config), shapes
+
+
+def _held_by(urdf: UrdfModel, base: str) -> set[str]:
+    """Links between which and the base there is no joint of several degrees of freedom."""
+    held, front = {base}, [base]
+    joints = [joint for joint in urdf.joints if joint.type not in MULTIPLE_TYPES]
+    while front:
+        at = front.pop()
+        ends = [(j.parent, j.child) for j in joints if at in (j.parent, j.child)]
+        found = {link for pair in ends for link in pair} - held
+        held |= found
+        front += found
+    return held

@@ -10,7 +10,7 @@ from tpgmm_torch import Poses, Robot
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import read_urdf
 from tpgmm_torch.viewing import link_shapes
-from tpgmm_torch.viewing.body import whole_body
+from tpgmm_torch.viewing.visuals import whole_body
 
 TRIANGLE = """solid one
 facet normal 0 0 1
