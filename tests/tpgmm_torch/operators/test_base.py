@@ -11,7 +11,7 @@ from tests.support import oracles
 from tests.support.mixtures import (
     assert_close,
     assert_equal_estimates,
-    local_mixture,
+    conditionals_of,
     random_local,
 )
 from tests.support.own_operators import (
@@ -158,7 +158,7 @@ class Problem:
         return cls(list(operators), mixtures, rng.dirichlet(3 * np.ones(n_components)))
 
     def regression(self, operators: list[Operator] | None = None, **options) -> Regression:
-        mixtures = [local_mixture(local) for local in self.mixtures]
+        mixtures = [conditionals_of(local) for local in self.mixtures]
         log_weights = torch.from_numpy(self.weights).log()
         return Regression(
             PlanarArm(), operators or self.operators, mixtures, log_weights, **options
@@ -221,7 +221,7 @@ def test_a_null_space_operator_of_full_row_rank_fuses_in_information_form():
     state = PlanarArm().state(Q)
     jacobian = planar_jacobian(state)
     basis = torch.linalg.svd(jacobian).Vh[2:]  # of either sign
-    tip, posture = (local_mixture(local).at(NOW)[0] for local in problem.mixtures)
+    tip, posture = (conditionals_of(local).at(NOW)[0] for local in problem.mixtures)
     asked = torch.cat((tip - state.position("tip")[:2], basis @ (posture - Q)))
     expected = Q + torch.linalg.solve(torch.cat((jacobian, basis)), asked)
     assert_close(problem.step(prior_std=1e5).joints, expected)
