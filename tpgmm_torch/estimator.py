@@ -28,10 +28,10 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
-from tpgmm_torch.large_data.processes import ALONE, Processes
-from tpgmm_torch.large_data.row_file import SpooledRows
+from tpgmm_torch.large_data.checkpoints import Checkpoint
+from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
+from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.mixture.checkpoints import Checkpoint
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -46,9 +46,9 @@ from tpgmm_torch.training.mixture_settings import (
     regularization,
 )
 from tpgmm_torch.training.training_rows import (
-    DemonstrationBatches,
     LearningRows,
-    check_like,
+    check_shares,
+    checked_batches,
     gather_rows,
     rows_in_memory,
     split_batches,
@@ -300,14 +300,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 known, operators, kinematics, responsibilities=self.responsibilities
             )
             return self._learn(gathered, operators, kinematics, checkpoint)
-        walk = iter(DemonstrationBatches([demonstrations] if batches is None else batches))
+        walk = checked_batches([demonstrations] if batches is None else batches)
         head = next(walk, None)
-        check_like(head, processes)
+        check_shares(head, processes)
         assert head is not None
         kinematics = self._kinematics_for(head, operators)
-        with SpooledRows() as spool:
+        with RowFile() as file:
             gathered = gather_rows(
-                chain([head], walk), operators, kinematics, spool, processes,
+                chain([head], walk), operators, kinematics, file, processes,
                 responsibilities=self.responsibilities,
             )  # fmt: skip
             return self._learn(gathered, operators, kinematics, checkpoint)
@@ -774,7 +774,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         checkpoint: Checkpoint | None,
     ) -> Self:
         """Fit the mixture to rows, and take over what it learned."""
-        moments = ColumnMoments.of_batches(learning.rows, learning.processes)
+        moments = column_moments(learning.rows, learning.processes)
         mixture = self.unfitted_mixture(moments, learning.group_size, operators, kinematics)
         mixture.fit_rows(
             learning.rows,

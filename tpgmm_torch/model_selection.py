@@ -155,7 +155,7 @@ def fit_folds(
         members = np.tile(belongs, len(rows) // size)
     else:
         members = np.repeat(belongs, [len(d) for d in demonstrations], axis=1)
-    moments = [ColumnMoments.of_batches([rows[own]]) for own in members]
+    moments = [ColumnMoments.of(rows[own]) for own in members]
     mixtures = [
         model.unfitted_mixture(known, len(fold) if size > 1 else 1, operators, kinematics)
         for model, fold, known in zip(models, chosen, moments, strict=True)

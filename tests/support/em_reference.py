@@ -6,10 +6,11 @@ Written with whitening by triangular solution, one component and one block after
 import numpy as np
 import torch
 
-from tpgmm_torch.em import ascent as expectation_maximization
-from tpgmm_torch.em.block_gaussians import Family, Parameters
+from tpgmm_torch.em import expectation_maximization
 from tpgmm_torch.em.column_moments import ColumnMoments
-from tpgmm_torch.em.points import StoredPoints
+from tpgmm_torch.em.covariance_family import CovarianceFamily
+from tpgmm_torch.em.parameters import Parameters
+from tpgmm_torch.em.points import StoredPoints, standardized_chunks
 
 WIDTHS = (3, 4)
 
@@ -17,11 +18,13 @@ WIDTHS = (3, 4)
 def standardized(X, dtype=torch.float64, widths=WIDTHS, group_size=1, n_components=10):
     """Points as EM sees them, and the units they are in."""
     units = ColumnMoments.of(X).standardization(widths, isotropic=False)
-    return StoredPoints(units.chunks(X, n_components, dtype, group_size)), units
+    return StoredPoints(standardized_chunks(X, units, n_components, dtype, group_size)), units
 
 
 def family(units, reg_covar=1e-6, covariance_type="full", dtype=torch.float64):
-    return Family.regularized(covariance_type, units, reg_covar, relative=True, dtype=dtype)
+    return CovarianceFamily.regularized(
+        covariance_type, units, reg_covar, relative=True, dtype=dtype
+    )
 
 
 def columns(points):
@@ -99,11 +102,22 @@ def assert_same_mixture(actual, expected, tolerance=1e-9):
 def counted_passes(monkeypatch):
     """A list to which each pass over the points adds how many mixtures it serves."""
     passes = []
-    expect = expectation_maximization.expect
+    e_step = expectation_maximization.e_step
 
-    def counted(mixtures, *arguments, **settings):
-        passes.append(len(mixtures))
-        return expect(mixtures, *arguments, **settings)
+    def counted(parameters, *arguments, **settings):
+        passes.append(len(parameters.weights))
+        return e_step(parameters, *arguments, **settings)
 
-    monkeypatch.setattr(expectation_maximization, "expect", counted)
+    monkeypatch.setattr(expectation_maximization, "e_step", counted)
     return passes
+
+
+def one(parameters):
+    """A mixture as a stack of one."""
+    return Parameters.stack([parameters])
+
+
+def m_step(expectation, family, floored=False):
+    """The M step of a pass for one mixture."""
+    flags = torch.full((len(expectation.bound),), floored)
+    return expectation_maximization.m_step(expectation, family, flags)[0]

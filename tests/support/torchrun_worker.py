@@ -26,8 +26,8 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import Processes, joined_processes
-from tpgmm_torch.mixture.checkpoints import Checkpoint
 
 BLOCKS = (2, 3)
 HAND = Poses(("hand",))

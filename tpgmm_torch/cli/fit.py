@@ -175,8 +175,8 @@ def fit(
     """
     from tpgmm_torch.cli.training_data import read_training_data
     from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.large_data.checkpoints import Checkpoint
     from tpgmm_torch.large_data.processes import joined_processes
-    from tpgmm_torch.mixture.checkpoints import Checkpoint
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = model_format(output_format)

@@ -20,7 +20,8 @@ from operator import ge
 import torch
 from torch import Tensor
 
-from tpgmm_torch.em.block_gaussians import Chunk, Parameters
+from tpgmm_torch.em.parameters import Parameters
+from tpgmm_torch.em.points import Chunk
 
 __all__ = ["Gate", "Selection"]
 
@@ -68,7 +69,7 @@ class Selection:
         chosen = _numbered(ceilings.topk(count, dim=1).indices, n_components)
         return cls(ceilings, least, chosen.reshape(-1))
 
-    def confirmed(self, least: Sequence[float]) -> bool:
+    def holds(self, least: Sequence[float]) -> bool:
         """Whether the least log-densities (S) of the selected components confirm it."""
         return self.components is None or all(map(ge, least, self.least))
 
@@ -98,33 +99,33 @@ class Gate:
         self._count += 1
 
     def selections(
-        self, mixtures: Parameters, peaks: Tensor, guess: Tensor | None = None
+        self, parameters: Parameters, peaks: Tensor, guess: Tensor | None = None
     ) -> Iterator[Selection]:
         """What each chunk probably needs, of those that are recorded when it is asked for.
 
         Parameters
         ----------
-        mixtures : Parameters
-            S mixtures of K components, one after the other.
+        parameters : Parameters
+            S mixtures of K components.
         peaks : Tensor of shape (S, K)
             Log of weight times density at the components' means.
-        guess : Tensor of shape (n_chunks, S), optional
+        guess : Tensor of shape (S, n_chunks), optional
             Least log-density of each chunk in the last pass.
         """
-        n_starts, n_components = peaks.shape
-        means = torch.cat(mixtures.means, 1)
-        narrowness = torch.cat([f.square().sum(-1).rsqrt() for f in mixtures.factors], 1)
-        widths = [mean.shape[1] for mean in mixtures.means]
+        n_components = peaks.shape[1]
+        means = torch.cat(parameters.means, -1)
+        narrowness = torch.cat([f.square().sum(-1).rsqrt() for f in parameters.factors], -1)
+        widths = [mean.shape[-1] for mean in parameters.means]
         slab = max(1, SLAB // means.numel())
         first = 0
         while first < self._count:
             part = slice(first, min(first + slab, self._count))
-            lowest, highest = self._boxes[part, :, None].unbind(1)
+            lowest, highest = self._boxes[part, :, None, None].unbind(1)
             gap = torch.maximum(lowest - means, means - highest).clamp_(min=0)
             gap.mul_(narrowness).square_()
             distance = torch.stack([g.amax(-1) for g in gap.split(widths, -1)]).sum(0)
-            ceilings = peaks - distance.unflatten(1, (n_starts, n_components)) / 2
-            least = ceilings.amax(-1) - DEPTH if guess is None else guess[part] - SLACK
+            ceilings = peaks - distance / 2
+            least = ceilings.amax(-1) - DEPTH if guess is None else guess.T[part] - SLACK
             needed = ceilings > (least - NEGLIGIBLE)[..., None]
             # none at all, if the guess is far too high
             counts = needed.sum(-1).amax(-1).clamp_(min=1).tolist()

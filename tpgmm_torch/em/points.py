@@ -1,82 +1,62 @@
 """The points that a mixture is learned from, in passes: wherever they are stored.
 
-EM sees the points only through :class:`Points`, chunk by chunk and pass after pass. Whether
-they are in memory, on disk or spread over several processes is the business of who made them.
+EM sees the points only through :class:`Points`, chunk by chunk and pass after pass.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.em.block_gaussians import Chunk
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.em.parameters import Standardization
 
-__all__ = ["Points", "StoredPoints", "Subset"]
+__all__ = ["Chunk", "Points", "StoredPoints", "standardized_chunks"]
+
+#: One chunk of points: for each block the columns (x; 1), shape (D_j + 1, n).
+Chunk = tuple[Tensor, ...]
+
+#: Whitened coordinates of a chunk, in float64, in float32 twice as many: what a processor's
+#: cache can keep, and what a GPU is busy with.
+CHUNK_SIZE = {"cpu": 3 * 2**17, "gpu": 2**25}
 
 
 class Points(ABC):
     """Standardised points as a source of chunks that can be walked through again and again.
 
-    Every pass yields the same chunks in the same order. Within what the source holds in
-    memory at a time (everything, or one batch), points are sorted by time where the mixture
-    has a time column; points of one group are never parted, and chunks end where groups end.
+    Every pass yields the same chunks in the same order. Chunks whose points are near each
+    other in time let EM leave out components that are far away; they end where groups end.
 
     Attributes
     ----------
     widths : tuple of int
         D_j of each block.
-    n_points : int
-        Number of points in this process.
     total : int
-        Number of points in all processes.
-    offset : int
-        Number of points in the processes before this one, so that ``offset + i`` numbers the
-        points of all processes in one sequence.
+        Number of points, with those of other processes where there are such.
     dtype : torch.dtype
         Of the chunks.
     device : torch.device
         Of the chunks.
-    time_feature : int or None
-        The column of the first block by which points are sorted.
-    processes : Processes
-        Who has a share of the points.
     """
 
     widths: tuple[int, ...]
-    n_points: int
     total: int
-    offset: int
     dtype: torch.dtype
     device: torch.device
-    time_feature: int | None
-    processes: Processes
 
     @abstractmethod
     def __iter__(self) -> Iterator[Chunk]:
         """One pass: chunks, each a tuple of Tensor of shape (D_j + 1, n), columns (x; 1)."""
 
     def combine(self, *sums: Tensor) -> tuple[Tensor, ...]:
-        """Add float64 sums over all processes; every process must ask, in the same order.
+        """Add float64 sums over all points to those of other processes; by default none."""
+        return sums
 
-        Parameters
-        ----------
-        *sums : Tensor
-            Of the same shapes in all processes; they are not changed.
-
-        Returns
-        -------
-        tuple of Tensor
-            To the last bit the same in all processes.
-        """
-        return self.processes.sum(*sums)
-
-    def _count(self, n_points: int) -> None:
-        """Set ``n_points``, and with the other processes ``total`` and ``offset``."""
-        counts = self.processes.concatenate(torch.tensor([n_points], dtype=torch.float64))
-        self.n_points, self.total = n_points, int(counts.sum())
-        self.offset = int(counts[: self.processes.rank].sum())
+    def concatenate(self, rows: Tensor) -> Tensor:
+        """Rows (n, ...) with those of other processes after each other; by default none."""
+        return rows
 
 
 class StoredPoints(Points):
@@ -86,30 +66,20 @@ class StoredPoints(Points):
     ----------
     chunks : sequence of tuple of Tensor of shape (D_j + 1, n)
         At least one.
-    time_feature : int, optional
-        The column of the first block by which points are sorted.
-    processes : Processes, optional
-        Who has a share of the points; this process alone by default.
 
     Examples
     --------
     >>> chunk = (torch.tensor([[0.0, 1.0], [1.0, 1.0]]),)
     >>> points = StoredPoints([chunk])
-    >>> points.widths, points.n_points, len(list(points))
+    >>> points.widths, points.total, len(list(points))
     ((1,), 2, 1)
     """
 
-    def __init__(
-        self,
-        chunks: Sequence[Chunk],
-        time_feature: int | None = None,
-        processes: Processes = ALONE,
-    ) -> None:
-        self.time_feature, self.processes = time_feature, processes
+    def __init__(self, chunks: Sequence[Chunk]) -> None:
         self._chunks = list(chunks)
         first = self._chunks[0]
         self.widths = tuple(len(block) - 1 for block in first)
-        self._count(sum(chunk[0].shape[1] for chunk in self._chunks))
+        self.total = sum(chunk[0].shape[1] for chunk in self._chunks)
         self.dtype, self.device = first[0].dtype, first[0].device
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -117,39 +87,39 @@ class StoredPoints(Points):
         return iter(self._chunks)
 
 
-class Subset(Points):
-    """Some of the points that are held in memory, as a fold of a cross-validation has.
-
-    A pass over all points serves mixtures that learn from subsets of them, too.
+def standardized_chunks(
+    rows: NDArray[np.floating],
+    units: Standardization,
+    n_components: int,
+    dtype: torch.dtype,
+    group_size: int = 1,
+) -> list[Chunk]:
+    """Standardise rows (n, n_features) in float64, and cut them between groups.
 
     Parameters
     ----------
-    points : StoredPoints
-        Of this process alone.
-    chosen : Tensor of bool, of shape (n_points,)
-        Which of them, in their order.
+    rows : array of shape (n, n_features)
+    units : Standardization
+        On the device where the chunks shall be.
+    n_components : int
+        Of all mixtures that are evaluated, which decides how large a chunk is.
+    dtype : torch.dtype
+        Of the chunks.
     group_size : int, default=1
-        How many of each group these are.
-
-    Examples
-    --------
-    >>> chunk = (torch.tensor([[0.0, 1.0], [1.0, 1.0]]),)
-    >>> second = Subset(StoredPoints([chunk]), torch.tensor([False, True]))
-    >>> second.total, [block.tolist() for [block] in second]
-    (1, [[[1.0], [1.0]]])
+        So many consecutive rows stay together.
     """
-
-    def __init__(self, points: StoredPoints, chosen: Tensor, group_size: int = 1) -> None:
-        self.widths, self.time_feature = points.widths, points.time_feature
-        self.dtype, self.device, self.processes = points.dtype, points.device, ALONE
-        self.chosen, self.group_size = chosen.to(points.device), group_size
-        self._points = points
-        self._count(int(chosen.sum()))
-
-    def __iter__(self) -> Iterator[Chunk]:
-        """One pass over the chosen points; a chunk without any is passed over."""
-        chunks = list(self._points)
-        places = self.chosen.split([chunk[0].shape[1] for chunk in chunks])
-        for chunk, chosen in zip(chunks, places, strict=True):
-            if bool(chosen.any()):
-                yield tuple(block[:, chosen] for block in chunk)
+    standard = units.rows(rows)
+    widths = [width + 1 for width in units.widths]
+    whole = CHUNK_SIZE["cpu" if standard.device.type == "cpu" else "gpu"] * 8 // dtype.itemsize
+    packed = sum(width * (width + 1) // 2 for width in widths)  # if they are expanded
+    size = whole // min(n_components * sum(widths), packed) // group_size * group_size
+    size += group_size
+    chunks = []
+    for part in standard.split(int(size)):
+        blocks = []
+        for width, columns in zip(widths, part.split(units.widths, 1), strict=True):
+            block = standard.new_ones(width, len(part), dtype=dtype)
+            block[:-1] = columns.T
+            blocks.append(block)
+        chunks.append(tuple(blocks))
+    return chunks

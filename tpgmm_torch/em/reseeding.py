@@ -1,21 +1,24 @@
-"""Components that have lost their data, and where they are placed anew."""
+"""Components that have lost their data, and points where they start again."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.em.block_gaussians import Family, Parameters
+from tpgmm_torch.em.covariance_family import CovarianceFamily
 from tpgmm_torch.em.e_step import Expectation, log_densities
+from tpgmm_torch.em.parameters import Parameters
 from tpgmm_torch.em.points import Points
 
-__all__ = ["degenerate", "obituary", "place_anew"]
+__all__ = ["dead_components", "reseed", "worst_points"]
 
-#: Components placed anew go to one of so many points at most.
-MOST_PLACES = 2**14
+#: Components start again at one of so many points at most.
+MOST_CANDIDATES = 2**14
 
 
-def degenerate(expectation: Expectation, family: Family, points: Points) -> Tensor:
-    """Which components have lost their data, shape (K,).
+def dead_components(
+    expectation: Expectation, family: CovarianceFamily, dtype: torch.dtype
+) -> Tensor:
+    """Which components of S mixtures have lost their data, shape (S, K).
 
     Either nothing is left of its mass, or at most two points are, without any spread
     beyond the regularisation, though there is data enough to give each component more.
@@ -23,26 +26,27 @@ def degenerate(expectation: Expectation, family: Family, points: Points) -> Tens
     Parameters
     ----------
     expectation : Expectation
-    family : Family
-    points : Points
+    family : CovarianceFamily
+    dtype : torch.dtype
+        Precision of the points.
     """
-    mass = expectation.mass
-    vanished = mass < 10 * torch.finfo(points.dtype).eps * points.total
-    few = mass <= 2
-    if points.total <= 2 * len(mass) or not bool(few.any()):
-        return vanished
-    spread = torch.stack([f.square().sum((1, 2)) for f in expectation.parameters.factors])
-    lambda_trace = sum(float(diagonal.sum()) for diagonal in family.diagonals)
-    return vanished | (few & (spread.sum(0) <= 2 * lambda_trace))
+    mass, n_points = expectation.mass, expectation.n_points[:, None]
+    vanished = mass < 10 * torch.finfo(dtype).eps * n_points
+    few = (mass <= 2) & (n_points > 2 * mass.shape[1])
+    factors = expectation.parameters.factors
+    spread = torch.stack([f.square().sum((-2, -1)) for f in factors]).sum(0)
+    floor = torch.stack([diagonal.sum(-1) for diagonal in family.diagonals]).sum(0)
+    return vanished | (few & (spread <= 2 * floor[..., None]))
 
 
-def place_anew(
+def reseed(
     parameters: Parameters,
     dead: Tensor,
-    expectation: Expectation,
+    explaining: Parameters,
     points: Points,
     rng: np.random.RandomState,
     group_size: int = 1,
+    members: Tensor | None = None,
 ) -> Parameters:
     """Move dead components to badly explained points, with the others' mean covariance.
 
@@ -52,20 +56,23 @@ def place_anew(
     Parameters
     ----------
     parameters : Parameters
-        What the M step made of the expectation.
-    dead : Tensor of shape (K,)
-    expectation : Expectation
-        Whose mixture explains points well or badly.
+        One mixture, as the M step left it.
+    dead : Tensor of bool, of shape (K,)
+    explaining : Parameters
+        The mixture of the E step, which explains points well or badly.
     points : Points
     rng : RandomState
         In the same state in all processes.
     group_size : int, default=1
-        See :func:`tpgmm_torch.em.e_step.expect`.
+        See :func:`tpgmm_torch.em.e_step.e_step`.
+    members : Tensor of bool, of shape (n_points,), optional
+        The points that the mixture is learned from; all by default.
     """
-    needed = int(dead.sum())
-    n_worst = max(needed, min(points.total // 20, MOST_PLACES))
-    worst = worst_points(expectation.parameters, points, n_worst, group_size)
-    places = worst[rng.choice(len(worst), needed, replace=False)]
+    n_dead = int(dead.sum())
+    n_points = points.total if members is None else int(members.sum())
+    n_candidates = max(n_dead, min(n_points // 20, MOST_CANDIDATES))
+    worst = worst_points(explaining, points, n_candidates, group_size, members)
+    places = worst[rng.choice(len(worst), n_dead, replace=False)]
     weights = torch.where(dead, 1 / len(dead), parameters.weights)
     share = torch.where(dead, 0.0, parameters.weights)
     share = share / share.sum()
@@ -83,46 +90,41 @@ def place_anew(
 
 
 def worst_points(
-    parameters: Parameters, points: Points, n_worst: int, group_size: int = 1
+    parameters: Parameters,
+    points: Points,
+    count: int,
+    group_size: int = 1,
+    members: Tensor | None = None,
 ) -> Tensor:
-    """The points of lowest density in all processes, by density, (n_worst, sum D_j).
+    """The points of lowest density, in one pass that keeps no more than it needs.
 
-    One pass, which keeps no more than it needs.
+    Parameters
+    ----------
+    parameters : Parameters
+        One mixture.
+    points : Points
+        Of all processes where there are several.
+    count : int
+        How many; all, if there are fewer.
+    group_size, members
+        As for :func:`reseed`.
+
+    Returns
+    -------
+    Tensor of shape (count, sum D_j)
+        By density.
     """
-    kept = torch.zeros(0, 1 + sum(points.widths), dtype=torch.float64, device=points.device)
-    waiting: list[Tensor] = []
+    worst = torch.zeros(0, 1 + sum(points.widths), dtype=torch.float64, device=points.device)
+    start = 0
     for chunk in points:
-        densities = log_densities(parameters, chunk, group_size)
+        stop = start + chunk[0].shape[1]
+        counted = None if members is None else members[start:stop]
+        densities = log_densities(parameters, chunk, group_size, counted)
         rows = torch.cat([densities[None], *(block[:-1] for block in chunk)]).T.double()
-        if len(kept) == n_worst:
-            rows = rows[rows[:, 0] < kept[-1, 0]]
-        waiting.append(rows)
-        if sum(map(len, waiting)) >= n_worst:
-            kept, waiting = _lowest(torch.cat([kept, *waiting]), n_worst), []
-    own = _lowest(torch.cat([kept, *waiting]), n_worst)
-    together = points.processes.concatenate(own).to(points.device)
-    return _lowest(together, n_worst)[:, 1:]
+        worst = _lowest(torch.cat([worst, rows[torch.isfinite(rows[:, 0])]]), count)
+        start = stop
+    return _lowest(points.concatenate(worst).to(points.device), count)[:, 1:]
 
 
 def _lowest(rows: Tensor, count: int) -> Tensor:
     return rows[rows[:, 0].argsort(stable=True)[:count]]
-
-
-def obituary(dead: Tensor, expectation: Expectation, points: Points, n_iter: int) -> str:
-    """What was placed anew, in words.
-
-    Parameters
-    ----------
-    dead : Tensor of shape (K,)
-    expectation : Expectation
-    points : Points
-    n_iter : int
-        The iteration.
-    """
-    components = dead.nonzero()[:, 0].tolist()
-    # to the digits that do not depend on what the gate left out
-    masses = ", ".join(f"{round(float(expectation.mass[k]), 9):.3g}" for k in components)
-    return (
-        f"component(s) {components} in iteration {n_iter} "
-        f"(left: {masses} of {points.total} points)"
-    )

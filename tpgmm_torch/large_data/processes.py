@@ -7,7 +7,7 @@ The processes are those of ``torch.distributed``'s default group, on one machine
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from numbers import Integral
@@ -15,13 +15,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sklearn.utils import check_random_state
 from torch import Tensor
 from torch import distributed as dist
 
+from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, DistributedError
 
-__all__ = ["ALONE", "GroupOfProcesses", "Processes", "common_random_state", "joined_processes"]
+__all__ = [
+    "ALONE",
+    "GroupOfProcesses",
+    "Processes",
+    "column_moments",
+    "common_random_state",
+    "joined_processes",
+]
 
 #: How long a process waits for the others before it gives up.
 PATIENCE = timedelta(minutes=30)
@@ -83,25 +92,17 @@ class Processes:
         DistributedError
             If a process has died, or does not answer.
         """
-        return values
+        return torch.cat(self.gather(values.cpu())) if self.count > 1 else values
 
-    def texts(self, text: str) -> list[str]:
-        """What each process says, in their order.
+    def gather(self, value: Any) -> list[Any]:
+        """The values of all processes, in their order: texts, numbers, lists.
 
         Raises
         ------
         DistributedError
             If a process has died, or does not answer.
         """
-        content = text.encode()
-        codes = torch.tensor(list(content), dtype=torch.float64)
-        size = torch.tensor([len(content)], dtype=torch.float64)
-        lengths = [int(length) for length in self.concatenate(size)]
-        everything = bytes(self.concatenate(codes).to(torch.uint8).tolist())
-        ends = np.cumsum(lengths)
-        return [
-            everything[end - n : end].decode() for n, end in zip(lengths, ends, strict=True)
-        ]
+        return [value]
 
     def share[T](self, items: Sequence[T]) -> list[T]:
         """The consecutive part of ``items`` that is this process's, equal up to one.
@@ -153,16 +154,11 @@ class GroupOfProcesses(Processes):
             for part, tensor in zip(parts, tensors, strict=True)
         )
 
-    def concatenate(self, values: Tensor) -> Tensor:
-        """Put together by adding what each process writes into its own place."""
-        lengths = torch.zeros(self.count, dtype=torch.float64)
-        lengths[self.rank] = len(values)
-        (lengths,) = self.sum(lengths)
-        ends = lengths.cumsum(0).long().tolist()
-        whole = values.new_zeros((ends[-1], *values.shape[1:]), dtype=torch.float64)
-        whole[ends[self.rank] - len(values) : ends[self.rank]] = values
-        (whole,) = self.sum(whole)
-        return whole
+    def gather(self, value: Any) -> list[Any]:
+        """Gather what pickle can carry."""
+        values: list[Any] = [None] * self.count
+        _speak(lambda: dist.all_gather_object(values, value))
+        return values
 
 
 def _speak(exchange: Callable[[], object]) -> None:
@@ -187,9 +183,42 @@ def common_random_state(seed: Any, processes: Processes) -> np.random.RandomStat
     """
     if processes.count == 1 or isinstance(seed, Integral):
         return check_random_state(seed)
-    own = float(check_random_state(seed).randint(2**31)) if processes.rank == 0 else 0.0
-    (common,) = processes.sum(torch.tensor(own, dtype=torch.float64))
-    return check_random_state(int(common))
+    return check_random_state(processes.gather(check_random_state(seed).randint(2**31))[0])
+
+
+def column_moments(
+    rows: Iterable[NDArray[np.floating]], processes: Processes = ALONE
+) -> ColumnMoments:
+    """Moments of the columns of batches of rows, in all processes together.
+
+    Parameters
+    ----------
+    rows : iterable of array of shape (n, n_features)
+        The batches of this process.
+    processes : Processes, optional
+
+    Raises
+    ------
+    DataError
+        If there are no rows, here or in another process, if the processes' rows have
+        different numbers of columns, or if the variance overflows.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        parts = [ColumnMoments.of(batch) for batch in rows]
+        gathered = processes.gather(ColumnMoments.merge(parts) if parts else None)
+        empty = [rank for rank, part in enumerate(gathered) if part is None]
+        if empty:
+            where = f" in process(es) {empty} of {processes.count}"
+            raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
+        widths = [len(part.mean) for part in gathered]
+        if len(set(widths)) > 1:
+            raise DataError(
+                f"the processes' rows have {widths} columns: all need the same ones"
+            )
+        total = ColumnMoments.merge(gathered)
+    if not np.isfinite(total.scatter).all():
+        raise DataError("the variance of the data overflows; divide the data by a constant")
+    return total
 
 
 @contextmanager

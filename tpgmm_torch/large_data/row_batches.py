@@ -7,6 +7,8 @@ make EM climb on shifting ground.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,8 @@ from sklearn.utils import check_array
 from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.large_data.prefetch import prefetched
 
-__all__ = ["BatchedRows", "Rows", "StoredRows", "are_batches"]
+__all__ = ["BatchedRows", "Rows", "StoredRows", "are_batches", "read_ahead"]
 
 Batch = NDArray[np.floating[Any]]
 
@@ -42,6 +43,37 @@ def are_batches(X: object) -> bool:
     return True
 
 
+def read_ahead[T](source: Iterable[T]) -> Iterator[T]:
+    """Walk through ``source`` in a thread of its own, one item ahead of who asks.
+
+    Yields
+    ------
+    object
+        The same items in the same order; two are in memory, one in use and one being read.
+
+    Raises
+    ------
+    Exception
+        What the source raises, itself, with a note of how many items came before it.
+
+    Examples
+    --------
+    >>> list(read_ahead(range(3)))
+    [0, 1, 2]
+    """
+    iterator, count = iter(source), 0
+    with ThreadPoolExecutor(1, thread_name_prefix="tpgmm-reader") as reader:
+        try:
+            following = reader.submit(lambda: [*islice(iterator, 1)])
+            while item := following.result():
+                following = reader.submit(lambda: [*islice(iterator, 1)])
+                count += 1
+                yield item[0]
+        except Exception as error:
+            error.add_note(f"while reading ahead, after {count} batches")
+            raise
+
+
 class Rows:
     """Batches of rows that can be walked through again and again.
 
@@ -62,7 +94,7 @@ class Rows:
 
     def __iter__(self) -> Iterator[Batch]:
         """The same; what is not in memory is read by a thread, one batch ahead."""
-        return self.batches() if self.in_memory else prefetched(self.batches())
+        return self.batches() if self.in_memory else read_ahead(self.batches())
 
 
 class StoredRows(Rows):

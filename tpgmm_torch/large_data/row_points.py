@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from tpgmm_torch.em.block_gaussians import Chunk, Standardization
-from tpgmm_torch.em.points import Points, StoredPoints
-from tpgmm_torch.large_data.prefetch import prefetched
+from tpgmm_torch.em.parameters import Standardization
+from tpgmm_torch.em.points import Chunk, Points, standardized_chunks
 from tpgmm_torch.large_data.processes import ALONE, Processes
-from tpgmm_torch.large_data.row_batches import Rows
+from tpgmm_torch.large_data.row_batches import Rows, read_ahead
 
 __all__ = ["RowPoints"]
 
@@ -21,17 +21,18 @@ PIECE = 2**14
 
 
 class RowPoints(Points):
-    """Points made of rows anew in each pass: nothing is kept.
+    """Points made of rows: anew in each pass, or once where the rows are in memory.
 
     Parameters
     ----------
     rows : Rows
-    n_points : int
-        Number of rows in this process.
+        Of this process.
+    total : int
+        Number of rows of all processes.
     units : Standardization
         On the device where the points shall be.
     n_components : int
-        Of the mixtures that are evaluated, which decides how large a chunk is.
+        Of all mixtures that are evaluated, which decides how large a chunk is.
     dtype : torch.dtype
     group_size : int, default=1
         So many consecutive rows belong together.
@@ -44,7 +45,7 @@ class RowPoints(Points):
     def __init__(
         self,
         rows: Rows,
-        n_points: int,
+        total: int,
         units: Standardization,
         n_components: int,
         dtype: torch.dtype,
@@ -53,50 +54,55 @@ class RowPoints(Points):
         time_feature: int | None = None,
         processes: Processes = ALONE,
     ) -> None:
-        self.widths = tuple(len(shift) for shift in units.shifts)
+        self.widths, self.total = units.widths, total
         self.dtype, self.device = dtype, units.shifts[0].device
-        self.time_feature, self.processes = time_feature, processes
         self._rows, self._units, self._group_size = rows, units, group_size
+        self._time_feature, self._processes = time_feature, processes
         self._n_components = n_components
-        self._count(n_points)
+        self._kept: list[Chunk] = []
 
     def __iter__(self) -> Iterator[Chunk]:
         """One pass over the rows; those not in memory are prepared one piece ahead."""
-        pieces = self._pieces()
-        for chunks in pieces if self._rows.in_memory else prefetched(pieces):
-            yield from chunks
+        if self._rows.in_memory:
+            self._kept = self._kept or [chunk for piece in self._pieces() for chunk in piece]
+            yield from self._kept
+        else:
+            for piece in read_ahead(self._pieces()):
+                yield from piece
+
+    def combine(self, *sums: Tensor) -> tuple[Tensor, ...]:
+        """Add float64 sums over all processes."""
+        return self._processes.sum(*sums)
+
+    def concatenate(self, rows: Tensor) -> Tensor:
+        """Rows of all processes, in their order."""
+        return self._processes.concatenate(rows)
+
+    def numbers(self) -> NDArray[np.intp]:
+        """Which row of this process each point is, (n,), in the order of a pass."""
+        numbers, start = [], 0
+        for batch in self._rows.batches():
+            numbers.append(start + self._order(batch))
+            start += len(batch)
+        return np.concatenate(numbers)
 
     def _pieces(self) -> Iterator[list[Chunk]]:
         step = max(1, PIECE // self._group_size) * self._group_size
         for batch in self._rows.batches():
             order = self._order(batch)
             for start in range(0, len(batch), step):
-                part = slice(start, start + step)
-                rows, chosen = (batch[part], None) if order is None else (batch, order[part])
-                yield self._units.chunks(
-                    rows, self._n_components, self.dtype, self._group_size, chosen
+                yield standardized_chunks(
+                    batch[order[start : start + step]],
+                    self._units,
+                    self._n_components,
+                    self.dtype,
+                    self._group_size,
                 )
 
-    def stored(self) -> StoredPoints:
-        """The same points kept in memory, standardised once."""
-        return StoredPoints(list(self), self.time_feature, self.processes)
-
-    def numbers(self) -> NDArray[np.intp]:
-        """Which row each point is, (n_points,), in the order of a pass."""
-        found, start = [], 0
-        for batch in self._rows.batches():
-            order = self._order(batch)
-            found.append(start + (np.arange(len(batch)) if order is None else order))
-            start += len(batch)
-        return np.concatenate(found)
-
-    def _order(self, batch: NDArray[np.floating]) -> NDArray[np.intp] | None:
-        """Row numbers by time, groups staying together; None if they are in order already."""
-        if self.time_feature is None:
-            return None
-        times = batch[:: self._group_size, self.time_feature]
-        if (np.diff(times) >= 0).all():
-            return None
-        groups = np.argsort(times, kind="stable")
+    def _order(self, batch: NDArray[np.floating]) -> NDArray[np.intp]:
+        """Row numbers by time, groups staying together."""
+        if self._time_feature is None:
+            return np.arange(len(batch))
+        groups = np.argsort(batch[:: self._group_size, self._time_feature], kind="stable")
         first = groups[:, None] * self._group_size
         return (first + np.arange(self._group_size)).ravel()

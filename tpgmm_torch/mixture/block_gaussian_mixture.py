@@ -2,34 +2,57 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.random import RandomState
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
+from sklearn.base import BaseEstimator, DensityMixin
+from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import validate_data
 from torch import Tensor
 
-from tpgmm_torch.em.ascent import Run
-from tpgmm_torch.em.block_gaussians import Parameters, Standardization, check_blocks
 from tpgmm_torch.em.column_moments import ColumnMoments
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.em.covariance_family import CovarianceFamily
+from tpgmm_torch.em.expectation_maximization import Fit, expectation_maximization
+from tpgmm_torch.em.parameters import Parameters, Standardization, check_blocks
+from tpgmm_torch.em.points import standardized_chunks
+from tpgmm_torch.em.whitening import Whitener
+from tpgmm_torch.exceptions import (
+    ConvergenceWarning,
+    DataError,
+    DegenerateComponentWarning,
+    NotFittedError,
+    ShapeError,
+)
+from tpgmm_torch.large_data.checkpoints import Checkpoint
+from tpgmm_torch.large_data.processes import (
+    ALONE,
+    Processes,
+    column_moments,
+    common_random_state,
+)
 from tpgmm_torch.large_data.row_batches import BatchedRows, Rows, StoredRows, are_batches
-from tpgmm_torch.mixture.checkpoints import Checkpoint
-from tpgmm_torch.mixture.density import MixtureDensity, on_cpu
-from tpgmm_torch.mixture.fitting import Learning, learn_subsets
-from tpgmm_torch.mixture.initial_parameters import GivenStart
+from tpgmm_torch.large_data.row_points import RowPoints
+from tpgmm_torch.mixture.initial_parameters import InitialParameters
+from tpgmm_torch.mixture.initialization import check_distinct, draw_starts
 
 __all__ = ["BlockGaussianMixture", "fit_subsets"]
 
+#: Settings that a checkpoint has to share, beside the blocks and the initial parameters.
+SHAPING = (
+    "n_components", "covariance_type", "tol", "reg_covar", "regularization", "n_init",
+    "init_params", "time_feature", "group_size", "random_state", "dtype",
+)  # fmt: skip
 
-class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
+
+class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     """Gaussian mixture whose covariance is block-diagonal, learned by EM.
 
     The columns are split into P blocks, independent of each other given the component:
@@ -79,9 +102,9 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         Start of the covariances, one array per block. They are brought into the family
         ``covariance_type`` and raised to the regularisation where they are below it.
     random_state : int, RandomState or None, default=None
-        For the starts, for components placed anew, and for :meth:`sample`.
+        For the starts, for components that are reseeded, and for :meth:`sample`.
     warm_start : bool, default=False
-        Continue from the last fit instead of starting anew.
+        Continue from the last fit instead of from the beginning.
     verbose : int, default=0
         1 prints a line per start, 2 also one per iteration.
     dtype : {"float64", "float32"}, default="float64"
@@ -103,8 +126,8 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         Mean log-likelihood of the training data under the mixture before the last M step,
         as in scikit-learn; ``score`` of the result is not below it.
     lower_bounds_ : list of float
-        Its history, which never falls. Where a component placed anew lowers it, the
-        history begins again at that point.
+        Its history, which never falls. Where reseeding a component lowers it, the history
+        begins again at that point.
     n_features_in_ : int
 
     Warns
@@ -112,7 +135,7 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
     ConvergenceWarning
         If the best start did not converge.
     DegenerateComponentWarning
-        If one of its components lost its data and was placed anew.
+        If one of its components lost its data and was reseeded.
 
     Examples
     --------
@@ -216,9 +239,11 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         defaults: dict[str, Any] = {"n_components": len(weights), "blocks": widths}
         model = cls(**(defaults | settings))
         widths = check_blocks(model.blocks, sum(widths))
-        given = GivenStart.checked(weights, means, covariances, model.n_components, widths)
+        given = InitialParameters.checked(
+            weights, means, covariances, model.n_components, widths
+        )
         model.n_features_in_ = sum(widths)
-        model._set(given.over(Parameters.standard(model.n_components, widths)))
+        model._set(given.over(None))
         return model
 
     def fit(
@@ -234,8 +259,8 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features), or iterable of such arrays
-            Batches, for data larger than memory: each ``iter(X)`` has to give the same ones
-            anew, one pass per iteration of EM.
+            Batches, for data larger than memory: each ``iter(X)`` has to give the same ones,
+            from the first on, in one pass per iteration of EM.
         y : Ignored
         checkpoint : Checkpoint, optional
             Where to keep the state of EM, and to go on from if there is one.
@@ -298,29 +323,138 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         ShapeError, DataError, ModelFileError, DistributedError
             As :meth:`fit`.
         """
-        moments = moments or ColumnMoments.of_batches(rows, processes)
-        learning = self._learning(rows, moments, processes)
-        self._take(learning.runs(checkpoint), learning.units)
-        return self
+        moments = moments or column_moments(rows, processes)
+        units = self._units(rows, moments)
+        family = self._family(units)
+        points = self._points(rows, units, moments.count, processes=processes)
+        fits, after = None, None
+        if checkpoint is not None:
+            settings: dict[str, Any] = {name: getattr(self, name) for name in SHAPING}
+            settings |= {"blocks": units.widths, "start": self._initial_parameters()}
+            fits = checkpoint.resume(settings, moments, processes)
 
-    def _learning(
-        self, rows: Rows, moments: ColumnMoments, processes: Processes = ALONE
-    ) -> Learning:
-        known = (self.weights_init, self.means_init, self.covariances_init)
+            def after(fits: Sequence[Fit]) -> None:
+                if processes.rank == 0:
+                    checkpoint.keep(fits, settings, moments, self.max_iter)
+
+        fits = fits or self._starts(rows, moments, units, family, processes)
+        expectation_maximization(
+            fits, points, family, group_size=self.group_size, after=after, **self._loop()
+        )
+        return self._take_best(fits, units)
+
+    def _units(self, rows: Rows, moments: ColumnMoments) -> Standardization:
+        """The units in which the mixture is learned."""
+        if moments.count < 2:
+            raise DataError("the data hold 1 sample; a mixture is learned from at least 2")
+        if rows.n_rows % self.group_size:
+            raise ShapeError(
+                f"{rows.n_rows} rows are no multiple of group_size={self.group_size}"
+            )
+        units = moments.standardization(
+            check_blocks(self.blocks, len(moments.mean)),
+            isotropic=self.covariance_type == "spherical",
+        )
+        return units.to(torch.device(self.device))
+
+    def _family(self, units: Standardization) -> CovarianceFamily:
+        """The covariances that are admitted, in those units."""
+        return CovarianceFamily.regularized(
+            self.covariance_type,
+            units,
+            self.reg_covar,
+            relative=self.regularization == "relative",
+            dtype=getattr(torch, self.dtype),
+        )
+
+    def _points(
+        self,
+        rows: Rows,
+        units: Standardization,
+        total: int,
+        *,
+        group_size: int | None = None,
+        processes: Processes = ALONE,
+    ) -> RowPoints:
+        """The rows as EM walks through them, sorted by time where there is such a column."""
+        return RowPoints(
+            rows,
+            total,
+            units,
+            self.n_components,
+            getattr(torch, self.dtype),
+            group_size=group_size or self.group_size,
+            time_feature=self.time_feature if self.time_feature < units.widths[0] else None,
+            processes=processes,
+        )
+
+    def _initial_parameters(self) -> tuple[Any, Any, Any]:
+        """Weights, means and covariances as far as they are given, else None."""
         if self.warm_start and hasattr(self, "weights_"):
-            known = (self.weights_, self.means_, self.covariances_)
-        return Learning(self.get_params(deep=False), known, rows, moments, processes)
+            return self.weights_, self.means_, self.covariances_
+        return self.weights_init, self.means_init, self.covariances_init
 
-    def _take(self, runs: Sequence[Run], units: Standardization) -> None:
-        """Take over the best of the runs."""
-        best = max(runs, key=lambda run: run.bound)
-        self.n_features_in_ = sum(len(shift) for shift in units.shifts)
+    def _starts(
+        self,
+        rows: Rows,
+        moments: ColumnMoments,
+        units: Standardization,
+        family: CovarianceFamily,
+        processes: Processes = ALONE,
+    ) -> list[Fit]:
+        """Where EM starts, drawn as far as it is not given."""
+        given = InitialParameters.checked(
+            *self._initial_parameters(), self.n_components, units.widths
+        ).standardize(units)
+        check_distinct(rows, moments.count, self.n_components, processes)
+        rng = common_random_state(self.random_state, processes)
+        drawn: Sequence[Parameters | None] = [None]
+        if not given.complete:
+            drawn = draw_starts(
+                self.init_params,
+                self.n_init,
+                rows,
+                moments.count,
+                units,
+                family,
+                rng,
+                n_components=self.n_components,
+                time_feature=self.time_feature,
+                group_size=self.group_size,
+                processes=processes,
+            )
+        return [
+            Fit(family.admit(given.over(start)), RandomState(rng.randint(2**31 - 1)))
+            for start in drawn
+        ]
+
+    def _loop(self) -> dict[str, Any]:
+        """The settings of the loop of EM."""
+        return {"tol": self.tol, "max_iter": self.max_iter, "verbose": self.verbose}
+
+    def _take_best(self, fits: Sequence[Fit], units: Standardization) -> Self:
+        """Take over the best of the fits, and warn of what the user should know."""
+        best = max(fits, key=lambda fit: fit.bounds[-1])
+        self.n_features_in_ = sum(units.widths)
         self._set(units.restore(best.parameters))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
-        self.lower_bound_ = best.bound - units.log_volume
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
-        for category, message in best.complaints():
-            warnings.warn(message, category, stacklevel=4)
+        self.lower_bound_ = self.lower_bounds_[-1]
+        if best.reseedings:
+            warnings.warn(
+                f"reseeded for having lost their data: {'; '.join(best.reseedings)}; "
+                "use fewer components, a larger reg_covar or another start",
+                DegenerateComponentWarning,
+                stacklevel=4,
+            )
+        if not best.converged:
+            warnings.warn(
+                f"EM did not converge in {best.n_iter} iterations: raise max_iter or tol, or "
+                "use another start",
+                ConvergenceWarning,
+                stacklevel=4,
+            )
+        return self
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
         """Fit, and return :meth:`predict` of the same points."""
@@ -332,6 +466,105 @@ class BlockGaussianMixture(MixtureDensity, BaseEstimator):  # type: ignore[misc]
         self.weights_ = parameters.weights.to(**target)
         self.means_ = [mean.to(**target) for mean in parameters.means]
         self.covariances_ = [covariance.to(**target) for covariance in parameters.covariances]
+
+    def score_samples(self, X: Any) -> NDArray[np.floating]:
+        """Log-density of each point.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        array of shape (n_samples,)
+        """
+        return _to_numpy(torch.logsumexp(joint, 0) for joint in self._log_joint(X))
+
+    def score(self, X: Any, y: Any = None) -> float:
+        """Mean log-density of the points X (n_samples, n_features)."""
+        return float(self.score_samples(X).mean(dtype=np.float64))
+
+    def predict_proba(self, X: Any) -> NDArray[np.floating]:
+        """Responsibilities of the components for each point.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        array of shape (n_samples, K)
+        """
+        return _to_numpy(torch.softmax(joint, 0).T for joint in self._log_joint(X))
+
+    def predict(self, X: Any) -> NDArray[np.int64]:
+        """Most probable component of each of the points X, shape (n_samples,)."""
+        return _to_numpy(joint.argmax(0) for joint in self._log_joint(X))
+
+    @property
+    def n_parameters_(self) -> int:
+        """Number of free parameters: weights, means, and covariances of all blocks."""
+        n_components, widths = len(self._fitted().weights), [m.shape[1] for m in self.means_]
+        per_block = {
+            "full": [n_components * width * (width + 1) // 2 for width in widths],
+            "tied": [width * (width + 1) // 2 for width in widths],
+            "diag": [n_components * width for width in widths],
+            "spherical": [n_components for _ in widths],
+        }[self.covariance_type]
+        return n_components - 1 + n_components * sum(widths) + sum(per_block)
+
+    def bic(self, X: Any) -> float:
+        """Bayesian information criterion on X (n_samples, n_features); lower is better."""
+        values = self.score_samples(X)
+        penalty = self.n_parameters_ * math.log(len(values))
+        return -2 * float(values.sum(dtype=np.float64)) + penalty
+
+    def aic(self, X: Any) -> float:
+        """Akaike information criterion on X (n_samples, n_features); lower is better."""
+        values = self.score_samples(X)
+        return -2 * float(values.sum(dtype=np.float64)) + 2 * self.n_parameters_
+
+    def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
+        """Draw points from the mixture.
+
+        Parameters
+        ----------
+        n_samples : int, default=1
+
+        Returns
+        -------
+        X : array of shape (n_samples, n_features)
+        labels : array of shape (n_samples,)
+            The components that they came from, in ascending order.
+        """
+        parameters = self._fitted()
+        if not isinstance(n_samples, Integral) or n_samples < 1:
+            raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
+        X, labels = parameters.sample(n_samples, check_random_state(self.random_state))
+        return X.astype(self.dtype), labels
+
+    def _fitted(self) -> Parameters:
+        """The fitted mixture in float64."""
+        if not hasattr(self, "weights_"):
+            raise NotFittedError(
+                f"this {type(self).__name__} is not fitted yet; call fit before this method"
+            )
+        return Parameters.from_covariances(
+            self.weights_.double(),
+            [mean.double() for mean in self.means_],
+            [covariance.double() for covariance in self.covariances_],
+        )
+
+    def _log_joint(self, X: Any) -> Iterator[Tensor]:
+        """Log of weight times density, (K, n), chunk by chunk."""
+        parameters = self._fitted()
+        points = validate_data(self, on_cpu(X), dtype=[np.float64, np.float32], reset=False)
+        units = Standardization.of_mixture(parameters)
+        whitener = Whitener(units.standardize(parameters), self.weights_.dtype)
+        for chunk in standardized_chunks(
+            points, units, len(parameters.weights), self.weights_.dtype
+        ):
+            yield whitener.log_joint(chunk)[0] - units.log_volume
 
 
 def fit_subsets(
@@ -365,13 +598,43 @@ def fit_subsets(
         As :meth:`BlockGaussianMixture.fit_rows`.
     """
     rows = StoredRows(X)
-    whole = mixtures[0]._learning(rows, ColumnMoments.of_batches(rows))
-    whole = replace(whole, settings={**whole.settings, "group_size": group_size})
-    own = [StoredRows(X[chosen]) for chosen in members]
-    moments = moments or [ColumnMoments.of_batches(part) for part in own]
-    parts = [
-        mixture._learning(part, known)
-        for mixture, part, known in zip(mixtures, own, moments, strict=True)
-    ]
-    for mixture, runs in zip(mixtures, learn_subsets(whole, parts, members), strict=True):
-        mixture._take(runs, whole.units)
+    first = mixtures[0]
+    units = column_moments(rows).standardization(
+        check_blocks(first.blocks, X.shape[1]), isotropic=first.covariance_type == "spherical"
+    )
+    units = units.to(torch.device(first.device))
+    points = first._points(rows, units, len(X), group_size=group_size)
+    parts = [StoredRows(X[own]) for own in members]
+    moments = moments or [column_moments(part) for part in parts]
+    fits: list[list[Fit]] = []
+    families: list[CovarianceFamily] = []
+    for mixture, part, known in zip(mixtures, parts, moments, strict=True):
+        own_units = mixture._units(part, known)
+        family = mixture._family(own_units)
+        starts = mixture._starts(part, known, own_units, family)
+        for fit in starts:
+            fit.parameters = units.standardize(own_units.restore(fit.parameters))
+        fits.append(starts)
+        families += [family.rescaled(own_units, units)] * len(starts)
+    belongs = torch.from_numpy(members[:, points.numbers()]).to(points.device)
+    expectation_maximization(
+        [fit for starts in fits for fit in starts],
+        points,
+        families,
+        group_size=group_size,
+        members=belongs.repeat_interleave(len(fits[0]), 0),
+        **first._loop(),
+    )
+    for mixture, starts in zip(mixtures, fits, strict=True):
+        mixture._take_best(starts, units)
+
+
+def on_cpu(X: Any) -> Any:
+    """X as an array if it is a tensor, as it is if not."""
+    return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
+
+
+def _to_numpy(chunks: Iterator[Tensor]) -> NDArray[Any]:
+    """Put the results of the chunks together."""
+    result: NDArray[Any] = torch.cat(list(chunks)).cpu().numpy()
+    return result

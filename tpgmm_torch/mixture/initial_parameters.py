@@ -1,4 +1,4 @@
-"""Where EM starts as far as the user says it."""
+"""Initial parameters that the user gives, in place of what would be drawn."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,15 +7,15 @@ from typing import Any
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import as_tensor
-from tpgmm_torch.em.block_gaussians import Parameters, Standardization
+from tpgmm_torch.em.parameters import Parameters, Standardization
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["GivenStart"]
+__all__ = ["InitialParameters"]
 
 
 @dataclass(frozen=True)
-class GivenStart:
-    """What is known of the start, in place of what would be drawn; None is unknown.
+class InitialParameters:
+    """Weights, means and covariances as far as they are given; None is to be drawn.
 
     Parameters
     ----------
@@ -30,11 +30,6 @@ class GivenStart:
     means: tuple[Tensor, ...] | None
     covariances: tuple[Tensor, ...] | None
 
-    @property
-    def complete(self) -> bool:
-        """Whether nothing has to be drawn."""
-        return not (self.weights is None or self.means is None or self.covariances is None)
-
     @classmethod
     def checked(
         cls,
@@ -43,7 +38,7 @@ class GivenStart:
         covariances: Any,
         n_components: int,
         widths: Sequence[int],
-    ) -> "GivenStart":
+    ) -> "InitialParameters":
         """Convert array-likes to float64 and check them.
 
         Raises
@@ -53,38 +48,46 @@ class GivenStart:
         DataError
             If weights are negative or do not add up to 1, or a value is not finite.
         """
-        first = [(n_components, width) for width in widths]
-        second = [(n_components, width, width) for width in widths]
-        given = None if weights is None else _tensor(weights, (n_components,), "weights")
-        if given is not None and (
-            bool((given < 0).any()) or abs(float(given.sum()) - 1) > 1e-3
-        ):
-            raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
+        if weights is not None:
+            given = _tensor(weights, (n_components,), "weights")
+            if bool((given < 0).any()) or abs(float(given.sum()) - 1) > 1e-3:
+                raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
+            weights = given / given.sum()
+        vectors = [(n_components, width) for width in widths]
+        matrices = [(n_components, width, width) for width in widths]
         return cls(
-            None if given is None else given / given.sum(),
-            _tensors(means, first, "means"),
-            _tensors(covariances, second, "covariances"),
+            weights,
+            _tensors(means, vectors, "means"),
+            _tensors(covariances, matrices, "covariances"),
         )
 
-    def standardize(self, units: Standardization) -> "GivenStart":
+    @property
+    def complete(self) -> bool:
+        """Whether nothing has to be drawn."""
+        return not (self.weights is None or self.means is None or self.covariances is None)
+
+    def standardize(self, units: Standardization) -> "InitialParameters":
         """The same in standardised units, on their device."""
         means, covariances = self.means, self.covariances
         parts = list(zip(units.shifts, units.scales, strict=True))
         if means is not None:
             means = tuple(
-                (m.to(shift) - shift) / scale
-                for m, (shift, scale) in zip(means, parts, strict=True)
+                (mean.to(shift) - shift) / scale
+                for mean, (shift, scale) in zip(means, parts, strict=True)
             )
         if covariances is not None:
             covariances = tuple(
-                c.to(scale) / (scale[:, None] * scale)
-                for c, (_, scale) in zip(covariances, parts, strict=True)
+                covariance.to(scale) / (scale[:, None] * scale)
+                for covariance, (_, scale) in zip(covariances, parts, strict=True)
             )
         weights = None if self.weights is None else self.weights.to(units.shifts[0])
-        return GivenStart(weights, means, covariances)
+        return InitialParameters(weights, means, covariances)
 
-    def over(self, drawn: Parameters) -> Parameters:
-        """The drawn start with what is given in its place."""
+    def over(self, drawn: Parameters | None) -> Parameters:
+        """What is given in the place of what was drawn, which may be None if all is given."""
+        if self.weights is not None and self.means is not None and self.covariances is not None:
+            return Parameters.from_covariances(self.weights, self.means, self.covariances)
+        assert drawn is not None
         return Parameters.from_covariances(
             drawn.weights if self.weights is None else self.weights,
             drawn.means if self.means is None else self.means,

@@ -11,25 +11,23 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
 from tpgmm_torch.large_data.row_batches import Rows, StoredRows
-from tpgmm_torch.large_data.row_file import SpooledRows
+from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import Instants
 from tpgmm_torch.training.local_data import at_equal_phase, constant_columns, local_data
 
 __all__ = [
-    "DemonstrationBatches",
     "LearningRows",
-    "check_like",
+    "check_shares",
+    "checked_batches",
     "gather_rows",
     "rows_in_memory",
     "share_one_grid",
@@ -60,38 +58,39 @@ class LearningRows:
     processes: Processes
 
 
-class DemonstrationBatches:
-    """Batches of like demonstrations, checked as they come.
+def checked_batches(
+    batches: Iterable[Sequence[Demonstration]],
+) -> Iterator[list[Demonstration]]:
+    """Batches of like demonstrations, checked as they come; empty ones are left out.
 
     Parameters
     ----------
     batches : iterable of sequence of Demonstration
+        They are walked through once.
+
+    Yields
+    ------
+    list of Demonstration
+        With their joints in the order of the first demonstration of all.
 
     Raises
     ------
     DataError, ShapeError
-        While walking: if demonstrations differ in joints or frames from those before; the
-        message says in which batch.
+        If demonstrations differ in joints or frames from those before; the message says in
+        which batch.
     """
-
-    def __init__(self, batches: Iterable[Sequence[Demonstration]]) -> None:
-        self._batches = batches
-
-    def __iter__(self) -> Iterator[list[Demonstration]]:
-        """One pass; joints are in the order of the first demonstration, none is empty."""
-        first: Demonstration | None = None
-        for number, batch in enumerate(self._batches):
-            if isinstance(batch, Sequence) and not batch:
-                continue
-            known = [] if first is None else [first]
-            try:
-                checked = check_demonstrations([*known, *batch])[len(known) :]
-            except (ValueError, TypeError) as error:
-                after = ", counted after the first of all" if known else ""
-                kind = type(error) if isinstance(error, DataError) else DataError
-                raise kind(f"batch {number} of demonstrations{after}: {error}") from error
-            first = first or checked[0]
-            yield checked
+    first: list[Demonstration] = []
+    for number, batch in enumerate(batches):
+        if isinstance(batch, Sequence) and not batch:
+            continue
+        try:
+            checked = check_demonstrations([*first, *batch])[len(first) :]
+        except (ValueError, TypeError) as error:
+            after = ", counted after the first of all" if first else ""
+            kind = type(error) if isinstance(error, DataError) else DataError
+            raise kind(f"batch {number} of demonstrations{after}: {error}") from error
+        first = first or [checked[0]]
+        yield checked
 
 
 def split_batches(X: Any) -> tuple[Any, Iterable[Sequence[Demonstration]] | None]:
@@ -122,7 +121,7 @@ def split_batches(X: Any) -> tuple[Any, Iterable[Sequence[Demonstration]] | None
     return ([] if first is None else list(chain([first], X))), None
 
 
-def check_like(batch: Sequence[Demonstration] | None, processes: Processes) -> None:
+def check_shares(batch: Sequence[Demonstration] | None, processes: Processes) -> None:
     """Refuse a share without demonstrations, and shares that differ in joints or frames.
 
     Parameters
@@ -136,24 +135,23 @@ def check_like(batch: Sequence[Demonstration] | None, processes: Processes) -> N
     DataError
         In all processes, whichever of them it is.
     """
-    if batch is None:
-        own = ""
-    else:
+    text = ""
+    if batch is not None:
         first = batch[0]
         joints = list(first.joint_names or [f"{first.n_joints} without names"])
-        own = f"joints {joints}, frames {sorted(first.frames)}"
-    found = processes.texts(own)
-    without = [rank for rank, text in enumerate(found) if not text]
-    if without:
+        text = f"joints {joints}, frames {sorted(first.frames)}"
+    texts = processes.gather(text)
+    if "" in texts:
+        without = [rank for rank, text in enumerate(texts) if not text]
         where = f" in process(es) {without} of {processes.count}"
         raise DataError(
             f"there are no demonstrations{where if processes.count > 1 else ''}: each process "
             "needs at least one"
         )
-    for rank, text in enumerate(found):
-        if text != found[0]:
+    for rank, text in enumerate(texts):
+        if text != texts[0]:
             raise DataError(
-                f"process {rank} has demonstrations with {text}, process 0 with {found[0]}"
+                f"process {rank} has demonstrations with {text}, process 0 with {texts[0]}"
             )
 
 
@@ -213,7 +211,7 @@ def gather_rows(
     batches: Iterable[Sequence[Demonstration]],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    spool: SpooledRows,
+    file: RowFile,
     processes: Processes,
     *,
     responsibilities: str = "auto",
@@ -226,7 +224,7 @@ def gather_rows(
         Of this process, at least one.
     operators : sequence of Operator
     kinematics : Kinematics
-    spool : SpooledRows
+    file : RowFile
         Where the local data go.
     processes : Processes
     responsibilities : {"auto", "instant", "point"}
@@ -236,34 +234,40 @@ def gather_rows(
     DataError
         If ``responsibilities="instant"`` and the demonstrations have different time grids.
     """
-    reference, grid = None, torch.empty(0)
-    durations: list[float] = []
-    lengths: list[int] = []
-    uneven = 0.0
+    reference, expected = torch.empty(0), None
+    spans: list[tuple[float, int, int]] = []  # duration, first and last row of each
+    aligned = True
     for batch in batches:
-        if reference is None:
-            reference, grid = _first(batch[0], operators, kinematics, processes)
-            widths = [1 + operator.dimension(kinematics) for operator in operators]
-            sides = at_equal_phase([block[:, 1:] for block in reference.split(widths, 1)])
-        uneven += sum(not _equal(demonstration.time, grid) for demonstration in batch)
-        durations += [demonstration.duration for demonstration in batch]
-        lengths += map(len, batch)
-        for rows in local_data(batch, operators, kinematics, sides):
-            spool.append(rows.cpu().numpy())
-    assert reference is not None
-    moments = ColumnMoments.of_batches(spool, processes)
-    smallest, largest = (
-        torch.from_numpy(ends).to(reference) for ends in (moments.smallest, moments.largest)
+        if expected is None:
+            # process 0 has the first demonstration of all, whose hemispheres all follow
+            blocks = [operator.local(batch[0], kinematics) for operator in operators]
+            first = [tensor.cpu() for tensor in (batch[0].time, *blocks)]
+            grid, *blocks = processes.gather(first)[0]
+            expected = at_equal_phase([block.to(kinematics.lower) for block in blocks])
+        aligned = aligned and all(torch.equal(item.time.cpu(), grid) for item in batch)
+        for demonstration, rows in zip(
+            batch, local_data(batch, operators, kinematics, expected), strict=True
+        ):
+            spans.append((demonstration.duration, file.n_rows, file.n_rows + len(rows)))
+            file.append(rows.cpu().numpy())
+            reference = reference if len(reference) else rows
+    aligned = all(processes.gather(aligned))
+    reference = processes.gather(reference.cpu())[0].to(reference)
+    widths = [1 + operator.dimension(kinematics) for operator in operators]
+    moments = column_moments(file, processes)
+    constant = constant_columns(
+        torch.from_numpy(moments.smallest).to(reference),
+        torch.from_numpy(moments.largest).to(reference),
+        widths,
     )
-    constant = constant_columns(smallest, largest, widths)
-    spool.make_constant(constant.cpu().numpy(), reference[0].cpu().numpy())
-    (total,) = processes.sum(torch.tensor(uneven, dtype=torch.float64))
-    time = _typical_time(spool, durations, lengths, processes).to(reference)
-    if responsibilities == "point" or (total > 0 and responsibilities == "auto"):
-        return LearningRows(spool, 1, time, processes)
-    _check_aligned(float(total) == 0)
+    file.make_constant(constant.cpu().numpy(), reference[0].cpu().numpy())
+    time = _typical_time(file, spans, processes).to(reference)
+    if responsibilities == "instant":
+        _check_aligned(aligned)
+    if responsibilities == "point" or not aligned:
+        return LearningRows(file, 1, time, processes)
     instants = Instants(torch.where(constant, reference[0], reference).cpu().numpy(), widths)
-    instants.add(spool)
+    instants.add(file)
     points, size = instants.points(processes)
     own = processes.share(range(len(points) // size))
     share = StoredRows(points[own[0] * size : (own[-1] + 1) * size])
@@ -279,50 +283,16 @@ def _check_aligned(aligned: bool) -> None:
         )
 
 
-def _first(
-    demonstration: Demonstration,
-    operators: Sequence[Operator],
-    kinematics: Kinematics,
-    processes: Processes,
-) -> tuple[Tensor, Tensor]:
-    """Rows and times of the first demonstration of all, that of process 0."""
-    time = demonstration.time.to(kinematics.lower)
-    blocks = []
-    for operator in operators:
-        blocks += [time[:, None], operator.local(demonstration, kinematics)]
-    rows, exact = torch.cat(blocks, 1), demonstration.time.double().cpu()
-    if processes.rank > 0:
-        rows, exact = rows[:0], exact[:0]
-    rows = processes.concatenate(rows.double().cpu()).to(rows)
-    return rows, processes.concatenate(exact)
-
-
-def _equal(time: Tensor, grid: Tensor) -> bool:
-    return torch.equal(time.double().cpu(), grid)
-
-
 def _typical_time(
-    spool: SpooledRows, durations: list[float], lengths: list[int], processes: Processes
+    file: RowFile, spans: Sequence[tuple[float, int, int]], processes: Processes
 ) -> Tensor:
     """The time grid of the demonstration of median duration, of those of all processes."""
-    owners = torch.full((len(durations),), processes.rank, dtype=torch.float64)
-    own = torch.tensor([durations, lengths], dtype=torch.float64).T
-    everyone = processes.concatenate(torch.cat([own, owners[:, None]], 1))
-    chosen = int(torch.sort(everyone[:, 0], stable=True).indices[len(everyone) // 2])
-    owner, before = everyone[chosen, 2], everyone[:chosen]
-    time = np.empty(0)
-    if int(owner) == processes.rank:
-        start = int(before[before[:, 2] == owner, 1].sum())
-        time = _slice(spool, start, start + int(everyone[chosen, 1]))
-    return processes.concatenate(torch.from_numpy(time))
-
-
-def _slice(rows: Rows, start: int, stop: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """First column of the rows from ``start`` to ``stop``."""
-    parts, at = [], 0
-    for batch in rows:
-        parts.append(batch[max(0, start - at) : max(0, stop - at), 0])
-        at += len(batch)
-        if at >= stop:
-            break
-    return np.concatenate(parts).astype(np.float64)
+    everyone = [
+        (duration, rank, start, stop)
+        for rank, each in enumerate(processes.gather(spans))
+        for duration, start, stop in each
+    ]
+    everyone.sort(key=lambda span: span[0])
+    _, owner, start, stop = everyone[len(everyone) // 2]
+    time = file.read(start, stop)[:, 0] if processes.rank == owner else None
+    return torch.from_numpy(processes.gather(time)[owner])

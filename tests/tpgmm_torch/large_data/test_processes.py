@@ -90,7 +90,7 @@ def test_a_process_that_dies_ends_the_job(tmp_path):
 def test_without_torchrun_there_is_one_process():
     with joined_processes() as processes:
         assert processes is ALONE
-        assert processes.texts("a word, µ") == ["a word, µ"]
+        assert processes.gather("a word, µ") == ["a word, µ"]
     with pytest.raises(DistributedError, match=r"torchrun.*init_process_group"):
         GroupOfProcesses()
 

@@ -9,7 +9,7 @@ import torch
 from tests.support.blocks import WIDTHS, fitted
 from tpgmm_torch import BlockGaussianMixture
 from tpgmm_torch.exceptions import ConvergenceWarning, DataError, ShapeError
-from tpgmm_torch.large_data.prefetch import prefetched
+from tpgmm_torch.large_data.row_batches import read_ahead
 
 SETTINGS = {"blocks": WIDTHS, "max_iter": 12, "tol": 0.0, "random_state": 0}
 
@@ -196,7 +196,7 @@ def test_reading_ahead_stops_when_nobody_asks_any_more():
             yield number
 
     before = threading.active_count()
-    walk = prefetched(source())
+    walk = read_ahead(source())
     assert [next(walk), next(walk)] == [0, 1]
     walk.close()
     assert threading.active_count() == before

@@ -1,17 +1,25 @@
-"""The mixture as an estimator: scikit-learn's contract, symmetries, starts, bad input."""
+"""The mixture as an estimator: scikit-learn's contract, starts, groups, folds, bad input."""
 
 import json
 import os
 import pickle
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from scipy.special import logsumexp, softmax
+from scipy.stats import multivariate_normal
 from sklearn.base import clone
 
 from tests.support.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
+from tests.support.em_reference import WIDTHS as FOLD_WIDTHS
+from tests.support.em_reference import counted_passes, movements
 from tpgmm_torch.exceptions import (
     ConvergenceWarning,
     DataError,
@@ -19,7 +27,7 @@ from tpgmm_torch.exceptions import (
     NotFittedError,
     ShapeError,
 )
-from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture, fit_subsets
 
 BATTERY = """
 import json, warnings
@@ -41,7 +49,7 @@ def test_every_check_of_scikit_learn_runs_and_passes():
     assert done.returncode == 0, done.stderr
     results = json.loads(done.stdout.splitlines()[-1])
     assert [result for result in results if result[1] != "passed"] == []
-    assert len(results) >= 40
+    assert len(results) == 41
 
 
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
@@ -145,7 +153,7 @@ def test_a_warm_start_continues_where_the_last_fit_ended(clusters):
     assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-10)
 
 
-def test_a_dead_component_is_placed_anew_and_reported(clusters):
+def test_a_dead_component_is_reseeded_and_reported(clusters):
     far = np.full((1, 5), 1e7)
     means = np.concatenate([clusters[:2], far])
     model = BlockGaussianMixture(
@@ -167,7 +175,7 @@ def test_a_dead_component_is_placed_anew_and_reported(clusters):
     torch.testing.assert_close(again.means_, model.means_, rtol=0, atol=0)
 
 
-def test_a_component_on_a_single_point_is_placed_anew(clusters):
+def test_a_component_on_a_single_point_is_reseeded(clusters):
     outlier = np.concatenate([clusters, clusters[:1] + 1e3])
     tiny = 1e-6 * np.diag(outlier.var(0))
     wide = np.diag(outlier.var(0))
@@ -321,3 +329,370 @@ def test_a_wrong_number_of_samples_is_refused(clusters):
         model.sample(0)
     with pytest.raises(ValueError, match="4 features"):
         model.predict(clusters[:, :4])
+
+
+# Rows that share one responsibility: ``group_size`` consecutive ones.
+
+GROUP, K = 4, 3
+REG = 1e-3
+
+
+def grouped_data(n_groups: int = 45, group: int = GROUP, seed: int = 0) -> np.ndarray:
+    """Rows in groups that lie together, (n_groups * group, 5)."""
+    rng = np.random.default_rng(seed)
+    centres = rng.standard_normal((3, 5)) * 2
+    rows = centres[np.arange(n_groups) * 3 // n_groups].repeat(group, 0)
+    return rows + rng.standard_normal((n_groups * group, 5)) @ rng.standard_normal((5, 5))
+
+
+def fit_grouped(X: np.ndarray, **options) -> BlockGaussianMixture:
+    with warnings.catch_warnings():
+        for category in (ConvergenceWarning, DegenerateComponentWarning):
+            warnings.simplefilter("ignore", category)
+        return BlockGaussianMixture(**{"n_components": K, "blocks": WIDTHS, **options}).fit(X)
+
+
+def joint_density(X, weights, means, covariances) -> np.ndarray:
+    """Log of weight times density of each row, (n, K)."""
+    blocks = np.split(X, np.cumsum(WIDTHS)[:-1], axis=1)
+    return np.stack(
+        [
+            np.log(weights[k])
+            + sum(
+                multivariate_normal(means[j][k], covariances[j][k]).logpdf(block)
+                for j, block in enumerate(blocks)
+            )
+            for k in range(len(weights))
+        ],
+        axis=1,
+    )
+
+
+def oracle_of_groups(X, weights, means, covariances, n_iter):
+    """EM as the definition says: one responsibility per group, counted for each of its rows."""
+    blocks = np.split(X, np.cumsum(WIDTHS)[:-1], axis=1)
+    bounds = []
+    for _ in range(n_iter):
+        # the logarithm of the geometric mean is the mean of the logarithms
+        log_joint = joint_density(X, weights, means, covariances)
+        shared = log_joint.reshape(-1, GROUP, len(weights)).mean(1)
+        bounds.append(logsumexp(shared, axis=1).mean())
+        gamma = softmax(shared, axis=1).repeat(GROUP, 0)
+        mass = gamma.sum(0)
+        weights = mass / len(X)
+        means = [(gamma.T @ block) / mass[:, None] for block in blocks]
+        covariances = [
+            np.stack(
+                [
+                    (gamma[:, k, None] * (block - mean[k])).T @ (block - mean[k]) / mass[k]
+                    + REG * np.eye(block.shape[1])
+                    for k in range(len(mass))
+                ]
+            )
+            for block, mean in zip(blocks, means, strict=True)
+        ]
+    return weights, means, covariances, bounds
+
+
+@pytest.mark.parametrize("n_iter", [1, 2, 12])
+def test_groups_equal_plain_em_with_shared_responsibilities(n_iter):
+    X = grouped_data()
+    start = {
+        "weights_init": np.array([0.5, 0.3, 0.2]),
+        "means_init": np.split(X[[3, 80, 170]], [2], axis=1),
+        "covariances_init": [np.stack([3.0 * np.eye(width)] * K) for width in WIDTHS],
+    }
+    model = fit_grouped(
+        X,
+        group_size=GROUP,
+        max_iter=n_iter,
+        tol=0.0,
+        reg_covar=REG,
+        regularization="absolute",
+        **start,
+    )
+    weights, means, covariances, bounds = oracle_of_groups(X, *start.values(), n_iter)
+    np.testing.assert_allclose(model.weights_, weights, rtol=1e-8)
+    for j in range(2):
+        np.testing.assert_allclose(model.means_[j], means[j], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(model.covariances_[j], covariances[j], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(model.lower_bounds_, bounds, rtol=1e-9)
+
+
+def test_groups_of_one_are_points():
+    X = grouped_data()
+    alone, plain = fit_grouped(X, group_size=1), fit_grouped(X)
+    assert torch.equal(alone.weights_, plain.weights_)
+    for name in ("means_", "covariances_"):
+        pairs = zip(getattr(alone, name), getattr(plain, name), strict=True)
+        assert all(torch.equal(one, other) for one, other in pairs)
+    assert alone.lower_bounds_ == plain.lower_bounds_
+
+
+def test_groups_are_another_model_than_points():
+    X = grouped_data()
+    assert not torch.allclose(
+        fit_grouped(X, group_size=GROUP).means_[0], fit_grouped(X).means_[0], atol=1e-3
+    )
+
+
+def test_groups_of_equal_rows_are_their_rows():
+    X = grouped_data(group=1)
+    repeated = fit_grouped(X.repeat(GROUP, 0), group_size=GROUP)
+    once = fit_grouped(X)
+    torch.testing.assert_close(repeated.weights_, once.weights_)
+    torch.testing.assert_close(repeated.means_, once.means_)
+    assert repeated.lower_bound_ == pytest.approx(once.lower_bound_)
+
+
+def test_order_within_groups_and_of_groups_does_not_matter():
+    X = grouped_data()
+    start = {
+        "weights_init": np.full(K, 1 / K),
+        "means_init": np.split(X[[3, 80, 170]], [2], axis=1),
+        "covariances_init": [np.stack([3.0 * np.eye(width)] * K) for width in WIDTHS],
+        "group_size": GROUP,
+    }
+    rng = np.random.default_rng(0)
+    groups = rng.permutation(X.reshape(-1, GROUP, 5))
+    shuffled = rng.permuted(np.arange(GROUP)[None].repeat(len(groups), 0), axis=1)
+    mixed = np.take_along_axis(groups, shuffled[..., None], axis=1).reshape(-1, 5)
+    torch.testing.assert_close(
+        fit_grouped(mixed, **start).means_, fit_grouped(X, **start).means_
+    )
+
+
+def test_prediction_is_of_single_rows():
+    X = grouped_data()
+    model = fit_grouped(X, group_size=GROUP)
+    parameters = [model.weights_.numpy()], model.means_, model.covariances_
+    log_joint = joint_density(X[:7], parameters[0][0], *parameters[1:])
+    np.testing.assert_allclose(model.score_samples(X[:7]), logsumexp(log_joint, axis=1))
+    np.testing.assert_allclose(model.predict_proba(X[:7]), softmax(log_joint, axis=1))
+
+
+@pytest.mark.parametrize("covariance_type", ["full", "tied", "diag", "spherical"])
+@hypothesis_settings(max_examples=25)
+@given(
+    seed=st.integers(0, 10**6),
+    group=st.integers(2, 6),
+    n_components=st.integers(1, 5),
+    init=st.sampled_from(["time", "kmeans", "random"]),
+    reg=st.sampled_from([0.0, 1e-6, 1e-1]),
+)
+def test_the_likelihood_of_groups_never_falls(
+    covariance_type, seed, group, n_components, init, reg
+):
+    model = fit_grouped(
+        grouped_data(12, group, seed),
+        group_size=group,
+        n_components=n_components,
+        covariance_type=covariance_type,
+        init_params=init,
+        reg_covar=reg,
+        random_state=seed,
+        tol=0.0,
+        max_iter=15,
+    )
+    bounds = np.array(model.lower_bounds_)
+    assert (np.diff(bounds) >= -1e-9 * np.maximum(1, np.abs(bounds[1:]))).all()
+
+
+@pytest.mark.parametrize("covariance_type", ["full", "tied", "diag", "spherical"])
+@pytest.mark.parametrize("size", [1, 20, 64 * 3 * 7])
+def test_chunks_are_cut_between_groups(covariance_type, size, monkeypatch):
+    X = grouped_data()
+    options = {"group_size": 9, "covariance_type": covariance_type}
+    whole = fit_grouped(X, **options)
+    monkeypatch.setattr("tpgmm_torch.em.points.CHUNK_SIZE", {"cpu": size})
+    chunked = fit_grouped(X, **options)
+    torch.testing.assert_close(chunked.weights_, whole.weights_)
+    torch.testing.assert_close(chunked.means_, whole.means_)
+    torch.testing.assert_close(chunked.covariances_, whole.covariances_)
+    np.testing.assert_allclose(chunked.score_samples(X), whole.score_samples(X), rtol=1e-9)
+
+
+def test_a_group_larger_than_all_chunks_is_not_cut(monkeypatch):
+    X = grouped_data(group=20)
+    whole = fit_grouped(X, group_size=60)
+    monkeypatch.setattr("tpgmm_torch.em.points.CHUNK_SIZE", {"cpu": 8})
+    torch.testing.assert_close(fit_grouped(X, group_size=60).means_, whole.means_)
+
+
+@pytest.mark.parametrize("group_size", [7, 181])
+def test_incomplete_groups_are_refused(group_size):
+    with pytest.raises(ShapeError, match=rf"180 rows are no multiple of .*{group_size}"):
+        fit_grouped(grouped_data(), group_size=group_size)
+
+
+@pytest.mark.parametrize("group_size", [0, -1, 2.5, "4"])
+def test_sizes_that_are_no_sizes_are_refused(group_size):
+    with pytest.raises(ValueError, match="'group_size' parameter"):
+        fit_grouped(grouped_data(), group_size=group_size)
+
+
+# Mixtures learned from some of the rows each, in common passes.
+
+
+unconverged = pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.ConvergenceWarning")
+
+
+def mixture(**settings):
+    defaults = {"blocks": FOLD_WIDTHS, "random_state": 0, "max_iter": 30}
+    return BlockGaussianMixture(6, **{**defaults, **settings})
+
+
+def start_of(model, means):
+    """The settings by which EM starts from a mixture, with other means."""
+    parts = {"weights": model.weights_, "means": means, "covariances": model.covariances_}
+    return {f"{name}_init": part for name, part in parts.items()}
+
+
+def folds(n_rows, n_folds=4):
+    """Every fold leaves out other ones of ten rows, the same in each ten."""
+    left_out = [[0, 1, 2], [3], [4, 5, 6, 7], [9]][:n_folds]
+    one = np.array([[place not in out for place in range(10)] for out in left_out])
+    return np.tile(one, n_rows // 10)
+
+
+def together(X, members, group_size=1, sizes=None, **settings):
+    sizes = [1] * len(members) if sizes is None else sizes
+    models = [mixture(group_size=size, **settings) for size in sizes]
+    fit_subsets(models, X, members, group_size)
+    return models
+
+
+def alone(X, members, sizes=None, **settings):
+    sizes = [1] * len(members) if sizes is None else sizes
+    return [
+        mixture(group_size=size, **settings).fit(X[chosen])
+        for size, chosen in zip(sizes, members, strict=True)
+    ]
+
+
+def assert_same(ours, expected, tolerance=1e-9):
+    close = {"rtol": tolerance, "atol": tolerance}
+    for one, other in zip(ours, expected, strict=True):
+        assert one.n_iter_ == other.n_iter_
+        assert one.converged_ == other.converged_
+        assert one.n_features_in_ == other.n_features_in_
+        torch.testing.assert_close(one.weights_, other.weights_, **close)
+        torch.testing.assert_close(one.means_, other.means_, **close)
+        torch.testing.assert_close(one.covariances_, other.covariances_, **close)
+        np.testing.assert_allclose(one.lower_bounds_, other.lower_bounds_, **close)
+
+
+@pytest.mark.parametrize("n_points", [6000, 2000], ids=["packed", "whitened"])
+@pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
+def test_each_learns_what_it_would_alone(covariance_type, n_points):
+    X = movements(n_points) * [1e3, 1e-3, 1.0, 1e3, 1.0, 50.0, 1e-2] + 7.0
+    members = folds(n_points)
+    settings = {"covariance_type": covariance_type, "reg_covar": 1e-4}
+    assert_same(together(X, members, **settings), alone(X, members, **settings))
+
+
+@unconverged
+@pytest.mark.parametrize("init_params", ["time", "kmeans", "random"])
+def test_starts_are_drawn_from_the_own_rows_in_their_own_units(init_params):
+    X = movements(2000) * [1.0, 5.0, 1e-3, 1.0, 1e2, 1.0, 1.0]
+    members, settings = folds(2000), {"init_params": init_params, "n_init": 3}
+    assert_same(together(X, members, **settings), alone(X, members, **settings))
+
+
+def test_a_start_that_is_given_serves_all():
+    X = movements(2000)
+    first = mixture().fit(X)
+    members, start = folds(2000), start_of(first, [mean + 0.05 for mean in first.means_])
+    assert_same(together(X, members, **start), alone(X, members, **start))
+
+
+@pytest.mark.parametrize("n_points", [6000, 2000], ids=["packed", "whitened"])
+def test_of_a_group_those_that_belong_share_a_responsibility(n_points):
+    X, members = movements(n_points, noise=0.2), folds(n_points)
+    sizes = members[:, :10].sum(1).tolist()
+    assert sizes == [7, 9, 6, 9]
+    ours = together(X, members, 10, sizes)
+    assert_same(ours, alone(X, members, sizes))
+    # and that is something else than one for each point
+    assert abs(ours[0].means_[0] - together(X, members)[0].means_[0]).max() > 1e-6
+
+
+def test_rows_in_any_order_are_the_same_rows():
+    X, members = movements(6000), folds(6000)
+    order = np.random.RandomState(0).permutation(6000)
+    shuffled = together(X[order], members[:, order])
+    assert_same(shuffled, alone(X, members))
+
+
+def test_a_chunk_of_which_a_mixture_has_nothing():
+    """Long stretches belong to the first one alone: the others' gates open for nobody."""
+    X = movements(20000)
+    members = np.ones((3, 20000), dtype=bool)
+    members[1:, 8000:] = False
+    members[2, :100] = False
+    assert_same(together(X, members), alone(X, members))
+
+
+@unconverged
+def test_float32_is_as_exact_as_alone():
+    X, members = movements(6000), folds(6000)
+    settings = {"dtype": "float32", "reg_covar": 1e-4, "max_iter": 5, "tol": 0.0}
+    assert_same(together(X, members, **settings), alone(X, members, **settings), 1e-3)
+
+
+def test_a_component_without_data_is_reseeded_among_the_own_rows():
+    X, members = movements(6000), folds(6000)
+    far = mixture().fit(X)
+    means = [mean.clone() for mean in far.means_]
+    for mean in means:
+        mean[0] += 1e3
+    start = start_of(far, means)
+    with warnings.catch_warnings(record=True) as ours:
+        warnings.simplefilter("always", DegenerateComponentWarning)
+        found = together(X, members, **start)
+    with warnings.catch_warnings(record=True) as theirs:
+        warnings.simplefilter("always", DegenerateComponentWarning)
+        expected = alone(X, members, **start)
+    assert_same(found, expected)
+    said = [str(warning.message) for warning in ours]
+    assert said == [str(warning.message) for warning in theirs]
+    assert ["(left: 0 of 4200 points)" in text for text in said] == [True, False, False, False]
+
+
+def test_a_regularization_that_becomes_a_floor_is_the_own_one():
+    X, members = movements(6000), folds(6000)
+    settings = {"reg_covar": 1e-1, "max_iter": 60}
+    assert_same(together(X, members, **settings), alone(X, members, **settings), 1e-8)
+
+
+def test_regularizations_may_differ():
+    X, members = movements(2000), folds(2000, 2)
+    amounts = (1e-6, 1e-2)
+    ours = [mixture(reg_covar=amount) for amount in amounts]
+    fit_subsets(ours, X, members)
+    expected = [
+        mixture(reg_covar=amount).fit(X[chosen])
+        for amount, chosen in zip(amounts, members, strict=True)
+    ]
+    assert_same(ours, expected)
+
+
+def test_one_pass_serves_all(monkeypatch):
+    passes = counted_passes(monkeypatch)
+    ours = together(movements(6000), folds(6000))
+    assert passes[0] == 4
+    assert len(passes) == 1 + max(model.n_iter_ for model in ours)
+    assert len({model.n_iter_ for model in ours}) > 1  # some are done before others
+
+
+def test_what_does_not_converge_says_so():
+    with pytest.warns(ConvergenceWarning, match="did not converge in 2 iterations"):
+        together(movements(2000), folds(2000, 1), max_iter=2)
+
+
+def test_too_few_rows_are_refused():
+    X, members = movements(2000), folds(2000, 2)
+    members[1] = False
+    members[1, :3] = True
+    with pytest.raises(DataError, match=r"n_components=6, but the data hold only 3 distinct"):
+        together(X, members)

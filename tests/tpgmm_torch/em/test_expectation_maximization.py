@@ -1,7 +1,9 @@
-"""EM against scikit-learn and a plain oracle, on singular data, and a likelihood that rises."""
+"""EM against scikit-learn and a plain oracle, restarts side by side, interrupted fits."""
 
+import copy
 import math
 import warnings
+from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 
@@ -14,10 +16,23 @@ from sklearn.mixture import GaussianMixture
 from torch.distributions import MultivariateNormal
 
 from tests.support.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
-from tpgmm_torch.em.sufficient_statistics import (
-    PackedStatistics,
-    WhitenedStatistics,
+from tests.support.em_reference import (
+    assert_same_mixture,
+    binned,
+    counted_passes,
+    family,
+    movements,
+    one,
+    reference_step,
+    standardized,
 )
+from tests.support.em_reference import columns as blocks_of
+from tpgmm_torch.em import expectation_maximization as loop
+from tpgmm_torch.em.covariance_family import CovarianceFamily
+from tpgmm_torch.em.e_step import e_step
+from tpgmm_torch.em.expectation_maximization import Fit, expectation_maximization, m_step
+from tpgmm_torch.em.parameters import Parameters
+from tpgmm_torch.em.sufficient_statistics import PackedStatistics, WhitenedStatistics
 from tpgmm_torch.exceptions import DegenerateComponentWarning
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 
@@ -63,13 +78,14 @@ def oracle_em(X, weights, means, covariances, widths, regularization, n_iter):
     return weights, means, covariances, history
 
 
-@pytest.mark.parametrize("many_points", [0, 10_000], ids=["packed", "whitened"])
+@pytest.mark.parametrize("many_components", [0, 10_000], ids=["packed", "whitened"])
 @pytest.mark.parametrize("n_iter", [1, 4, 25])
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
 def test_one_block_equals_scikit_learn(
-    clusters, start, covariance_type, n_iter, many_points, monkeypatch
+    clusters, start, covariance_type, n_iter, many_components, monkeypatch
 ):
-    monkeypatch.setattr("tpgmm_torch.em.sufficient_statistics.MANY_POINTS", many_points)
+    monkeypatch.setattr("tpgmm_torch.em.sufficient_statistics.MANY_POINTS", 0)
+    monkeypatch.setattr("tpgmm_torch.em.sufficient_statistics.MANY_COMPONENTS", many_components)
     weights, means, covariances = start
     precision = 1 / covariances[0, 0, 0]
     reference = GaussianMixture(
@@ -204,8 +220,9 @@ def test_packed_moments_serve_only_where_they_are_accurate(reg_covar, form, monk
             forms.append(kind)
             return kind(*arguments)
 
-        monkeypatch.setattr(f"tpgmm_torch.em.e_step.{name}Statistics", spy)
-    monkeypatch.setattr("tpgmm_torch.em.sufficient_statistics.MANY_POINTS", 0)
+        monkeypatch.setattr(f"tpgmm_torch.em.sufficient_statistics.{name}Statistics", spy)
+    for limit in ("POINTS", "COMPONENTS"):
+        monkeypatch.setattr(f"tpgmm_torch.em.sufficient_statistics.MANY_{limit}", 0)
     model = fitted(BlockGaussianMixture(6, **settings), X)
     assert forms[-1] is form
     np.testing.assert_allclose(model.lower_bounds_, reference.lower_bounds_, atol=1e-7)
@@ -328,9 +345,205 @@ def test_float32_stands_nearly_singular_data():
 
 def test_chunks_do_not_show(clusters, monkeypatch):
     model = fitted(BlockGaussianMixture(3, blocks=WIDTHS), clusters)
-    monkeypatch.setattr("tpgmm_torch.em.block_gaussians.CHUNK_SIZE", {"cpu": 64 * 3 * 7})
+    monkeypatch.setattr("tpgmm_torch.em.points.CHUNK_SIZE", {"cpu": 64 * 3 * 7})
     chunked = fitted(BlockGaussianMixture(3, blocks=WIDTHS), clusters)
     torch.testing.assert_close(chunked.means_, model.means_)
     np.testing.assert_allclose(
         chunked.score_samples(clusters), model.score_samples(clusters), rtol=1e-9
     )
+
+
+K = 6
+
+
+def jittered(parameters, seed):
+    rng = np.random.RandomState(seed)
+    noise = (0.1 * torch.from_numpy(rng.randn(*mean.shape)) for mean in parameters.means)
+    means = tuple(mean + one for mean, one in zip(parameters.means, noise, strict=True))
+    return Parameters(parameters.weights, means, parameters.factors)
+
+
+def with_a_component_far_away(parameters):
+    means = tuple(mean.clone() for mean in parameters.means)
+    for mean in means:
+        mean[0] += 1e3
+    return Parameters(parameters.weights, means, parameters.factors)
+
+
+def problem(reg_covar=1e-6, n_points=6000, dtype=torch.float64):
+    points, units = standardized(movements(n_points), dtype)
+    lambdas = family(units, reg_covar, dtype=dtype)
+    return points, lambdas, binned(points, lambdas, K)
+
+
+def starts(parameters):
+    jitter = [jittered(parameters, seed) for seed in range(3)]
+    return [parameters, *jitter, with_a_component_far_away(parameters)]
+
+
+def fits_of(mixtures):
+    return [Fit(each, np.random.RandomState(seed)) for seed, each in enumerate(mixtures)]
+
+
+def assert_same_fits(actual, expected, tolerance=1e-9):
+    for own, other in zip(actual, expected, strict=True):
+        assert own.n_iter == other.n_iter
+        assert own.converged == other.converged
+        assert own.floored == other.floored
+        assert own.reseedings == other.reseedings
+        np.testing.assert_allclose(own.bounds, other.bounds, rtol=tolerance)
+        assert_same_mixture(own.parameters, other.parameters, tolerance)
+
+
+@pytest.mark.parametrize("reg_covar", [1e-6, 1e-1], ids=["added", "floored"])
+@pytest.mark.parametrize("many", [0, 10**9], ids=["packed", "whitened"])
+def test_together_they_do_what_each_does_alone(many, reg_covar, monkeypatch):
+    monkeypatch.setattr("tpgmm_torch.em.sufficient_statistics.MANY_COMPONENTS", many)
+    points, lambdas, parameters = problem(reg_covar)
+    settings = {"tol": 1e-3, "max_iter": 40}
+    together, alone = (fits_of(starts(lambdas.admit(parameters))) for _ in range(2))
+    expectation_maximization(together, points, lambdas, **settings)
+    for fit in alone:
+        expectation_maximization([fit], points, lambdas, **settings)
+    assert_same_fits(together, alone, 1e-8 if reg_covar == 1e-1 else 1e-9)
+    assert len({fit.n_iter for fit in together}) > 1
+    assert together[-1].reseedings
+    assert not together[0].reseedings
+    assert any(fit.floored for fit in together) == (reg_covar == 1e-1)
+    for fit in together:
+        assert all(later >= earlier - 1e-9 for earlier, later in pairwise(fit.bounds))
+
+
+def test_one_pass_serves_all(monkeypatch):
+    points, lambdas, parameters = problem()
+    passes = counted_passes(monkeypatch)
+    fits = fits_of([parameters, jittered(parameters, 0), jittered(parameters, 1)])
+    expectation_maximization(fits, points, lambdas, tol=1e-3, max_iter=30)
+    assert passes[0] == 3
+    assert len(passes) == 1 + max(fit.n_iter for fit in fits)
+    assert sorted(passes, reverse=True) == passes
+    assert sum(passes) == 3 + sum(fit.n_iter for fit in fits)
+
+
+def test_interrupted_fits_go_on_as_if_nothing_had_happened():
+    points, lambdas, parameters = problem()
+    mixtures = starts(parameters)
+    whole, halfway = fits_of(mixtures), fits_of(mixtures)
+    expectation_maximization(whole, points, lambdas, tol=1e-4, max_iter=20)
+    saved = []
+    expectation_maximization(
+        halfway,
+        points,
+        lambdas,
+        tol=1e-4,
+        max_iter=20,
+        after=lambda fits: saved.append(copy.deepcopy(list(fits))),
+    )
+    assert_same_fits(halfway, whole)
+    assert [fit.n_iter for fit in saved[0]] == [1] * 5
+    for stop in (0, 2, 9):
+        expectation_maximization(saved[stop], points, lambdas, tol=1e-4, max_iter=20)
+        assert_same_fits(saved[stop], whole)
+
+
+def test_fits_that_are_finished_stay_as_they_are():
+    points, lambdas, parameters = problem()
+    [fit] = fits_of([parameters])
+    expectation_maximization([fit], points, lambdas, tol=1e-3, max_iter=50)
+    assert fit.converged
+    before = copy.deepcopy(fit)
+    expectation_maximization([fit], points, lambdas, tol=1e-3, max_iter=100)
+    assert_same_fits([fit], [before], 0)
+
+
+def test_float32_restarts_agree_with_float64():
+    bounds = []
+    parameters = problem(1e-5)[2]
+    for dtype in (torch.float64, torch.float32):
+        points, lambdas, _ = problem(1e-5, dtype=dtype)
+        fits = fits_of([parameters, jittered(parameters, 0)])
+        expectation_maximization(fits, points, lambdas, tol=0.0, max_iter=5)
+        bounds.append([fit.bounds[-1] for fit in fits])
+    np.testing.assert_allclose(*bounds, rtol=1e-4)
+
+
+@pytest.mark.parametrize("floored", [False, True])
+@pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
+def test_the_m_step_of_each_mixture_is_its_own(covariance_type, floored):
+    points, units = standardized(movements(2000))
+    families = [family(units, share, covariance_type) for share in (1e-4, 1e-1)]
+    start = families[0].admit(binned(points, families[0], K))
+    mixtures = [start, jittered(start, 3)]
+    flags = torch.tensor([floored, not floored])
+    after = m_step(
+        e_step(Parameters.stack(mixtures), points), CovarianceFamily.stack(families), flags
+    )
+    for s, (mixture, own) in enumerate(zip(mixtures, families, strict=True)):
+        alone = m_step(e_step(one(mixture), points), own, flags[s : s + 1])[0]
+        assert_same_mixture(after[s], alone)
+        if not flags[s]:
+            expected, _ = reference_step(mixture, blocks_of(points), own)
+            assert_same_mixture(after[s], expected)
+
+
+def test_a_component_without_data_keeps_its_place_and_shape():
+    points, units = standardized(movements(2000))
+    lambdas = family(units)
+    start = binned(points, lambdas, K)
+    expectation = e_step(one(start), points)
+    for moment in expectation.moments:  # as where the gate leaves it out everywhere
+        moment[0, 2] = 0.0
+    after = m_step(expectation, lambdas, torch.tensor([False]))[0]
+    assert float(after.weights[2]) == 0.0
+    for own, before in zip(after.means, start.means, strict=True):
+        assert torch.equal(own[2], before[2])
+    for j, (own, before) in enumerate(zip(after.covariances, start.covariances, strict=True)):
+        expected = before[2] + torch.diag(lambdas.diagonals[j])
+        torch.testing.assert_close(own[2], expected)
+
+
+def test_a_step_that_lowers_the_likelihood_even_so_is_undone(monkeypatch):
+    points, lambdas, parameters = problem()
+    bounds = iter([-1.0, -2.0, -2.5, -3.0])  # start, a step, the same with the floor, a step
+
+    def falling(*arguments, **settings):
+        expectation = e_step(*arguments, **settings)
+        bound = torch.full_like(expectation.bound, next(bounds))
+        return replace(expectation, bound=bound)
+
+    monkeypatch.setattr(loop, "e_step", falling)
+    [fit] = fits_of([parameters])
+    expectation_maximization([fit], points, lambdas, tol=1e-6, max_iter=10)
+    assert fit.floored and fit.converged
+    assert fit.bounds == [-1.0, -1.0]
+    assert_same_mixture(fit.parameters, parameters, 0)
+
+
+def test_what_is_reseeded_is_told_and_the_bounds_begin_again():
+    points, lambdas, parameters = problem()
+    [fit] = fits_of([with_a_component_far_away(parameters)])
+    expectation_maximization([fit], points, lambdas, tol=0.0, max_iter=1)
+    assert fit.reseedings == ["component(s) [0] in iteration 1 (left: 0 of 6000 points)"]
+    assert (fit.n_reseeded, fit.n_iter, len(fit.bounds), fit.converged) == (1, 1, 1, False)
+
+
+def test_components_are_reseeded_at_most_once_each():
+    points, lambdas, parameters = problem()
+    [fit] = fits_of([with_a_component_far_away(parameters)])
+    fit.n_reseeded = K
+    expectation_maximization([fit], points, lambdas, tol=0.0, max_iter=2)
+    assert not fit.reseedings
+    assert fit.n_reseeded == K
+    assert float(fit.parameters.weights[0]) < 1e-100
+
+
+def test_progress_is_printed(capsys):
+    points, lambdas, parameters = problem(n_points=2000)
+    for verbose, lines in ((0, 0), (1, 1), (2, 4)):
+        expectation_maximization(
+            fits_of([parameters]), points, lambdas, tol=0.0, max_iter=3, verbose=verbose
+        )
+        printed = capsys.readouterr().out
+        assert printed.count("\n") == lines
+        assert ("start: not converged in 3 iterations, bound" in printed) == (verbose > 0)
+        assert ("  iteration 1: bound" in printed) == (verbose > 1)
