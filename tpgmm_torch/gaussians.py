@@ -68,15 +68,10 @@ def whiten(covariance: Tensor, right: Tensor, name: str) -> Tensor:
 
     Parameters
     ----------
-    covariance : Tensor of shape (..., m, m)
-    right : Tensor of shape (..., m, r)
-        ``R``, columns to be whitened.
+    covariance, right : Tensor of shape (..., m, m) and (..., m, r)
+        ``R`` are columns to be whitened.
     name : str
         How the error message calls the covariance.
-
-    Returns
-    -------
-    Tensor of shape (..., m, r)
 
     Raises
     ------
@@ -148,7 +143,7 @@ def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
 def information(
     jacobian: Tensor | None, targets: Tensor, covariance: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What ``J x = y``, known with covariance ``S``, says about ``x``.
+    """What ``J x = y``, given with covariance ``S``, says about ``x``.
 
     ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank,
     so that sums of these terms are the product (2) of the projected Gaussians
@@ -179,7 +174,7 @@ def information(
 
     Examples
     --------
-    The sum of two numbers is known, their difference is not:
+    The sum of two numbers is observed, their difference is not:
 
     >>> jacobian, target = torch.tensor([[1.0, 1.0]]), torch.tensor([[2.0]])
     >>> precision, _, _ = information(jacobian, target, torch.tensor([[0.25]]))

@@ -159,19 +159,9 @@ def hemisphere_sign(inner: Tensor) -> Tensor:
 
 
 def quaternion_blocks(starts: Sequence[int], size: int) -> Tensor:
-    """Where quaternions stand among coordinates, for :func:`hemisphere_signs`.
+    """Where quaternions begin among ``size`` coordinates, for :func:`hemisphere_signs`.
 
-    Parameters
-    ----------
-    starts : sequence of int
-        The first coordinate of each of the Q quaternions.
-    size : int
-        The number of coordinates, D.
-
-    Returns
-    -------
-    Tensor of shape (Q, D)
-        1 at the four coordinates of each quaternion, 0 elsewhere; float64.
+    For each of the ``starts`` a row, 1 at the four coordinates of the quaternion, 0 elsewhere.
     """
     blocks = torch.zeros(len(starts), size, dtype=torch.float64)
     for block, start in zip(blocks, starts, strict=True):
@@ -180,19 +170,14 @@ def quaternion_blocks(starts: Sequence[int], size: int) -> Tensor:
 
 
 def hemisphere_signs(x: Tensor, reference: Tensor, blocks: Tensor) -> Tensor:
-    """Signs that bring all quaternions among coordinates to the side of the reference.
+    """Signs (..., D) that bring all quaternions among coordinates to the side of the reference.
 
     Parameters
     ----------
     x, reference : Tensor of shape (..., D)
-        Coordinates, some of them quaternions.
+        Coordinates, some of them quaternions; of others the sign is 1.
     blocks : Tensor of shape (Q, D)
         Of :func:`quaternion_blocks`.
-
-    Returns
-    -------
-    Tensor of shape (..., D)
-        1 or -1; 1 where no quaternion stands.
 
     Examples
     --------

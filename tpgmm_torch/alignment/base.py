@@ -166,6 +166,13 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
     def _path(self, demonstration: Demonstration) -> Tensor:
         """Fractional time steps of a demonstration at each time of the grid."""
 
+    def _start(self, X: Any) -> list[Demonstration]:
+        """What each ``fit`` begins with: check parameters and demonstrations."""
+        self._validate_params()
+        demonstrations = check_demonstrations(X)
+        self.joint_names_ = demonstrations[0].joint_names
+        return self._checked(demonstrations)
+
     def _checked(self, X: Any) -> list[Demonstration]:
         """Check demonstrations and bring their joints into the order of the first fitted."""
         demonstrations = check_demonstrations(X)

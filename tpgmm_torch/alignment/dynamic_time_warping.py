@@ -21,7 +21,7 @@ from tpgmm_torch.alignment.warping_paths import (
     warping_path,
 )
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["DynamicTimeWarping"]
@@ -79,15 +79,12 @@ class DynamicTimeWarping(Alignment):
         Which demonstration of ``fit`` it is, or which the barycentre started from.
     time_ : Tensor of shape (T,)
         Common time grid [s]. For a barycentre it is the average clock, from 0 on.
-    paths_ : list of Tensor of shape (T,)
-        For each demonstration of ``fit``, its fractional time step at each time of the grid:
-        a strictly increasing function.
     distortions_ : ndarray of shape (n_demonstrations,)
         Root mean square distance of features along each path, in standard deviations.
     feature_names_ : tuple of str
         The groups of features in use; those that never change are left out.
-    joint_names_ : tuple of str or None
-        Order of the joints.
+    paths_, joint_names_ : list of Tensor of shape (T,), tuple of str or None
+        As in :class:`Alignment`.
 
     Examples
     --------
@@ -154,10 +151,7 @@ class DynamicTimeWarping(Alignment):
         DependencyError
             Without dtaidistance.
         """
-        self._validate_params()
-        demonstrations = check_demonstrations(X)
-        self.joint_names_ = demonstrations[0].joint_names
-        demonstrations = self._checked(demonstrations)
+        demonstrations = self._start(X)
         self._features = AlignmentFeatures.fit(
             demonstrations, self.robot, self.features, self.weights
         )

@@ -12,7 +12,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch.alignment.base import Alignment, seconds, steps_at
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["LinearTimeNormalization"]
 
@@ -69,10 +69,7 @@ class LinearTimeNormalization(Alignment):
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Learn the common duration and grid from demonstrations ``X``; ``y`` is ignored."""
-        self._validate_params()
-        demonstrations = check_demonstrations(X)
-        self.joint_names_ = demonstrations[0].joint_names
-        demonstrations = self._checked(demonstrations)
+        demonstrations = self._start(X)
         duration = self.duration
         if isinstance(duration, str):
             average = np.mean if duration == "mean" else np.median

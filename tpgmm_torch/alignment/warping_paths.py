@@ -41,7 +41,7 @@ def _dtaidistance() -> Any:
 
 
 def resample(values: Array, time: Floats, grid: Floats) -> Array:
-    """Interpolate the columns of ``values`` (T, D), known at ``time`` (T,), on a ``grid``."""
+    """Interpolate the columns of ``values`` (T, D), given at ``time`` (T,), on a ``grid``."""
     return np.stack([np.interp(grid, time, column) for column in values.T], axis=1)
 
 

@@ -24,20 +24,17 @@ class MovingFrame:
     """The frame behind one moving joint.
 
     Its pose is the parent's pose times ``offset`` times the motion by
-    ``multiplier * q[joint] + shift`` about (or along) ``axis``.
+    ``multiplier * q[joint] + shift`` about (or, if ``prismatic``, along) ``axis``.
 
     Attributes
     ----------
-    parent : int
-        Index of the moving frame that carries it; -1 is the base.
-    offset : ndarray of shape (4, 4)
-        Pose of the joint in the parent frame.
-    axis : ndarray of shape (3,)
-        Unit vector in the frame.
+    parent, joint : int
+        Indices of the moving frame that carries it, -1 the base; and of what moves it in the
+        joint vector.
+    offset, axis : ndarray of shape (4, 4) and (3,)
+        Pose of the joint in the parent frame, and a unit vector in the frame.
     prismatic : bool
         Whether it slides instead of turning.
-    joint : int
-        Position in the joint vector of the joint that moves it.
     multiplier, shift : float
         How it follows that joint; 1 and 0 unless it mimics.
     """

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
+from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
@@ -139,8 +140,6 @@ def constant_columns(smallest: Tensor, largest: Tensor, widths: Sequence[int]) -
 
 def _same_side(local: Tensor, template: Tensor, block: slice) -> Tensor:
     """Flip a whole quaternion path if it lies on the other hemisphere than the template's."""
-    if bool((local[:, block] * template[:, block]).sum() >= 0):
-        return local
     sign = torch.ones_like(local[0])
-    sign[block] = -1
+    sign[block] = quaternions.hemisphere_sign((local[:, block] * template[:, block]).sum())
     return local * sign

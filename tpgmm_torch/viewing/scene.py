@@ -248,14 +248,14 @@ def _let_go(drag: Callable[[str, Frame], None], name: str, event: Any) -> None:
 def _steps(time: Tensor, fps: float) -> Tensor:
     """Which time steps are shown: the first at or after each picture's instant, the last."""
     wanted = torch.arange(float(time[0]), float(time[-1]), 1 / fps, dtype=time.dtype)
-    found = torch.searchsorted(time, wanted)
-    return torch.cat((found, torch.tensor([len(time) - 1]))).unique()
+    steps = torch.searchsorted(time, wanted)
+    return torch.cat((steps, torch.tensor([len(time) - 1]))).unique()
 
 
 def _bounds(points: Sequence[Array]) -> tuple[Array, Array]:
     """Least and greatest x, y, z."""
-    together = np.concatenate([some.reshape(-1, 3) for some in points])
-    return together.min(axis=0), together.max(axis=0)
+    rows = np.concatenate([some.reshape(-1, 3) for some in points])
+    return rows.min(axis=0), rows.max(axis=0)
 
 
 def _spread(length: int, most: int) -> NDArray[np.int64]:

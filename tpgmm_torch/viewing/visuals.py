@@ -81,8 +81,8 @@ def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[
     plain = not any(visuals.values())
     shapes: dict[str, list[Shape]] = {}
     for link, elements in visuals.items():
-        found = [_shape(element, link, materials, meshes) for element in elements]
-        drawn = [shape for shape in found if shape is not None]
+        read = (_shape(element, link, materials, meshes) for element in elements)
+        drawn = [shape for shape in read if shape is not None]
         if not drawn and (elements or plain):
             drawn = _sticks(model, link)
         if drawn:
@@ -216,7 +216,7 @@ def _held_by(urdf: UrdfModel, base: str) -> set[str]:
     while front:
         at = front.pop()
         ends = [(j.parent, j.child) for j in joints if at in (j.parent, j.child)]
-        found = {link for pair in ends for link in pair} - held
-        held |= found
-        front += found
+        new = {link for pair in ends for link in pair} - held
+        held |= new
+        front += new
     return held
