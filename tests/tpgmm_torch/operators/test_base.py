@@ -36,6 +36,7 @@ from tpgmm_torch import (
     Stack,
 )
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.operators.base import Reference, frame_names
 from tpgmm_torch.regression.regression import Regression
 
 WORLDS = pytest.mark.parametrize("world", [OnRobot(), OnPoses()], ids=["robot", "poses"])
@@ -124,6 +125,40 @@ def test_a_frame_with_the_name_of_a_link_is_refused(world: World):
     _, frames = world.scene()
     with pytest.raises(UnknownNameError, match=r"'r_hand'.* it is a link .*rename the frame"):
         RelativePosition(LEFT, RIGHT).check(world.kinematics, {RIGHT: frames[OBJECT]})
+
+
+def test_a_reference_is_a_link_with_its_jacobians_or_a_frame_without():
+    state, frames = OnRobot().scene(2)
+    hand = Reference.of(RIGHT, state, frames)
+    assert torch.equal(hand.frame.position, state.position(RIGHT))
+    assert torch.equal(hand.frame.orientation, state.orientation(RIGHT))
+    assert torch.equal(hand.linear_jacobian, state.linear_jacobian(RIGHT))
+    assert torch.equal(hand.angular_jacobian, state.angular_jacobian(RIGHT))
+    thing = Reference.of(OBJECT, state, frames)
+    assert thing.frame is frames[OBJECT]
+    assert thing.linear_jacobian is None and thing.angular_jacobian is None
+    listed = r"the situation or the robot's links; it has \['l_hand', 'object', 'r_hand'\]"
+    with pytest.raises(UnknownNameError, match=rf"frame 'cup' is not in {listed}"):
+        Reference.of("cup", state, frames)
+
+
+def test_a_situation_needs_each_frame_once_and_no_link():
+    operators = [
+        Stack(RelativePosition(LEFT, "cup"), RelativePosition(RIGHT, "lid")),
+        RelativeOrientation(LEFT, "cup"),
+        RelativePosition(LEFT, RIGHT),
+        Canonical(),
+    ]
+    assert frame_names(operators, OnRobot().kinematics) == ("cup", "lid")
+    assert frame_names(operators, PlanarArm()) == ("cup", "lid", RIGHT)
+    assert frame_names([], PlanarArm()) == ()
+
+
+def test_by_default_an_operator_needs_nothing_and_knows_no_quaternion():
+    operator, arm = PlanarPosition(), PlanarArm()
+    assert operator.links() == operator.references() == operator.quaternion_starts(arm) == ()
+    assert operator.tolerances(arm) == (0.0, 0.0)
+    assert operator.determines_joints is False
 
 
 def test_coordinates_of_another_size_than_announced_are_refused():

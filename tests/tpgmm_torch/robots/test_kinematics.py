@@ -1,6 +1,7 @@
 """States of robots as tensors, and robots of a user's own."""
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,11 @@ import torch
 from sklearn.base import clone
 from torch.autograd import gradcheck, gradgradcheck
 
+from tests.support.own_operators import PlanarArm
 from tests.support.robot_zoo import assert_differences_agree, random_joints, upper_body, zoo
 from tpgmm_torch import quaternions
-from tpgmm_torch.exceptions import UnknownNameError
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots.kinematics import dtype_name, dtype_named
 
 
 class TestTensors:
@@ -120,41 +122,48 @@ class TestState:
             assert bool(error < 1e-8) is agrees
 
 
-class PlanarArm(Kinematics):
-    """Two hinges about z, in closed form: a robot of a user's own."""
-
-    joint_names, links = ("shoulder", "elbow"), ("tip",)
-
-    def __init__(self) -> None:
-        self.upper = torch.full((2,), math.pi, dtype=torch.float64)
-        self.lower, self.velocity = -self.upper, self.upper
-
-    def state(self, joints: Any) -> RobotState:
-        q = self.joint_tensor(joints)
-        angles = q.cumsum(-1)
-        sine, cosine, zero = angles.sin(), angles.cos(), torch.zeros_like(angles[..., 0])
-        position = torch.stack((cosine.sum(-1), sine.sum(-1), zero), dim=-1)
-        turn = torch.stack((zero, zero, angles[..., 1]), dim=-1)
-        columns = torch.zeros(*q.shape[:-1], 1, 6, 2, dtype=q.dtype)
-        for joint in range(2):
-            columns[..., 0, 0, joint] = -sine[..., joint:].sum(-1)
-            columns[..., 0, 1, joint] = cosine[..., joint:].sum(-1)
-            columns[..., 0, 5, joint] = 1.0
-        orientation = quaternions.exp(turn)[..., None, :]
-        return RobotState(q, self.links, position[..., None, :], orientation, columns)
-
-
 class TestOwnKinematics:
     def test_a_user_defined_robot_needs_only_its_state(self) -> None:
         arm = PlanarArm()
-        assert arm.n_joints == 2
+        assert arm.n_joints == 3
         assert_differences_agree(arm, random_joints(arm))
         assert clone(arm) is arm
-        joints = torch.ones(3, 2)
+        joints = torch.ones(2, 3)
         assert arm.retract(joints) is joints
 
     def test_it_converts_to_another_dtype(self) -> None:
         arm = PlanarArm()
         single = arm.to(torch.float32)
-        assert single.state([0.1, 0.2]).positions.dtype == torch.float32
+        assert single.state([0.1, 0.2, 0.3]).positions.dtype == torch.float32
         assert arm.lower.dtype == torch.float64
+
+    def test_only_floating_tensors_change_their_dtype(self) -> None:
+        arm = PlanarArm()
+        arm.order, arm.scale = torch.tensor([2, 0, 1]), torch.ones(3)
+        double = arm.to(torch.float64, "cpu")
+        assert double.order.dtype == torch.int64
+        assert double.scale.dtype == double.upper.dtype == torch.float64
+        assert arm.scale.dtype == torch.float32
+        assert arm.to(device="meta").upper.device.type == "meta"
+        assert arm.to(device="meta").upper.dtype == torch.float64
+
+    def test_joint_vectors_become_tensors_of_the_robot(self) -> None:
+        single = PlanarArm().to(torch.float32)
+        tensor = single.joint_tensor(np.ones((2, 3)))
+        assert tensor.dtype == torch.float32
+        assert tensor.tolist() == [[1.0] * 3] * 2
+        for wrong in (np.ones((2, 2)), 1.0):
+            shape = re.escape(str(np.shape(wrong)))
+            with pytest.raises(ShapeError, match=rf"\(\.\.\., 3\) .*'elbow'.* got {shape}"):
+                single.joint_tensor(wrong)
+        with pytest.raises(DataError, match="joints holds 1 value"):
+            single.joint_tensor([0.0, math.nan, 0.0])
+
+
+def test_dtypes_go_by_name() -> None:
+    for dtype in (torch.float32, torch.float64):
+        assert dtype_named(dtype_name(dtype)) == dtype
+    assert dtype_name(torch.float32) == "float32"
+    for call in (lambda: dtype_named("float16"), lambda: dtype_name(torch.float16)):
+        with pytest.raises(DataError, match=r"one of \['float32', 'float64'\], got 'float16'"):
+            call()
