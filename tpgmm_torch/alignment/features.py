@@ -100,12 +100,10 @@ class AlignmentFeatures:
         ----------
         demonstrations, robot : sequence of Demonstration, Kinematics or None
             What to compare.
-        names : sequence of str, optional
-            By default all but those seen from a frame: away from the object that the motion
-            is about, they differ between demonstrations at equal phase.
-        weights : mapping of str to float, optional
-            0 leaves a group out. By default 3 for the directions, and for n others
-            ``n ** -0.5`` each.
+        names, weights : sequence of str, mapping of str to float, optional
+            As ``features`` and ``weights`` of :class:`DynamicTimeWarping`. Features seen from a
+            frame are no default: away from the object that the motion is about, they differ
+            between demonstrations at equal phase.
 
         Raises
         ------

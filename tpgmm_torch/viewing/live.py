@@ -32,14 +32,10 @@ class LiveView:
 
     Parameters
     ----------
-    model : TaskParameterizedGMM
-        Fitted, with a robot or with tracked poses.
-    situations : sequence of Situation
-        What to reproduce for.
-    demonstrations : sequence of Demonstration, default=()
-        Whose paths are drawn beside it.
-    meshes : Path, optional
-        Folder with the files of the robot's meshes.
+    model, situations : TaskParameterizedGMM, sequence of Situation
+        What to reproduce, and for what; fitted, with a robot or with tracked poses.
+    demonstrations, meshes : sequence of Demonstration, Path
+        As for :class:`MotionScene`.
     first : int, default=0
         Which of the situations is shown first.
     fps : float, default=25.0
@@ -63,10 +59,8 @@ class LiveView:
 
     Raises
     ------
-    DependencyError
-        If viser is not installed.
-    DataError
-        If the model has no links, or the robot's description cannot be drawn.
+    DependencyError, DataError
+        If viser is not installed, or the model has no links that can be drawn.
     """
 
     def __init__(

@@ -42,12 +42,8 @@ def write_motion(
         The file; replaced if it exists.
     model, situation : TaskParameterizedGMM, Situation
         What to reproduce, and for what; fitted, with a robot or with tracked poses.
-    demonstrations : sequence of Demonstration, default=()
-        Whose paths are drawn beside it.
-    meshes : Path, optional
-        Folder with the files of the robot's meshes.
-    fps : float, default=25.0
-        Pictures per second.
+    demonstrations, meshes, fps : sequence of Demonstration, Path, float
+        As for :class:`MotionScene`.
     title : str, default="tpgmm"
         Of the page.
 
@@ -58,10 +54,8 @@ def write_motion(
 
     Raises
     ------
-    DependencyError
-        If viser is not installed.
-    DataError
-        If the model has no links, or the robot's description cannot be drawn.
+    DependencyError, DataError
+        If viser is not installed, or the model has no links that can be drawn.
     """
     with viser_server("127.0.0.1", 0) as server:
         scene = MotionScene(server, model, demonstrations, meshes, fps)
