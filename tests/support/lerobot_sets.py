@@ -7,9 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
 import torch
 
-from tpgmm_datasets import save_lerobot
+from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -138,6 +139,11 @@ def in_info(**changes):
     return lambda root: change_info(root, lambda info: info.update(changes))
 
 
+def later(values):
+    values[15:21] += 0.1
+    return values
+
+
 def stuck(values):
     values[15] = values[14]
     return values
@@ -147,3 +153,14 @@ def undeclared(root, factor):
     """The joints multiplied, and no units in the metadata."""
     change_table(root, DATA, lambda t: set_column(t, "observation.state", lambda x: x * factor))
     change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
+
+
+def assert_refused(root, check, file=None, episode=None, column=None):
+    """The set cannot be read, and the error says what failed and where."""
+    with pytest.raises(DatasetError) as caught:
+        load_lerobot(root)
+    error = caught.value
+    where = file, episode, column
+    assert (error.check, error.file, error.episode, error.column) == (check, *where)
+    for part in filter(None, where):
+        assert str(part) in str(error)

@@ -1,6 +1,10 @@
+"""Data sets read as demonstrations: what is chosen, what is refused, what damage does."""
+
+import inspect
 import json
+import os
 import shutil
-import sys
+import warnings
 
 import numpy as np
 import pyarrow as pa
@@ -13,28 +17,23 @@ from tests.support.lerobot_sets import (
     NAMES,
     Arm,
     assert_equal,
-    change_info,
     change_table,
     joints_of,
     set_column,
     spoil,
     to_v21,
-    write,
 )
 from tpgmm_datasets import (
     DatasetError,
     LinkPose,
     iter_lerobot,
     load_lerobot,
+    save_lerobot,
 )
-from tpgmm_datasets.lerobot import parquet
-from tpgmm_torch.exceptions import DependencyError, TPGMMError
-
-
-@pytest.fixture
-def root(tmp_path):
-    write(tmp_path / "set")
-    return tmp_path / "set"
+from tpgmm_datasets.reader import open_recording
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import TPGMMError
 
 
 def test_both_layouts_give_the_same_demonstrations(root, tmp_path):
@@ -46,12 +45,6 @@ def test_both_layouts_give_the_same_demonstrations(root, tmp_path):
         assert dict(a.events) == dict(b.events)
         torch.testing.assert_close(a.frames["bottle"].position, b.frames["bottle"].position)
         torch.testing.assert_close(a.time, b.time, rtol=0, atol=0)
-
-
-def test_small_batches_give_the_same_demonstrations(root, monkeypatch):
-    expected = joints_of(load_lerobot(root))
-    monkeypatch.setattr(parquet, "BATCH_ROWS", 4)
-    assert_equal(joints_of(load_lerobot(root)), expected)
 
 
 def test_iteration_reads_an_episode_when_it_comes(root):
@@ -68,71 +61,6 @@ def test_columns_that_only_lerobot_needs_may_be_missing(root):
     for name in ("index", "frame_index", "task_index", "timestamp"):
         change_table(root, DATA, lambda table, name=name: table.drop_columns([name]))
         assert_equal(joints_of(load_lerobot(root)), expected)
-
-
-def test_another_data_path_and_list_columns_are_read(root):
-    expected = joints_of(load_lerobot(root))
-    (root / "data" / "all").mkdir()
-    lists = pa.list_(pa.float64())
-    table = pq.read_table(root / DATA).replace_schema_metadata(None)
-    column = table["observation.state"].combine_chunks().cast(lists)
-    pq.write_table(
-        set_column(table, "observation.state", column), root / "data/all/0-0.parquet"
-    )
-    (root / DATA).unlink()
-    template = "data/all/{chunk_index}-{file_index}.parquet"
-    change_info(root, lambda info: info.update(data_path=template))
-    assert_equal(joints_of(load_lerobot(root)), expected)
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        list(NAMES),
-        [list(NAMES)],
-        [[list(NAMES)]],
-        {"motors": list(NAMES)},
-        {"gripper": 2, "left_elbow": 0, "right_elbow": 1},
-    ],
-)
-def test_names_are_found_however_they_are_nested(root, tmp_path, names):
-    plain = to_v21(root, tmp_path / "plain")
-    change_info(plain, lambda i: i["features"]["observation.state"].update(names=names))
-    assert load_lerobot(plain)[0].joint_names == NAMES
-
-
-@pytest.mark.parametrize("names", [None, ["state"], [1, 2, 3], ["a", "a", "b"]])
-def test_names_that_name_nothing_count_as_missing(root, tmp_path, names):
-    plain = to_v21(root, tmp_path / "plain")
-    change_info(plain, lambda i: i["features"]["observation.state"].update(names=names))
-    assert load_lerobot(plain)[0].joint_names is None
-    assert load_lerobot(plain, joint_names=["x", "y", "z"])[0].joint_names == ("x", "y", "z")
-    assert load_lerobot(plain, robot=Arm("a", "b", "c"))[0].joint_names == ("a", "b", "c")
-    with pytest.raises(DatasetError, match="name all values"):
-        load_lerobot(plain, robot=Arm("a", "b"))
-
-
-@pytest.mark.parametrize(
-    "spelling",
-    [
-        ("right_elbow", "left_elbow"),
-        ("right_elbow_joint", "left_elbow_joint"),
-        ("kRightElbow", "kLeftElbow"),
-        ("r_elbow.pos", "l_elbow.pos"),
-        ("RightElbow", "LeftElbow"),
-    ],
-)
-def test_a_robot_gets_its_joints_in_its_order_however_they_are_spelled(root, spelling):
-    expected = [joints[:, [1, 0]] for joints in joints_of(load_lerobot(root))]
-    found = load_lerobot(root, robot=Arm(*spelling))
-    assert_equal(joints_of(found), expected)
-    assert found[0].joint_names == spelling
-
-
-def test_a_mapping_names_the_joints_that_are_called_otherwise(root):
-    found = load_lerobot(root, robot=Arm("hand", "left_elbow"), joint_names={"gripper": "hand"})
-    expected = [joints[:, [2, 0]] for joints in joints_of(load_lerobot(root))]
-    assert_equal(joints_of(found), expected)
 
 
 @pytest.mark.parametrize(
@@ -163,26 +91,6 @@ def test_arguments_that_do_not_fit_are_refused(root, options, message):
     assert isinstance(caught.value, ValueError)
 
 
-def test_a_robot_joint_that_fits_two_values_is_refused(root):
-    options = {"joint_names": ["l_elbow", "left.elbow", "x"], "robot": Arm("left_elbow")}
-    with pytest.raises(DatasetError, match="fits several values"):
-        load_lerobot(root, **options)
-
-
-def test_the_joint_feature_is_found_or_chosen(root):
-    expected = joints_of(load_lerobot(root))
-    action = joints_of(load_lerobot(root, joints="action"))
-    assert_equal([a[:-1] for a in action], [e[1:] for e in expected])
-    rename = {"observation.state": "state"}
-    change_table(
-        root, DATA, lambda t: t.rename_columns([rename.get(n, n) for n in t.column_names])
-    )
-    change_info(
-        root, lambda i: i["features"].update(state=i["features"].pop("observation.state"))
-    )
-    assert_equal(joints_of(load_lerobot(root)), expected)
-
-
 @pytest.mark.parametrize(
     ("episodes", "kept"),
     [
@@ -209,35 +117,176 @@ def test_no_json_file_needs_to_be_complete_for_what_is_not_read(root):
     assert len(load_lerobot(root)) == 3
 
 
-def test_an_id_is_looked_up_in_the_cache_of_lerobot(root, tmp_path, monkeypatch):
-    home = tmp_path / "home"
-    shutil.copytree(root, home / "someone" / "bottles")
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(home))
-    assert len(load_lerobot("someone/bottles")) == 3
+COPIES = int(os.environ.get("TPGMM_MUTATIONS", "300"))
 
 
-def test_an_id_is_fetched_without_videos(root, tmp_path, monkeypatch):
-    asked = {}
+def demonstrations():
+    rng = np.random.default_rng(7)
+    made = []
+    for length in (12, 9, 15):
+        quaternion = rng.normal(size=(length, 4))
+        quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+        frames = {
+            "bottle": Frame(rng.normal(size=3), quaternion[0]),
+            "hand": Frame(rng.normal(size=(length, 3)), quaternion),
+        }
+        joints = rng.normal(size=(length, 3))
+        events = {"close": 5 / 50}
+        made.append(Demonstration(np.arange(length) / 50, joints, frames, list("abc"), events))
+    return made
 
-    def fetch(repo_id, **options):
-        asked.update(options, repo_id=repo_id)
-        return str(root)
 
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
-    monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
-    assert len(load_lerobot("someone/bottles")) == 3
-    assert asked["repo_id"] == "someone/bottles"
-    assert not any("videos" in pattern for pattern in asked["allow_patterns"])
+def same(first, second):
+    return len(first) == len(second) and all(map(same_demonstration, first, second))
 
 
-def test_an_id_out_of_reach_says_how_to_get_it(tmp_path, monkeypatch):
-    def fetch(repo_id, **options):
-        raise OSError("offline")
+def same_demonstration(a, b):
+    return (
+        a.joint_names == b.joint_names
+        and dict(a.events) == dict(b.events)
+        and torch.equal(a.time, b.time)
+        and torch.equal(a.joints, b.joints)
+        and list(a.frames) == list(b.frames)
+        and all(
+            torch.equal(a.frames[name].position, b.frames[name].position)
+            and torch.equal(a.frames[name].orientation, b.frames[name].orientation)
+            for name in a.frames
+        )
+    )
 
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
-    monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
-    with pytest.raises(DatasetError, match="hf download --repo-type dataset someone/bottles"):
-        load_lerobot("someone/bottles")
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    with pytest.raises(DependencyError, match="pip install"):
-        load_lerobot("someone/bottles")
+
+def files(root):
+    return sorted(path for path in root.rglob("*") if path.is_file())
+
+
+def flip_bytes(root, rng):
+    path = files(root)[rng.integers(len(files(root)))]
+    content = bytearray(path.read_bytes())
+    for _ in range(int(rng.integers(1, 4))):
+        content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(bytes(content))
+    return f"bytes flipped in {path.name}"
+
+
+def flip_footer(root, rng):
+    path = parquet_file(root, rng)
+    content = bytearray(path.read_bytes())
+    length = int.from_bytes(content[-8:-4], "little") + 8
+    content[-int(rng.integers(1, length + 1))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(bytes(content))
+    return f"a bit flipped in the footer of {path.name}"
+
+
+def truncate(root, rng):
+    path = files(root)[rng.integers(len(files(root)))]
+    content = path.read_bytes()
+    path.write_bytes(content[: rng.integers(len(content))])
+    return f"{path.name} truncated"
+
+
+def remove_file(root, rng):
+    path = files(root)[rng.integers(len(files(root)))]
+    path.unlink()
+    return f"{path.name} removed"
+
+
+def parquet_file(root, rng):
+    found = [path for path in files(root) if path.suffix == ".parquet"]
+    return found[rng.integers(len(found))]
+
+
+def drop_column(root, rng):
+    path = parquet_file(root, rng)
+    table = pq.read_table(path)
+    name = table.column_names[rng.integers(table.num_columns)]
+    pq.write_table(table.drop_columns([name]), path)
+    return f"{name} dropped from {path.name}"
+
+
+def drop_rows(root, rng):
+    path = parquet_file(root, rng)
+    table = pq.read_table(path)
+    row = int(rng.integers(len(table)))
+    keep = [i for i in range(len(table)) if i != row]
+    pq.write_table(table.take(pa.array(keep, pa.int64())), path)
+    return f"row {row} dropped from {path.name}"
+
+
+def swap_rows(root, rng):
+    path = parquet_file(root, rng)
+    table = pq.read_table(path)
+    order = np.arange(len(table))
+    a, b = rng.integers(len(table), size=2)
+    order[[a, b]] = order[[b, a]]
+    pq.write_table(table.take(order), path)
+    return f"rows {a} and {b} swapped in {path.name}"
+
+
+def edit_json(root, rng):
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    holder, key = info, list(info)[rng.integers(len(info))]
+    while isinstance(holder[key], (dict, list)) and holder[key] and rng.random() < 0.9:
+        holder = holder[key]
+        keys = list(holder) if isinstance(holder, dict) else list(range(len(holder)))
+        key = keys[rng.integers(len(keys))]
+    values = [None, 0, -1, 3, 2.5, "x", "deg", True, [], {}, [["a"]], "video", "float64", 1e300]
+    values += [float("nan"), "data/{chunk_index}/{x}", "../{episode_index}", "{0.__class__}"]
+    if rng.random() < 0.2:
+        del holder[key]
+    else:
+        holder[key] = values[rng.integers(len(values))]
+    path.write_text(json.dumps(info))
+    return f"{key} edited in info.json"
+
+
+MUTATIONS = [
+    flip_bytes,
+    flip_footer,
+    truncate,
+    remove_file,
+    drop_column,
+    drop_rows,
+    swap_rows,
+    edit_json,
+]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    root = tmp_path_factory.mktemp("original") / "set"
+    half = demonstrations()
+    save_lerobot(half[:2], root, fps=50, task="reach", robot_type="arm")
+    return save_lerobot(half[2:], root, fps=50, task="shake", append=True)
+
+
+@pytest.mark.parametrize("mutate", MUTATIONS, ids=lambda mutate: mutate.__name__)
+def test_damage_gives_the_right_data_or_a_specific_error(mutate, original, tmp_path):
+    expected = load_lerobot(original)
+    refused = 0
+    for seed in range(COPIES // len(MUTATIONS)):
+        copy = tmp_path / str(seed)
+        shutil.copytree(original, copy)
+        what = mutate(copy, np.random.default_rng(seed))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                found = load_lerobot(copy)
+        except DatasetError as error:
+            refused += 1
+            assert str(error)
+        else:
+            assert same(found, expected), f"wrong data after: {what} (seed {seed})"
+        shutil.rmtree(copy)
+    assert refused > 0
+
+
+@pytest.mark.parametrize("function", [load_lerobot, iter_lerobot])
+def test_options_are_those_of_what_opens_a_recording(function, root):
+    shown, opened = inspect.signature(function), inspect.signature(open_recording)
+    assert shown.parameters == opened.parameters
+    assert "Demonstration" in shown.return_annotation
+    with pytest.raises(TypeError, match="robto"):
+        function(root, robto=None)
+    for name in opened.parameters:
+        assert name in function.__doc__

@@ -16,16 +16,9 @@ from tests.support.lerobot_sets import (
     joints_of,
     set_column,
     undeclared,
-    write,
 )
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
 from tpgmm_datasets.units import as_scale, convert, guess_unit, with_pose_units
-
-
-@pytest.fixture
-def root(tmp_path):
-    write(tmp_path / "set")
-    return tmp_path / "set"
 
 
 def test_degrees_become_radians(root):

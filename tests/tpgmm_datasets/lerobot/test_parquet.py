@@ -1,0 +1,76 @@
+"""Parquet files: read in parts, and named where they are damaged."""
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tests.support.lerobot_sets import (
+    DATA,
+    assert_equal,
+    assert_refused,
+    change_info,
+    change_table,
+    joints_of,
+    set_column,
+    to_v21,
+)
+from tpgmm_datasets import (
+    DatasetWarning,
+    load_lerobot,
+)
+from tpgmm_datasets.lerobot import parquet
+
+
+def test_small_batches_give_the_same_demonstrations(root, monkeypatch):
+    expected = joints_of(load_lerobot(root))
+    monkeypatch.setattr(parquet, "BATCH_ROWS", 4)
+    assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def test_another_data_path_and_list_columns_are_read(root):
+    expected = joints_of(load_lerobot(root))
+    (root / "data" / "all").mkdir()
+    lists = pa.list_(pa.float64())
+    table = pq.read_table(root / DATA).replace_schema_metadata(None)
+    column = table["observation.state"].combine_chunks().cast(lists)
+    pq.write_table(
+        set_column(table, "observation.state", column), root / "data/all/0-0.parquet"
+    )
+    (root / DATA).unlink()
+    template = "data/all/{chunk_index}-{file_index}.parquet"
+    change_info(root, lambda info: info.update(data_path=template))
+    assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def cut_file(root):
+    (root / DATA).write_bytes((root / DATA).read_bytes()[:-200])
+
+
+def without(name):
+    return lambda root: change_table(root, DATA, lambda table: table.drop_columns([name]))
+
+
+def test_a_missing_file_can_be_relaxed(root, tmp_path):
+    old = to_v21(root, tmp_path / "old")
+    (old / "data/chunk-000/episode_000001.parquet").unlink()
+    with pytest.warns(DatasetWarning, match="episode_000001.parquet: the file is missing"):
+        assert len(load_lerobot(old, relax=["missing"])) == 2
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda root: (root / DATA).unlink(),
+        lambda root: (root / DATA).write_bytes(b""),
+        cut_file,
+    ],
+)
+def test_a_file_that_is_missing_or_cut_off_is_named(root, damage):
+    damage(root)
+    assert_refused(root, "missing", DATA)
+
+
+@pytest.mark.parametrize("column", ["observation.state", "episode_index"])
+def test_a_column_that_is_missing_is_named(root, column):
+    without(column)(root)
+    assert_refused(root, "", DATA, column=column)

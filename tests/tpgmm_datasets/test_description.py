@@ -1,0 +1,64 @@
+"""What a description tells of a data set."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.lerobot_sets import (
+    FPS,
+    in_data,
+    in_info,
+    joints_of,
+    spoil,
+    stuck,
+    to_v21,
+    undeclared,
+)
+from tpgmm_datasets import (
+    describe_lerobot,
+    load_lerobot,
+)
+
+
+def test_a_description_tells_what_is_there(root):
+    found = describe_lerobot(root)
+    assert (found.version, found.fps, found.robot_type) == ("v3.0", FPS, "arm")
+    assert (found.joints, found.frames, found.events) == (
+        "observation.state",
+        ("bottle",),
+        ("close",),
+    )
+    assert found.tasks == ("reach", "shake")
+    assert found.lengths == (12, 9, 15)
+    assert found.duration == pytest.approx(36 / FPS)
+    assert found.problems == ()
+    columns = {column.key: column for column in found.columns}
+    assert columns["observation.state"].units == ("rad", "rad", "rad")
+    every = torch.cat(joints_of(load_lerobot(root)))
+    assert columns["observation.state"].high == tuple(every.amax(dim=0).tolist())
+
+
+def test_a_description_guesses_units_and_lists_cameras(root, tmp_path):
+    undeclared(root, 180 / math.pi)
+    found = describe_lerobot(to_v21(root, tmp_path / "old"))
+    state = next(column for column in found.columns if column.key == "observation.state")
+    assert "deg" in state.units[0]
+    assert found.cameras == ("camera",)
+
+
+def test_a_description_lists_all_problems(root):
+    in_info(total_episodes=4, total_frames=1)(root)
+    in_data("timestamp", stuck)(root)
+    in_data("observation.state", spoil(14, 1, np.nan))(root)
+    in_data("action", spoil(30, 1, np.nan))(root)
+    problems = describe_lerobot(root).problems
+    assert [problem.check for problem in problems] == [
+        "metadata",
+        "metadata",
+        "time",
+        "nan",
+        "nan",
+    ]
+    assert [problem.episode for problem in problems] == [None, None, 1, 1, 2]
