@@ -23,7 +23,8 @@ EXAMPLE = (
     "Example: tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand "
     "--frame bottle --n-components 30 --out out/model"
 )
-LEARNING, REPRODUCING = "Learning", "Reproduction (saved with the model)"
+learning = options.in_panel("Learning")
+reproducing = options.in_panel("Reproduction (saved with the model)")
 
 
 @app.command(epilog=EXAMPLE)
@@ -45,11 +46,9 @@ def fit(
     coordinate: options.Coordinates = None,
     poses: Annotated[
         list[str] | None,
-        typer.Option(
+        options.of_robot(
+            "Instead of a robot: a tracked body whose pose the data set holds, repeatable.",
             metavar="NAME",
-            rich_help_panel=options.ROBOT,
-            help="Instead of a robot: a tracked body whose pose the data set holds, "
-            "repeatable.",
         ),
     ] = None,
     frame: options.Frames = None,
@@ -60,109 +59,76 @@ def fit(
     alignment: options.AlignmentMethod = "dtw",
     batch_episodes: Annotated[
         int | None,
-        typer.Option(
+        options.of_data(
+            "For sets larger than memory: read so many episodes at a time. The first N "
+            "decide on the common clock. Default: all at once.",
             min=1,
             metavar="N",
-            rich_help_panel=options.DATA,
-            help="For sets larger than memory: read so many episodes at a time. The first N "
-            "decide on the common clock. Default: all at once.",
         ),
     ] = None,
     operator: Annotated[
         list[str] | None,
-        typer.Option(
-            rich_help_panel=LEARNING,
-            help="What is learned together, repeatable: 'canonical' (the joints), "
+        learning(
+            "What is learned together, repeatable: 'canonical' (the joints), "
             "'position:LINK@FRAME', 'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), "
             "without @FRAME in the base frame; FRAME may be another link; '+' stacks. "
-            "Default: the poses of all links in all frames, stacked, and canonical.",
+            "Default: the poses of all links in all frames, stacked, and canonical."
         ),
     ] = None,
-    n_components: Annotated[
-        int, typer.Option(min=1, rich_help_panel=LEARNING, help="K, the number of Gaussians.")
-    ] = 10,
+    n_components: Annotated[int, learning("K, the number of Gaussians.", min=1)] = 10,
     covariance_type: Annotated[
-        Literal["full", "diag", "tied", "spherical"],
-        typer.Option(rich_help_panel=LEARNING, help="Shape of the covariances."),
+        Literal["full", "diag", "tied", "spherical"], learning("Shape of the covariances.")
     ] = "full",
     reg_covar: Annotated[
         float,
-        typer.Option(
-            min=0,
-            rich_help_panel=LEARNING,
-            help="Added to the covariances' diagonal, relative to each coordinate's variance.",
+        learning(
+            "Added to the covariances' diagonal, relative to each coordinate's variance.", min=0
         ),
     ] = 1e-5,
     tol: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            rich_help_panel=LEARNING,
-            help="Stop when the mean log-likelihood gains less.",
-        ),
+        float, learning("Stop when the mean log-likelihood gains less.", min=0)
     ] = 1e-3,
-    max_iter: Annotated[
-        int, typer.Option(min=1, rich_help_panel=LEARNING, help="Largest number of iterations.")
-    ] = 100,
-    n_init: Annotated[
-        int,
-        typer.Option(min=1, rich_help_panel=LEARNING, help="Starts, of which the best counts."),
-    ] = 1,
+    max_iter: Annotated[int, learning("Largest number of iterations.", min=1)] = 100,
+    n_init: Annotated[int, learning("Starts, of which the best counts.", min=1)] = 1,
     init_params: Annotated[
         Literal["time", "kmeans", "random"],
-        typer.Option(rich_help_panel=LEARNING, help="How to start; 'time' cuts equal bins."),
+        learning("How to start; 'time' cuts equal bins."),
     ] = "time",
     responsibilities: Annotated[
         Literal["auto", "instant", "point"],
-        typer.Option(
-            rich_help_panel=LEARNING,
-            help="Whether a component takes all demonstrations at an instant, or each point "
-            "by itself; 'auto' is 'instant' after alignment.",
+        learning(
+            "Whether a component takes all demonstrations at an instant, or each point "
+            "by itself; 'auto' is 'instant' after alignment."
         ),
     ] = "auto",
-    random_state: Annotated[
-        int, typer.Option(rich_help_panel=LEARNING, help="Seed of what is random.")
-    ] = 0,
+    random_state: Annotated[int, learning("Seed of what is random.")] = 0,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            rich_help_panel=LEARNING,
-            help="Keep the state of EM there, and go on from it if it is of the same data and "
+        learning(
+            "Keep the state of EM there, and go on from it if it is of the same data and "
             "settings.",
+            metavar="DIR",
         ),
     ] = None,
     checkpoint_every: Annotated[
-        int,
-        typer.Option(
-            min=1, rich_help_panel=LEARNING, help="Iterations from one state kept to the next."
-        ),
+        int, learning("Iterations from one state kept to the next.", min=1)
     ] = 10,
     fusion: Annotated[
         Literal["information", "covariance"],
-        typer.Option(
-            rich_help_panel=REPRODUCING,
-            help="Form of the product of Gaussians; 'covariance' is the paper's, as printed.",
+        reproducing(
+            "Form of the product of Gaussians; 'covariance' is the paper's, as printed."
         ),
     ] = "information",
     activation: Annotated[
-        Literal["time", "product"],
-        typer.Option(rich_help_panel=REPRODUCING, help="Where mixing weights come from."),
+        Literal["time", "product"], reproducing("Where mixing weights come from.")
     ] = "time",
     epsilon: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            rich_help_panel=REPRODUCING,
-            help="Regulariser of --fusion covariance, rad^2.",
-        ),
+        float, reproducing("Regulariser of --fusion covariance, rad^2.", min=0)
     ] = 1e-4,
     blend: Annotated[
         float,
-        typer.Option(
-            min=0,
-            rich_help_panel=REPRODUCING,
-            help="Seconds over which the start posture leads into the model's reference.",
+        reproducing(
+            "Seconds over which the start posture leads into the model's reference.", min=0
         ),
     ] = 1.0,
 ) -> None:

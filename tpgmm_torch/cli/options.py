@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,93 +16,86 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = [
-    "align",
-    "aligner",
-    "read_robot",
-    "recordings",
-]
+__all__ = ["align", "aligner", "in_panel", "read_robot", "recordings"]
 
-DATA, ROBOT = "Data set", "Robot"
-ENVIRONMENT = "observation.environment_state"
+
+def in_panel(panel: str) -> Callable[..., Any]:
+    """A ``typer.Option`` that is shown in a panel of the help; its text comes first.
+
+    Parameters
+    ----------
+    panel : str
+        The heading.
+    """
+
+    def option(text: str, *names: str, **settings: Any) -> Any:
+        return typer.Option(*names, help=text, rich_help_panel=panel, **settings)
+
+    return option
+
+
+of_data, of_robot = in_panel("Data set"), in_panel("Robot")
+
 Dataset = Annotated[str, typer.Argument(help="A LeRobot data set: its folder, or its hub id.")]
 Model = Annotated[Path, typer.Argument(metavar="DIR", help="A model that 'tpgmm fit' saved.")]
 Frames = Annotated[
     list[str] | None,
-    typer.Option(
+    of_data(
+        "An object's pose, repeatable: NAME (found by the names in "
+        "observation.environment_state), NAME=FEATURE, NAME=FEATURE\\[7:14], or "
+        "NAME=LINK@EVENT, where a link of the robot is at an event. Default: all poses that "
+        "the set names.",
         "--frame",
         metavar="NAME[=SOURCE]",
-        rich_help_panel=DATA,
-        help="An object's pose, repeatable: NAME (found by the names in "
-        f"{ENVIRONMENT}), NAME=FEATURE, NAME=FEATURE\\[7:14], or NAME=LINK@EVENT, where a "
-        "link of the robot is at an event. Default: all poses that the set names.",
     ),
 ]
 Episodes = Annotated[
-    str | None,
-    typer.Option(
-        metavar="0:10 | 0,3,5 | TASK",
-        rich_help_panel=DATA,
-        help="Which episodes; default all.",
-    ),
+    str | None, of_data("Which episodes; default all.", metavar="0:10 | 0,3,5 | TASK")
 ]
 Units = Annotated[
     list[str] | None,
-    typer.Option(
-        metavar="[JOINT=]UNIT",
-        rich_help_panel=DATA,
-        help="Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them, "
+    of_data(
+        "Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them, "
         "repeatable. Default: as the set declares.",
+        metavar="[JOINT=]UNIT",
     ),
 ]
 Joints = Annotated[
     str | None,
-    typer.Option(
+    of_data(
+        "The feature that holds the joints; default observation.state or the like.",
         metavar="FEATURE",
-        rich_help_panel=DATA,
-        help="The feature that holds the joints; default observation.state or the like.",
     ),
 ]
-Rate = Annotated[
-    float | None,
-    typer.Option(min=1e-3, rich_help_panel=DATA, help="Resample to so many steps per second."),
+Rate = Annotated[float | None, of_data("Resample to so many steps per second.", min=1e-3)]
+AlignmentMethod = Annotated[
+    Literal["dtw", "barycenter", "linear", "none"],
+    of_data(
+        "Bring episodes onto one clock: by time warping onto the most typical one, onto "
+        "their average, by stretching time, or not at all."
+    ),
 ]
 RobotFile = Annotated[
     str | None,
-    typer.Option(
-        metavar="URDF",
-        rich_help_panel=ROBOT,
-        help="The robot's URDF file; 'upper_body' is the one that comes with the package. "
+    of_robot(
+        "The robot's URDF file; 'upper_body' is the one that comes with the package. "
         "Without a robot, joints alone.",
+        metavar="URDF",
     ),
 ]
-Links = Annotated[
-    list[str] | None,
-    typer.Option(rich_help_panel=ROBOT, help="A link of interest (a hand), repeatable."),
-]
+Links = Annotated[list[str] | None, of_robot("A link of interest (a hand), repeatable.")]
 RobotJoints = Annotated[
     list[str] | None,
-    typer.Option(
+    of_robot(
+        "Joints that move, repeatable, like 'left_*'; the others stand still. Default: all.",
         metavar="PATTERN",
-        rich_help_panel=ROBOT,
-        help="Joints that move, repeatable, like 'left_*'; the others stand still. "
-        "Default: all.",
     ),
 ]
 Coordinates = Annotated[
     list[str] | None,
-    typer.Option(
+    of_robot(
+        "A value that is learned like a joint but moves no link (a gripper), repeatable.",
         metavar="NAME",
-        rich_help_panel=ROBOT,
-        help="A value that is learned like a joint but moves no link (a gripper), repeatable.",
-    ),
-]
-AlignmentMethod = Annotated[
-    Literal["dtw", "barycenter", "linear", "none"],
-    typer.Option(
-        rich_help_panel=DATA,
-        help="Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, or not at all.",
     ),
 ]
 
@@ -116,17 +109,7 @@ def recordings(
     joints: str | None,
     rate: float | None,
 ) -> plugins.Recordings:
-    """A data set as the options say, not yet read.
-
-    Parameters
-    ----------
-    dataset : str
-        A folder or a hub id.
-    robot : Kinematics or None
-        Gives the order of the joints.
-    frames, episodes, units, joints, rate
-        The options.
-    """
+    """A data set as the options say, not yet read; a robot gives the order of its joints."""
     reader = plugins.required(plugins.READERS, "lerobot")
     opened: plugins.Recordings = reader(dataset, robot, frames, episodes, units, joints, rate)
     return opened
@@ -139,17 +122,16 @@ def read_robot(
     coordinates: Sequence[str] | None = None,
     poses: Sequence[str] | None = None,
 ) -> Kinematics | None:
-    """The robot that the options describe; None for joints alone.
+    """The robot that the options describe, or tracked poses; None for joints alone.
 
     Parameters
     ----------
     robot : str or None
-        Path of a URDF, or ``"upper_body"``.
-    links : sequence of str, optional
+        Path of a URDF, or the name of one that is registered in ``tpgmm.robots``.
+    links, coordinates : sequence of str, optional
+        Links of interest, and joints without kinematics.
     joints : sequence of str, optional
         Patterns with ``*`` for the joints that move; the others stand still. All by default.
-    coordinates : sequence of str, optional
-        Joints without kinematics.
     poses : sequence of str, optional
         Tracked bodies in place of a robot.
 
@@ -185,29 +167,8 @@ def read_robot(
     return Robot.from_urdf(robot, links or (), joints=moving, coordinates=coordinates or ())
 
 
-def align(
-    demonstrations: Sequence[Demonstration], method: str, robot: Kinematics | None
-) -> list[Demonstration]:
-    """Bring demonstrations onto one clock.
-
-    Parameters
-    ----------
-    demonstrations : sequence of Demonstration
-    method : {"dtw", "barycenter", "linear", "none"}
-    robot : Kinematics or None
-    """
-    chosen = aligner(method, robot)
-    return list(demonstrations) if chosen is None else chosen.fit_transform(demonstrations)
-
-
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
-    """The transformer that brings demonstrations onto one clock, None for none.
-
-    Parameters
-    ----------
-    method : {"dtw", "barycenter", "linear", "none"}
-    robot : Kinematics or None
-    """
+    """The transformer that ``--alignment`` names, None for none."""
     from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 
     if method == "none":
@@ -215,3 +176,11 @@ def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
     if method == "linear":
         return LinearTimeNormalization(robot=robot)
     return DynamicTimeWarping("medoid" if method == "dtw" else method, robot=robot)
+
+
+def align(
+    demonstrations: list[Demonstration], method: str, robot: Kinematics | None
+) -> list[Demonstration]:
+    """Bring demonstrations onto one clock, as ``--alignment`` names it."""
+    chosen = aligner(method, robot)
+    return demonstrations if chosen is None else chosen.fit_transform(demonstrations)

@@ -84,13 +84,7 @@ def plot(
 
 
 def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
-    """A label for each local coordinate of an operator.
-
-    Parameters
-    ----------
-    operator : Operator
-    kinematics : Kinematics
-    """
+    """A label for each local coordinate of an operator."""
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,

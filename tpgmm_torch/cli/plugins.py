@@ -43,28 +43,17 @@ class Recordings(Protocol):
 
 
 def found(group: str) -> dict[str, EntryPoint]:
-    """The entry points of a group by name.
-
-    Parameters
-    ----------
-    group : str
-        One of the groups above.
-    """
+    """The entry points of a ``group`` by name."""
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
 def required(group: str, name: str) -> Any:
-    """What is registered under a name by this distribution itself.
-
-    Parameters
-    ----------
-    group, name : str
-        Where it is registered.
+    """What this distribution itself registers in ``group`` under ``name``.
 
     Raises
     ------
     DependencyError
-        If it is not, because an older release was installed than is run.
+        If it does not, because an older release is installed than is run.
     """
     from tpgmm_torch.exceptions import DependencyError
 
@@ -78,12 +67,7 @@ def required(group: str, name: str) -> Any:
 
 
 def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
-    """What writes a model in a format; None for the estimator's own.
-
-    Parameters
-    ----------
-    name : str
-        As ``--format`` takes it.
+    """What writes a model in the format ``name``; None for the estimator's own.
 
     Raises
     ------

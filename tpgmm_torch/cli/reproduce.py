@@ -84,12 +84,7 @@ def reproduce(
 
 
 def situation_of(demonstration: Demonstration) -> Situation:
-    """The situation of a demonstration, on the model's clock unless its frames move.
-
-    Parameters
-    ----------
-    demonstration : Demonstration
-    """
+    """The situation of a demonstration, on the model's clock unless its frames move."""
     from tpgmm_torch.data.demonstrations import Situation
 
     if any(frame.batch_shape for frame in demonstration.frames.values()):

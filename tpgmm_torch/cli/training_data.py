@@ -27,11 +27,11 @@ class AlignedBatches:
     Parameters
     ----------
     batches : iterable of sequence of Demonstration
-        This process's.
+        Those of this process.
     alignment : Alignment or None
         Fitted already.
     durations : list of float
-        Of the episodes of the last pass, before they were aligned [s].
+        Of the episodes of the last pass, before alignment [s].
     steps : int
         Number of their time steps, after.
     """
@@ -73,12 +73,9 @@ class TrainingData:
     aligned: Sequence[Demonstration]
 
     def summary(self, processes: Processes) -> tuple[list[float], int]:
-        """Durations of all episodes, and their steps after alignment; after ``fit``.
+        """Durations of all episodes, and their steps after alignment, after ``fit``.
 
-        Parameters
-        ----------
-        processes : Processes
-            All of which have to ask.
+        All processes have to ask.
         """
         if not isinstance(self.source, AlignedBatches):
             return [d.duration for d in self.read], sum(map(len, self.aligned))
@@ -97,18 +94,13 @@ def read_training_data(
     """Read what this process learns from.
 
     Without batches each process reads and aligns all episodes, then learns from its share.
-    With batches it reads its share alone, and the alignment is that of the first batch of all.
+    With ``batch_episodes`` it reads its share alone, and the alignment, named as in
+    ``--alignment``, is that of the first batch of all.
 
     Parameters
     ----------
-    recordings : Recordings
-        All episodes.
-    robot : Kinematics or None
-        What the alignment may ask for links.
-    alignment : {"dtw", "barycenter", "linear", "none"}
-        The option.
-    batch_episodes : int or None
-        Episodes in a batch.
+    recordings, robot, alignment, batch_episodes
+        What the options say.
     processes : Processes
         Those that learn together.
     """

@@ -15,7 +15,7 @@ __all__ = ["app"]
 
 app = typer.Typer()
 
-LIVE = "Live"
+serving = options.in_panel("Live")
 EXAMPLE = (
     "Example: tpgmm view out/demo"
     "\n\n"
@@ -58,30 +58,24 @@ def view(
     rate: options.Rate = None,
     meshes: Annotated[
         Path | None,
-        typer.Option(
+        options.of_robot(
+            "The robot's mesh files; without them, sticks stand for meshes.",
             metavar="FOLDER",
             exists=True,
             file_okay=False,
-            rich_help_panel=options.ROBOT,
-            help="The robot's mesh files; without them, sticks stand for meshes.",
         ),
     ] = None,
     fps: Annotated[float, typer.Option(min=1, max=200, help="Pictures per second.")] = 25.0,
     live: Annotated[
         bool,
-        typer.Option(
-            "--live",
-            rich_help_panel=LIVE,
-            help="Serve the page instead: objects can be moved by hand, and the skill is "
+        serving(
+            "Serve the page instead: objects can be moved by hand, and the skill is "
             "reproduced anew.",
+            "--live",
         ),
     ] = False,
-    host: Annotated[
-        str, typer.Option(rich_help_panel=LIVE, help="Address to listen on.")
-    ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, rich_help_panel=LIVE, help="First port to try.")
-    ] = 8080,
+    host: Annotated[str, serving("Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, serving("First port to try.", min=0, max=65535)] = 8080,
 ) -> None:
     """Look at a motion in three dimensions.
 
