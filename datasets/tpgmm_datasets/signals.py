@@ -10,6 +10,7 @@ from typing import Any, Self
 from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources
 from tpgmm_datasets.conversion.poses import FramePose
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.columns import ACTION, ENVIRONMENT, STATE
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import match_names
 from tpgmm_datasets.reader import open_recording
@@ -17,8 +18,6 @@ from tpgmm_datasets.units import Scale, as_scale
 
 __all__ = ["Signals"]
 
-STATE, ACTION = "observation.state", "action"
-ENVIRONMENT = "observation.environment_state"
 REMEDY = "A policy observes each joint, and gives an action for it"
 
 

@@ -10,7 +10,9 @@ import pandas as pd
 import torch
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.columns import pose_values
 from tpgmm_datasets.names import POSE_PARTS
+from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 
@@ -55,27 +57,21 @@ def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataF
 def _part(demonstration: Demonstration, episode: int) -> pd.DataFrame:
     rows = len(demonstration)
     names = demonstration.joint_names or range(demonstration.n_joints)
-    joints = _array(demonstration.joints)
+    joints = as_array(demonstration.joints)
     columns: dict[Any, Any] = {("joint", name): joints[:, i] for i, name in enumerate(names)}
     for name, frame in demonstration.frames.items():
         kind = "frame" if frame.batch_shape else "constant frame"
-        pose = np.concatenate((_array(frame.position), _array(frame.orientation)), axis=-1)
-        pose = np.broadcast_to(pose, (rows, len(POSE_PARTS)))
+        pose = pose_values(frame, rows)
         columns |= {(kind, f"{name}.{part}"): pose[:, i] for i, part in enumerate(POSE_PARTS)}
     for name, at in demonstration.events.items():
         columns["event", name] = np.full(rows, at)
     index = pd.MultiIndex.from_arrays(
-        [np.full(rows, episode), _array(demonstration.time)], names=["episode", "time"]
+        [np.full(rows, episode), as_array(demonstration.time)], names=["episode", "time"]
     )
     # a dict of tuples would become a MultiIndex, which pandas aligns by sorting
     part = pd.DataFrame(dict(enumerate(columns.values())), index=index)
     part.columns = pd.Index(list(columns), tupleize_cols=False)
     return part
-
-
-def _array(values: torch.Tensor) -> np.ndarray[Any, Any]:
-    array: np.ndarray[Any, Any] = values.detach().cpu().double().numpy()
-    return array
 
 
 def demonstrations_from_frame(table: pd.DataFrame) -> list[Demonstration]:

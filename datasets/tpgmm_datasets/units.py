@@ -11,6 +11,7 @@ import numpy as np
 
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import pose_groups
+from tpgmm_torch.data.arrays import Array
 
 __all__ = [
     "POSE_UNITS",
@@ -22,8 +23,6 @@ __all__ = [
     "guess_unit",
     "with_pose_units",
 ]
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

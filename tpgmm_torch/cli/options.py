@@ -109,7 +109,17 @@ def recordings(
     joints: str | None,
     rate: float | None,
 ) -> plugins.Recordings:
-    """A data set as the options say, not yet read; a robot gives the order of its joints."""
+    """The ``dataset`` of which the options say the rest, not yet read.
+
+    Parameters
+    ----------
+    dataset : str
+        A folder or a hub id.
+    robot : Kinematics or None
+        Gives the order of the joints.
+    frames, episodes, units, joints, rate
+        The options as they were given.
+    """
     reader = plugins.required(plugins.READERS, "lerobot")
     opened: plugins.Recordings = reader(dataset, robot, frames, episodes, units, joints, rate)
     return opened
@@ -128,10 +138,12 @@ def read_robot(
     ----------
     robot : str or None
         Path of a URDF, or the name of one that is registered in ``tpgmm.robots``.
-    links, coordinates : sequence of str, optional
-        Links of interest, and joints without kinematics.
+    links : sequence of str, optional
+        Links of interest.
     joints : sequence of str, optional
         Patterns with ``*`` for the joints that move; the others stand still. All by default.
+    coordinates : sequence of str, optional
+        Joints without kinematics.
     poses : sequence of str, optional
         Tracked bodies in place of a robot.
 
@@ -168,7 +180,7 @@ def read_robot(
 
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
-    """The transformer that ``--alignment`` names, None for none."""
+    """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
     from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 
     if method == "none":
@@ -181,6 +193,6 @@ def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
 def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
-    """Bring demonstrations onto one clock, as ``--alignment`` names it."""
+    """Bring ``demonstrations`` onto one clock, as :func:`aligner` does by ``method, robot``."""
     chosen = aligner(method, robot)
     return demonstrations if chosen is None else chosen.fit_transform(demonstrations)

@@ -99,10 +99,8 @@ def read_training_data(
 
     Parameters
     ----------
-    recordings, robot, alignment, batch_episodes
-        What the options say.
-    processes : Processes
-        Those that learn together.
+    recordings, robot, alignment, batch_episodes, processes
+        What the options say, and those that learn together.
     """
     if batch_episodes is None:
         read = recordings.demonstrations()

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Recordings", "parse_episodes", "parse_frames", "parse_units"]
 
-ENVIRONMENT = "observation.environment_state"
 #: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
 FRAME = re.compile(
     r"(?P<name>[^=@\[\]]+)"
@@ -33,17 +32,10 @@ class Recordings:
     robot : Kinematics or None
         Gives the order of the joints.
     frames, episodes, units
-        Texts as :func:`parse_frames`, :func:`parse_episodes` and :func:`parse_units` take
-        them, or None.
-    joints : str or None
-        The feature that holds the joints.
-    rate : float or None
-        Steps per second.
-
-    Attributes
-    ----------
-    options : dict
-        Arguments of :func:`tpgmm_datasets.load_lerobot`.
+        What :func:`parse_frames`, :func:`parse_episodes` and :func:`parse_units` take, or
+        None.
+    joints, rate
+        As for :func:`tpgmm_datasets.load_lerobot`.
 
     Raises
     ------
@@ -94,17 +86,11 @@ class Recordings:
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
     """What ``load_lerobot`` takes as ``frames``; None if nothing was given.
 
-    Parameters
-    ----------
-    texts : sequence of str
-        ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``.
-
-    Raises
-    ------
-    DataError
-        If a text is none of these.
+    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``; a
+    DataError says so of any other.
     """
     from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+    from tpgmm_datasets.lerobot.columns import ENVIRONMENT
     from tpgmm_torch.exceptions import DataError
 
     frames: dict[str, Any] = {}
@@ -127,13 +113,7 @@ def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
 
 
 def parse_episodes(text: str | None) -> slice | list[int] | str | None:
-    """What ``load_lerobot`` takes as ``episodes``.
-
-    Parameters
-    ----------
-    text : str or None
-        ``"0:10"`` is a slice, ``"0,3,5"`` a list, anything else the name of a task.
-    """
+    """``"0:10"`` as a slice, ``"0,3,5"`` as a list, anything else as the name of a task."""
     if text is None:
         return None
     if re.fullmatch(r"(-?\d*):(-?\d*)", text):
@@ -145,17 +125,9 @@ def parse_episodes(text: str | None) -> slice | list[int] | str | None:
 
 
 def parse_units(texts: Sequence[str]) -> Any:
-    """What ``load_lerobot`` takes as ``units``.
+    """What ``load_lerobot`` takes as ``units``: one for all, or any number of ``JOINT=UNIT``.
 
-    Parameters
-    ----------
-    texts : sequence of str
-        One unit for all, or any number of ``JOINT=UNIT``.
-
-    Raises
-    ------
-    DataError
-        If both are given, or several for all.
+    A DataError is raised if both are given, or several for all.
     """
     from tpgmm_torch.exceptions import DataError
 

@@ -13,7 +13,7 @@ from tpgmm_datasets.conversion.joints import JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
 from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import pose_groups
@@ -35,11 +35,10 @@ def frame_sources(
             name: FramePose(source) if isinstance(source, str) else source
             for name, source in frames.items()
         }
-    feature = layout.features.get("observation.environment_state")
+    feature = layout.features.get(ENVIRONMENT)
     groups = pose_groups(feature.names) if feature else {}
     return {
-        name: FramePose("observation.environment_state", columns, constant=None)
-        for name, columns in groups.items()
+        name: FramePose(ENVIRONMENT, columns, constant=None) for name, columns in groups.items()
     }
 
 
@@ -103,7 +102,7 @@ class Assembly:
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
-        joints = self.joints.values(rows.values[self.joints.feature.key], **rows.where)
+        joints = self.joints.values(rows.values[self.joints.feature.key], **rows.episode.where)
         demonstration = Demonstration(
             torch.from_numpy(rows.time),
             torch.from_numpy(joints),
@@ -114,7 +113,7 @@ class Assembly:
         demonstration = self._with_events(demonstration, rows)
         demonstration = self._with_links(demonstration, rows)
         if self.trim is not None:
-            demonstration = trim(demonstration, self.trim, **rows.where)
+            demonstration = trim(demonstration, self.trim, **rows.episode.where)
         if self.rate is not None:
             demonstration = resample(demonstration, self.rate)
         if self.robot is not None:
@@ -127,7 +126,9 @@ class Assembly:
             if isinstance(source, FramePose):
                 feature = self.layout.feature(source.feature)
                 places = source.select(name, feature)
-                frames[name] = source.frame(rows.values[feature.key], places, **rows.where)
+                frames[name] = source.frame(
+                    rows.values[feature.key], places, **rows.episode.where
+                )
             elif isinstance(source, Frame):
                 frames[name] = source
         return frames
@@ -148,7 +149,7 @@ class Assembly:
                 raise DatasetError(
                     f"event {name!r} was found at {at:.6g} s, outside the episode of "
                     f"{demonstration.duration:.6g} s",
-                    **rows.where,
+                    **rows.episode.where,
                 )
             found[name] = at
         return replace(demonstration, events=found) if self.events else demonstration
@@ -157,7 +158,7 @@ class Assembly:
         frames = dict(demonstration.frames)
         for name, source in self.frames.items():
             if isinstance(source, LinkPose):
-                time = source.time(demonstration, **rows.where)
+                time = source.time(demonstration, **rows.episode.where)
                 frames[name] = source.frame(demonstration, self.robot, time)
         if len(frames) == len(demonstration.frames):
             return demonstration

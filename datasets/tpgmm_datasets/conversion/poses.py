@@ -13,12 +13,11 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import UNIT_NORM_TOLERANCE, Frame
 
 __all__ = ["FramePose", "LinkPose"]
-
-Array = np.ndarray[Any, Any]
 
 #: Number of values of each way to write a rotation.
 ROTATIONS = {"wxyz": 4, "xyzw": 4, "rotvec": 3, "euler": 3, "yaw": 1, None: 0}

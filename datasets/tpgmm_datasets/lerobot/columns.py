@@ -24,9 +24,17 @@ import pyarrow as pa
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import POSE_PARTS
 from tpgmm_datasets.units import POSE_UNITS, with_pose_units
+from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 
-__all__ = ["action_column", "demonstration_columns", "feature_table", "features_of"]
+__all__ = [
+    "action_column",
+    "demonstration_columns",
+    "feature_table",
+    "features_of",
+    "pose_values",
+]
 
 Array = np.ndarray[Any, Any]
 Features = dict[str, dict[str, Any]]
@@ -42,14 +50,7 @@ TIME_TOLERANCE = 0.01
 def features_of(
     demonstrations: Sequence[Demonstration], dtype: str, units: Mapping[str, str] | None = None
 ) -> Features:
-    """What ``info.json`` declares for these demonstrations.
-
-    Parameters
-    ----------
-    demonstrations : sequence of Demonstration
-    dtype : {"float32", "float64"}
-    units : mapping of str to str, optional
-        ``"m"`` or ``"raw"`` by name, for joints that are not in radians.
+    """What ``info.json`` declares for these demonstrations, told as ``save_lerobot`` is.
 
     Raises
     ------
@@ -106,7 +107,7 @@ def demonstration_columns(
     """
     steps = len(demonstration)
     grid = np.arange(steps) / fps
-    time = _array(demonstration.time - demonstration.time[0])
+    time = as_array(demonstration.time - demonstration.time[0])
     off = np.abs(time - grid)
     if off.max() > TIME_TOLERANCE / fps:
         at = int(off.argmax())
@@ -115,11 +116,14 @@ def demonstration_columns(
             f"{time[at]:.6g} s instead of {grid[at]:.6g} s. Resample it, "
             "tpgmm_datasets.resample(demonstration, fps)"
         )
-    joints = _array(demonstration.joints)
-    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
+    joints = as_array(demonstration.joints)
+    columns: dict[str, Array] = {
+        STATE: joints,
+        ACTION: np.concatenate((joints[1:], joints[-1:])),
+    }
     if demonstration.frames:
         columns[ENVIRONMENT] = np.concatenate(
-            [_pose(demonstration, name) for name in _frame_order(features)], axis=1
+            [pose_values(demonstration.frame(n), steps) for n in _frame_order(features)], axis=1
         )
     for key in features:
         if key.startswith(EVENT):
@@ -136,25 +140,14 @@ def demonstration_columns(
 def action_column(
     commanded: Demonstration, number: int, features: Mapping[str, Any]
 ) -> dict[str, Array]:
-    """The column ``action`` where the references are known, as the joints of ``commanded``.
-
-    Raises
-    ------
-    DatasetError
-        If there are not as many as joints.
-    """
+    """The column ``action`` where the references are known, as the joints of ``commanded``."""
     feature = features[ACTION]
     if commanded.n_joints != feature["shape"][0]:
         raise DatasetError(
             f"demonstration {number} has {feature['shape'][0]} joints and actions of "
             f"{commanded.n_joints} values"
         )
-    return {ACTION: _cast(_array(commanded.joints), feature["dtype"], ACTION, number)}
-
-
-def _array(values: Any) -> Array:
-    array: Array = values.detach().cpu().double().numpy()
-    return array
+    return {ACTION: _cast(as_array(commanded.joints), feature["dtype"], ACTION, number)}
 
 
 def _frame_order(features: Mapping[str, Any]) -> list[str]:
@@ -162,10 +155,10 @@ def _frame_order(features: Mapping[str, Any]) -> list[str]:
     return [name.removesuffix(".x") for name in names[:: len(POSE_PARTS)]]
 
 
-def _pose(demonstration: Demonstration, name: str) -> Array:
-    frame = demonstration.frame(name)
-    pose = np.concatenate((_array(frame.position), _array(frame.orientation)), axis=-1)
-    return np.broadcast_to(pose, (len(demonstration), len(POSE_PARTS)))
+def pose_values(frame: Frame, rows: int) -> Array:
+    """Position and quaternion of a frame at each of so many rows, shape (rows, 7)."""
+    pose = np.concatenate([as_array(frame.position), as_array(frame.orientation)], axis=-1)
+    return np.broadcast_to(pose, (rows, len(POSE_PARTS)))
 
 
 def _flag(demonstration: Demonstration, event: str, fps: float) -> Array:

@@ -45,11 +45,6 @@ class EpisodeRows:
     time: Array
     values: Mapping[str, Array]
 
-    @property
-    def where(self) -> dict[str, Any]:
-        """File and episode, for errors."""
-        return {"file": self.episode.file, "episode": self.episode.index}
-
 
 def strict_policy(relax: Collection[str]) -> Policy:
     """What to do with a problem: raise it, or warn if its check is among ``relax``.
@@ -177,8 +172,7 @@ def _rows(
 
 def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator[DatasetError]:
     """All contradictions between the rows of an episode and the metadata, and in time."""
-    where: dict[str, Any] = {"file": episode.file, "episode": episode.index}
-    rows = len(table)
+    where, rows = episode.where, len(table)
     if rows != episode.length:
         yield DatasetError(
             f"the metadata give {episode.length} rows, the file has {rows}",
@@ -209,9 +203,7 @@ def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator
 
 def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array:
     """The values of a feature, shape (T, width), without a copy where arrow allows."""
-    where: dict[str, Any] = {"file": episode.file, "episode": episode.index}
-    where["column"] = feature.key
-    rows = len(table)
+    where, rows = episode.where | {"column": feature.key}, len(table)
     flat = _flat(table[feature.key].combine_chunks(), where)
     if str(flat.type) != ARROW_NAMES.get(feature.dtype, feature.dtype):
         raise DatasetError(

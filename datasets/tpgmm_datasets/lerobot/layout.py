@@ -91,6 +91,11 @@ class Episode:
     file: Path
     start: int | None = None
 
+    @property
+    def where(self) -> dict[str, Any]:
+        """File and index, for errors."""
+        return {"file": self.file, "episode": self.index}
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -144,14 +149,6 @@ class Layout:
                 column=key,
             )
         return self.features[key]
-
-    @property
-    def files(self) -> dict[Path, list[Episode]]:
-        """The episodes by the file that holds them, in order."""
-        files: dict[Path, list[Episode]] = {}
-        for episode in self.episodes:
-            files.setdefault(episode.file, []).append(episode)
-        return files
 
 
 def open_layout(root: Path) -> Layout:

@@ -72,13 +72,7 @@ def open_parquet(path: Path, root: Path, columns: Sequence[str]) -> pq.ParquetFi
 
 
 def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
-    """Read some columns of a parquet file whole.
-
-    Raises
-    ------
-    DatasetError
-        If it is missing or unreadable, or a column is not in it.
-    """
+    """Read some columns of a parquet file whole; errors are those of ``open_parquet``."""
     with open_parquet(path, root, columns) as parquet, _named(path.relative_to(root)):
         table = parquet.read(columns=list(columns), use_threads=False).select(list(columns))
         table.validate(full=True)

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_torch.data.arrays import Array
 
 __all__ = ["row_times", "time_problems"]
-
-Array = np.ndarray[Any, Any]
 
 #: Fractions of a period: how far a row may be off its place on the grid, and how long a step
 #: may be.

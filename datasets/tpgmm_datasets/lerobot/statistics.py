@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
+from tpgmm_torch.data.arrays import Array
+
 __all__ = ["QUANTILES", "Statistics", "episode_statistics", "merge_statistics"]
 
-Array = np.ndarray[Any, Any]
 #: By column, by name of the statistic: one value per value of the column.
 Statistics = dict[str, dict[str, Array]]
 
