@@ -104,8 +104,8 @@ class Folder:
 
     def _replaceable(self, path: Path) -> bool:
         """Whether nothing but one of this kind, or nothing at all, is lost by replacing it."""
-        own = {CONFIG, self.tensors}
-        if not path.is_dir() or {item.name for item in path.iterdir()} - own:
+        files = {CONFIG, self.tensors}
+        if not path.is_dir() or {item.name for item in path.iterdir()} - files:
             return False
         try:
             return json.loads((path / CONFIG).read_text())["format"] == self._format
@@ -164,9 +164,11 @@ class Folder:
             tensors = safetensors.torch.load(blob)
         except SafetensorError as error:
             raise ModelFileError(f"{path / self.tensors} cannot be read: {error}") from error
-        found = {k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()}
-        if found != config.get("tensors"):
+        described = {
+            k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()
+        }
+        if described != config.get("tensors"):
             raise ModelFileError(
-                f"{path / self.tensors} holds {found}, expected {config.get('tensors')}"
+                f"{path / self.tensors} holds {described}, expected {config.get('tensors')}"
             )
         return config, tensors

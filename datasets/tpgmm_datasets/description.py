@@ -50,7 +50,7 @@ class ColumnInfo:
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What :func:`describe_lerobot` found.
+    """What :func:`describe_lerobot` returns.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class DatasetInfo:
     fps : float
         Rows per second.
     columns : tuple of ColumnInfo
-        The numeric ones, LeRobot's bookkeeping apart.
+        The numeric ones, without LeRobot's bookkeeping.
     cameras : tuple of str
         Video and image columns, which are not read.
     joints : str or None
@@ -93,7 +93,7 @@ class DatasetInfo:
 
     @property
     def duration(self) -> float:
-        """Seconds of all episodes together."""
+        """Seconds of all episodes."""
         return sum(self.lengths) / self.fps
 
 
@@ -163,11 +163,13 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
     )
 
 
-def _column(feature: Feature, found: tuple[Any, Any] | None, joints: str | None) -> ColumnInfo:
+def _column(
+    feature: Feature, extremes: tuple[Any, Any] | None, joints: str | None
+) -> ColumnInfo:
     units = feature.units
     low = high = None
-    if found is not None:
-        low, high = (tuple(map(float, values)) for values in found)
+    if extremes is not None:
+        low, high = (tuple(map(float, values)) for values in extremes)
         if units is None and feature.key == joints:
             guesses = [f"{guess_unit(a, b)}?" for a, b in zip(low, high, strict=True)]
             units = with_pose_units(feature.names, guesses)

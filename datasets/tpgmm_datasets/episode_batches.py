@@ -19,8 +19,8 @@ __all__ = ["EpisodeBatches"]
 class EpisodeBatches:
     """The episodes of a LeRobot data set in batches, for ``TaskParameterizedGMM.fit``.
 
-    Each ``iter()`` starts to read anew. The metadata are checked when it is made, the rows of
-    an episode when it comes.
+    Each ``iter()`` reads from the first on. The metadata are checked when it is made, the
+    rows of an episode when it comes.
 
     Parameters
     ----------

@@ -79,18 +79,18 @@ def match_names(
     DatasetError
         If a name is found nowhere or fits several.
     """
-    found: dict[str, str] = {}
+    matched: dict[str, str] = {}
     for name in wanted:
         fits = [name] if name in present else [p for p in present if _words(p) == _words(name)]
-        fits = [fit for fit in fits if fit not in found]
+        fits = [fit for fit in fits if fit not in matched]
         if len(fits) != 1:
             what = f"fits several values, {fits}" if fits else "is none of the values"
             raise DatasetError(
                 f"the robot's joint {name!r} {what}; they are called {list(present)}. {remedy}",
                 column=column,
             )
-        found[fits[0]] = name
-    return found
+        matched[fits[0]] = name
+    return matched
 
 
 def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:

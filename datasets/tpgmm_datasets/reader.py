@@ -99,8 +99,8 @@ def select_episodes(
     DatasetError
         If an index or a task does not exist.
     """
-    known = {episode.index: episode for episode in layout.episodes}
-    available = list(known.values())
+    by_index = {episode.index: episode for episode in layout.episodes}
+    available = list(by_index.values())
     if episodes is None:
         return available
     if isinstance(episodes, slice):
@@ -112,10 +112,10 @@ def select_episodes(
                 f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
             )
         return chosen
-    missing = [index for index in episodes if index not in known]
+    missing = [index for index in episodes if index not in by_index]
     if missing:
-        raise DatasetError(f"there are no episodes {missing}; the set has {sorted(known)}")
-    return [known[index] for index in sorted({int(index) for index in episodes})]
+        raise DatasetError(f"there are no episodes {missing}; the set has {sorted(by_index)}")
+    return [by_index[index] for index in sorted({int(index) for index in episodes})]
 
 
 def opened_by[**P, T](

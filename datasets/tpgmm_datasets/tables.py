@@ -125,11 +125,11 @@ def _demonstration(episode: Any, part: pd.DataFrame) -> Demonstration:
     poses = [(k, n.rpartition(".")[0]) for k, n in part.columns if k in FRAME_KINDS]
     frames = {}
     for kind, name in dict.fromkeys(poses):
-        own = [(kind, f"{name}.{x}") for x in POSE_PARTS]
-        lacking = [full for _, full in own if full not in names[kind]]
+        columns = [(kind, f"{name}.{x}") for x in POSE_PARTS]
+        lacking = [full for _, full in columns if full not in names[kind]]
         if lacking:
             raise DatasetError(f"{where} lacks {lacking} of frame {name!r}")
-        pose = torch.from_numpy(np.array(part[own], dtype=np.float64))
+        pose = torch.from_numpy(np.array(part[columns], dtype=np.float64))
         pose = pose if kind == "frame" else _only(pose, name, where)
         frames[name] = Frame(pose[..., :3], pose[..., 3:])
     events = {

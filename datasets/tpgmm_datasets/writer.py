@@ -179,20 +179,20 @@ def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
     features = {**new["features"]}
     # an event that none of the new demonstrations has stays a column
     features |= {k: v for k, v in info["features"].items() if k.startswith("event.")}
-    for name, given, found in (
+    for name, given, present in (
         ("codebase_version", new["codebase_version"], old.version),
         ("fps", new["fps"], info["fps"]),
         ("robot_type", new["robot_type"] or info.get("robot_type"), info.get("robot_type")),
         ("features", sorted(features), sorted(info["features"])),
     ):
-        if given != found:
-            raise DatasetError(f"the set has {name} {found!r}, the demonstrations {given!r}")
+        if given != present:
+            raise DatasetError(f"the set has {name} {present!r}, the demonstrations {given!r}")
     for key, feature in features.items():
         for name in ("dtype", "shape", "names"):
-            found = info["features"][key].get(name)
-            if feature[name] != found:
+            present = info["features"][key].get(name)
+            if feature[name] != present:
                 raise DatasetError(
-                    f"the set has {name} {found!r}, the demonstrations {feature[name]!r}",
+                    f"the set has {name} {present!r}, the demonstrations {feature[name]!r}",
                     column=key,
                 )
     return info
@@ -268,8 +268,8 @@ class _Writer:
         for key, column in statistics.items():
             row |= {f"stats/{key}/{name}": column[name].tolist() for name in column}
         self.pending.append(row)
-        known = self.statistics
-        self.statistics = statistics if known is None else merge_statistics(known, statistics)
+        before = self.statistics
+        self.statistics = statistics if before is None else merge_statistics(before, statistics)
         self.episodes, self.rows = self.episodes + 1, self.rows + rows
 
     def _flush(self) -> None:
@@ -311,9 +311,11 @@ def _old_statistics(old: Layout) -> Statistics:
     needed = {"min", "max", "mean", "std", "count", *QUANTILES}
     with suppress(OSError, ValueError, TypeError, AttributeError):
         stored = json.loads(path.read_text(encoding="utf-8"))
-        found = {key: {n: np.array(v) for n, v in stored[key].items()} for key in old.features}
-        if all(needed <= set(column) for column in found.values()):
-            return found
+        statistics = {
+            key: {n: np.array(v) for n, v in stored[key].items()} for key in old.features
+        }
+        if all(needed <= set(column) for column in statistics.values()):
+            return statistics
     raise DatasetError(
         "statistics of some columns are missing or not readable; the set cannot grow",
         file="meta/stats.json",

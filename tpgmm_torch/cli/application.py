@@ -1,4 +1,4 @@
-"""The commands together: what they have in common, and what plugins add."""
+"""The command ``tpgmm``: what its commands have in common, and what plugins add."""
 
 from __future__ import annotations
 

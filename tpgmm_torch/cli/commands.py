@@ -13,7 +13,7 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from tpgmm_torch.cli.plugins import COMMANDS, found
+from tpgmm_torch.cli.plugins import COMMANDS, registered
 
 __all__ = ["explain"]
 
@@ -63,13 +63,13 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """The commands of this package and those of plugins."""
-        names = {*super().list_commands(ctx), *found(COMMANDS)}
+        names = {*super().list_commands(ctx), *registered(COMMANDS)}
         return sorted(names, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command by name; of a plugin's, which may take long to import, only the name."""
         command = super().get_command(ctx, cmd_name)
-        if command is not None or (plugin := found(COMMANDS).get(cmd_name)) is None:
+        if command is not None or (plugin := registered(COMMANDS).get(cmd_name)) is None:
             return command
         origin = plugin.dist.name if plugin.dist else plugin.module
         if origin == DISTRIBUTION:
@@ -79,7 +79,7 @@ class Commands(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is about to run; now a plugin is imported."""
-        plugin = found(COMMANDS).get(args[0])
+        plugin = registered(COMMANDS).get(args[0])
         if plugin is not None and args[0] not in self.commands:
             self.add_command(_loaded(plugin))
         return super().resolve_command(ctx, args)
@@ -100,8 +100,8 @@ def explain(error: Exception) -> str | None:
 
     from tpgmm_torch.exceptions import TPGMMError
 
-    known = isinstance(error, TPGMMError | InvalidParameterError | OSError)
-    return str(error) if known else None
+    expected = isinstance(error, TPGMMError | InvalidParameterError | OSError)
+    return str(error) if expected else None
 
 
 def _say(message: str) -> None:

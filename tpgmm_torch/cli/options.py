@@ -167,7 +167,7 @@ def read_robot(
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.urdf import read_urdf
 
-    if robot in (named := plugins.found(plugins.ROBOTS)):
+    if robot in (named := plugins.registered(plugins.ROBOTS)):
         robot = str(named[robot].load()())
     moving = None
     if joints:

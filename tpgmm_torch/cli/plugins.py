@@ -1,4 +1,4 @@
-"""What packages built on the toolkit bring to the command line, found as entry points."""
+"""What packages built on the toolkit bring to the command line, looked up as entry points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.large_data.processes import Processes
 
-__all__ = ["Recordings", "found", "model_format", "required"]
+__all__ = ["Recordings", "model_format", "registered", "required"]
 
 #: The groups. A command is a typer app or a function, added under its name.
 COMMANDS = "tpgmm.commands"
@@ -42,7 +42,7 @@ class Recordings(Protocol):
         """Names, units and rate of states and actions: what a policy must know."""
 
 
-def found(group: str) -> dict[str, EntryPoint]:
+def registered(group: str) -> dict[str, EntryPoint]:
     """The entry points of a ``group`` by name."""
     return {entry.name: entry for entry in entry_points(group=group)}
 
@@ -57,7 +57,7 @@ def required(group: str, name: str) -> Any:
     """
     from tpgmm_torch.exceptions import DependencyError
 
-    entries = found(group)
+    entries = registered(group)
     if name not in entries:
         raise DependencyError(
             f"nothing that is installed registers {name!r} in {group!r}: install "
@@ -80,7 +80,7 @@ def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
 
     if name == OWN:
         return None
-    plugins = found(FORMATS)
+    plugins = registered(FORMATS)
     if name not in plugins:
         raise DataError(
             f"format {name!r} is not known here; there are {sorted({OWN, *plugins})}. "

@@ -1,4 +1,4 @@
-"""What ``tpgmm fit`` learns from: all episodes at once, or batches; alone, or with others."""
+"""What ``tpgmm fit`` learns from: all episodes at once, or batches."""
 
 from __future__ import annotations
 
@@ -79,9 +79,9 @@ class TrainingData:
         """
         if not isinstance(self.source, AlignedBatches):
             return [d.duration for d in self.read], sum(map(len, self.aligned))
-        own = torch.tensor(self.source.durations, dtype=torch.float64)
+        durations = torch.tensor(self.source.durations, dtype=torch.float64)
         (steps,) = processes.sum(torch.tensor(float(self.source.steps), dtype=torch.float64))
-        return processes.concatenate(own).tolist(), int(steps)
+        return processes.concatenate(durations).tolist(), int(steps)
 
 
 def read_training_data(

@@ -251,7 +251,7 @@ class _Measure:
         shoulders = torch.stack(
             [self.skill.shoulders(trajectory) for trajectory in trajectories]
         )
-        apart = (shoulders - self.shoulders)[:, self.shaking]
+        residual = (shoulders - self.shoulders)[:, self.shaking]
         wanted = self._rhythm(self.shoulders)
         rhythms = np.array([self._rhythm(motion) for motion in shoulders]) / wanted - 1
         robot = self.skill.robot
@@ -259,7 +259,7 @@ class _Measure:
         return {
             "grasp position error [mm]": _spread(1e3 * position),
             "grasp orientation error [deg]": _spread(torch.rad2deg(orientation)),
-            "shoulder RMSE [rad]": _spread(apart.square().mean((1, 2)).sqrt()),
+            "shoulder RMSE [rad]": _spread(residual.square().mean((1, 2)).sqrt()),
             "frequency error [%]": _spread(100 * np.abs(rhythms[:, 0])),
             "amplitude error [%]": _spread(100 * np.abs(rhythms[:, 1])),
             "first step [rad]": float((joints[:, 0] - starts).abs().max()),
@@ -295,7 +295,7 @@ class _Measure:
         paths: Sequence[Tensor],
         trajectories: Sequence[Trajectory],
     ) -> dict[str, float]:
-        """How far apart the demonstrations shake, and the reproductions from each of them.
+        """How unlike the demonstrations shake, and the reproductions from each of them.
 
         The true phase of a demonstration is known from its events, and ``paths`` say which
         of its time steps stands at each instant of the common clock.
@@ -308,11 +308,13 @@ class _Measure:
             phases.append(2 * math.pi * self.skill.cycles * done)
         spread = torch.stack(phases)[:, self.steady].std(0)
         shoulders = torch.stack([self.skill.shoulders(t) for t in trajectories])
-        apart = [(shoulders - self.skill.shoulders(d))[:, self.shaking] for d in self.aligned]
+        residuals = [
+            (shoulders - self.skill.shoulders(d))[:, self.shaking] for d in self.aligned
+        ]
         return {
             "spread of the shaking's phase [rad]": float(spread.square().mean().sqrt()),
             "shoulder RMSE against each demonstration [rad]": float(
-                torch.stack(apart).square().mean().sqrt()
+                torch.stack(residuals).square().mean().sqrt()
             ),
         }
 

@@ -202,17 +202,17 @@ class BottleShaking:
             In radians.
         """
         state = self.robot.state(joints)
-        apart, turn = [], []
+        distance, angle = [], []
         for hand in HANDS:
             target = _attached(bottle, GRASP_POINT[hand])
-            apart.append(
+            distance.append(
                 torch.linalg.vector_norm(state.position(hand) - target.position, dim=-1)
             )
             between = quaternions.product(
                 target.orientation, quaternions.conjugate(state.orientation(hand))
             )
-            turn.append(torch.linalg.vector_norm(quaternions.log(between), dim=-1))
-        return torch.maximum(*apart), torch.maximum(*turn)
+            angle.append(torch.linalg.vector_norm(quaternions.log(between), dim=-1))
+        return torch.maximum(*distance), torch.maximum(*angle)
 
     def shoulders(self, trajectory: Trajectory | Demonstration) -> Tensor:
         """Both shoulder pitches of a motion, shape (T, 2) [rad]."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tpgmm_datasets.commands.recordings import Recordings, parse_episodes, parse_units
+from tpgmm_datasets.commands.recordings import Recordings
 from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo
-    from tpgmm_datasets.lerobot.layout import Layout
+    from tpgmm_datasets.lerobot.layout import Episode
     from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
@@ -35,17 +35,17 @@ def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
     from tpgmm_datasets.description import describe_lerobot
 
-    found = describe_lerobot(path)
-    for name, value in _summary(found).items():
+    description = describe_lerobot(path)
+    for name, value in _summary(description).items():
         typer.echo(f"{name:<10} {value}")
     rows = [("column", "type", "value", "unit", "from", "to")]
-    rows += [row for column in found.columns for row in _rows(column)]
+    rows += [row for column in description.columns for row in _rows(column)]
     widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
     typer.echo()
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
         typer.echo("  ".join(cells).rstrip())
-    for problem in found.problems:
+    for problem in description.problems:
         typer.echo(f"problem: {problem}")
 
 
@@ -54,12 +54,14 @@ def check(path: options.Dataset) -> None:
     """List all problems of a data set; the exit code is 1 if there are any."""
     from tpgmm_datasets.description import describe_lerobot
 
-    found = describe_lerobot(path)
-    for problem in found.problems:
+    description = describe_lerobot(path)
+    for problem in description.problems:
         typer.echo(problem)
-    if found.problems:
+    if description.problems:
         raise typer.Exit(1)
-    typer.echo(f"no problems in {len(found.lengths)} episodes, {sum(found.lengths)} rows")
+    typer.echo(
+        f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
+    )
 
 
 @app.command(epilog="Example: tpgmm dataset plot out/demo/dataset --out out/dataset.png")
@@ -152,54 +154,40 @@ def convert(
     events are kept, as float32; the action becomes the next joint state, and
     pictures stay behind.
     """
-    from tpgmm_datasets.lerobot.hub import local_folder
-    from tpgmm_datasets.lerobot.layout import open_layout
+    from tpgmm_datasets.reader import open_recording
 
-    layout = open_layout(local_folder(source))
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
     recordings = Recordings(source, kinematics, frame, episodes, units, joints, rate)
-    demonstrations = recordings.demonstrations()
-    tasks = [task] * len(demonstrations) if task else _tasks(layout, episodes)
+    recording = open_recording(source, **recordings.options)
+    demonstrations = list(recording.demonstrations())
+    layout, columns = recording.assembly.layout, recording.assembly.joints
+    kept = demonstrations[0].joint_names or ()
+    stored = {"m": "m", "mm": "m", "raw": "raw"}  # what is no angle once it is read
     _save(
         demonstrations,
         path,
         append,
         fps=rate or layout.fps,
-        task=tasks,
+        task=[task] * len(demonstrations) if task else _tasks(recording.episodes),
         robot_type=layout.robot_type,
-        units=_units(layout, units, joints, demonstrations[0].joint_names),
+        units={
+            name: stored[unit]
+            for name, unit in zip(columns.names or (), columns.units, strict=False)
+            if name in kept and unit in stored
+        },
     )
 
 
-def _units(
-    layout: Layout, texts: Sequence[str] | None, joints: str | None, names: Sequence[str] | None
-) -> dict[str, str]:
-    """Units of the joints that are no angles once they are read: told here, or by the set."""
-    from tpgmm_datasets.conversion.joints import joint_feature
-
-    feature = layout.features[joints or joint_feature(layout)]
-    told = parse_units(texts or [])
-    if told == "auto":
-        told = dict(zip(feature.names or (), feature.units or (), strict=False))
-    elif isinstance(told, str):
-        told = dict.fromkeys(names or (), told)
-    stored = {"m": "m", "mm": "m", "raw": "raw"}
-    chosen = {name: stored[unit] for name, unit in told.items() if unit in stored}
-    return {name: unit for name, unit in chosen.items() if name in (names or ())}
-
-
-def _tasks(layout: Layout, episodes: str | None) -> list[str]:
-    """The task of each chosen episode, of which it must have one."""
-    from tpgmm_datasets.reader import select_episodes
+def _tasks(episodes: Sequence[Episode]) -> list[str]:
+    """The task of each episode, of which it must have one."""
     from tpgmm_torch.exceptions import DataError
 
-    chosen = select_episodes(layout, parse_episodes(episodes))
-    for episode in chosen:
+    for episode in episodes:
         if len(episode.tasks) != 1:
             raise DataError(
                 f"episode {episode.index} has {len(episode.tasks)} tasks, not one: give --task"
             )
-    return [episode.tasks[0] for episode in chosen]
+    return [episode.tasks[0] for episode in episodes]
 
 
 def _save(
@@ -212,21 +200,21 @@ def _save(
     typer.echo(f"{len(demonstrations)} episodes, {rows} rows written to {path}")
 
 
-def _summary(found: DatasetInfo) -> dict[str, object]:
-    lengths = found.lengths
+def _summary(description: DatasetInfo) -> dict[str, object]:
+    lengths, cameras = description.lengths, ", ".join(description.cameras)
     longest = f", {min(lengths)} to {max(lengths)} rows each" if lengths else ""
     return {
-        "path": found.path,
-        "layout": found.version,
-        "robot": found.robot_type or "not told",
-        "rate": f"{found.fps:g} rows per second",
-        "episodes": f"{len(lengths)}, {found.duration:.1f} s in all{longest}",
-        "tasks": ", ".join(found.tasks) or "none",
-        "cameras": f"{', '.join(found.cameras)} (not read)" if found.cameras else "none",
-        "joints": found.joints or "not found",
-        "frames": ", ".join(found.frames) or "none found",
-        "events": ", ".join(found.events) or "none found",
-        "problems": len(found.problems) or "none",
+        "path": description.path,
+        "layout": description.version,
+        "robot": description.robot_type or "not told",
+        "rate": f"{description.fps:g} rows per second",
+        "episodes": f"{len(lengths)}, {description.duration:.1f} s in all{longest}",
+        "tasks": ", ".join(description.tasks) or "none",
+        "cameras": f"{cameras} (not read)" if cameras else "none",
+        "joints": description.joints or "not found",
+        "frames": ", ".join(description.frames) or "none found",
+        "events": ", ".join(description.events) or "none found",
+        "problems": len(description.problems) or "none",
     }
 
 

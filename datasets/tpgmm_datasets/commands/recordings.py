@@ -6,6 +6,8 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from tpgmm_torch.cli import plugins
+
 if TYPE_CHECKING:
     from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.signals import Signals
@@ -22,7 +24,7 @@ FRAME = re.compile(
 )
 
 
-class Recordings:
+class Recordings(plugins.Recordings):
     """A LeRobot data set as the options of a command describe it.
 
     Parameters

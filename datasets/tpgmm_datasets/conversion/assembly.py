@@ -142,7 +142,7 @@ class Assembly:
         return events
 
     def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
-        found = dict(demonstration.events)
+        events = dict(demonstration.events)
         for name, function in self.events.items():
             at = float(function(demonstration))
             if not 0 <= at <= demonstration.duration:
@@ -151,8 +151,8 @@ class Assembly:
                     f"{demonstration.duration:.6g} s",
                     **rows.episode.where,
                 )
-            found[name] = at
-        return replace(demonstration, events=found) if self.events else demonstration
+            events[name] = at
+        return replace(demonstration, events=events) if self.events else demonstration
 
     def _with_links(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
         frames = dict(demonstration.frames)

@@ -125,15 +125,15 @@ def _units(
 ) -> tuple[Unit, ...]:
     """A unit may be given by the data set's name or by the robot's."""
     final = final or _numbered(feature)
-    own = feature.names or final
+    stored = feature.names or final
     declared = feature.units or ("auto",) * feature.width
     given = units if isinstance(units, Mapping) else dict.fromkeys(final, units)
-    unknown = sorted(set(given) - {*own, *final})
+    unknown = sorted(set(given) - {*stored, *final})
     if unknown:
         raise DatasetError(
-            f"units names {unknown}; the values are called {list(own)}", column=feature.key
+            f"units names {unknown}; the values are called {list(stored)}", column=feature.key
         )
-    chosen = [given.get(f, given.get(o, "auto")) for o, f in zip(own, final, strict=True)]
+    chosen = [given.get(f, given.get(o, "auto")) for o, f in zip(stored, final, strict=True)]
     chosen = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
     if robot is not None:
         # other values are only seen by functions that find events

@@ -101,8 +101,8 @@ def _read_file(
         schema = parquet.schema_arrow
         for problem in _declaration_problems(layout, file, schema.metadata or {}):
             policy(problem)
-        own = [name for name in BOOKKEEPING[:4] if name in schema.names]
-        columns = list(dict.fromkeys([*own, *keys]))
+        counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
+        columns = list(dict.fromkeys([*counters, *keys]))
         for index, table in episode_tables(parquet, file, columns, set(expected)):
             if index in seen:
                 message = "its rows are there twice, or are not together"

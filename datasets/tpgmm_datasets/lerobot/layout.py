@@ -346,10 +346,10 @@ def _contradictions(
         "total_frames": sum(episode.length for episode in episodes),
         "total_tasks": len(tasks),
     }
-    for name, found in counts.items():
-        if name in info and info[name] != found:
+    for name, count in counts.items():
+        if name in info and info[name] != count:
             yield DatasetError(
-                f"{name} is {info[name]!r}, but the set lists {found}",
+                f"{name} is {info[name]!r}, but the set lists {count}",
                 check="metadata",
                 file="meta/info.json",
             )

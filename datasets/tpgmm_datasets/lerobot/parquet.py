@@ -147,11 +147,13 @@ def _groups(parquet: pq.ParquetFile, wanted: set[int]) -> list[int]:
         metadata = parquet.metadata.row_group(group)
         # nested columns count as one leaf each here, since all lists hold plain values
         leaf = metadata.column(column) if column < metadata.num_columns else None
-        found = leaf.statistics if leaf and leaf.path_in_schema == "episode_index" else None
+        statistics = (
+            leaf.statistics if leaf and leaf.path_in_schema == "episode_index" else None
+        )
         if (
-            found is None
-            or not found.has_min_max
-            or any(found.min <= index <= found.max for index in wanted)
+            statistics is None
+            or not statistics.has_min_max
+            or any(statistics.min <= index <= statistics.max for index in wanted)
         ):
             groups.append(group)
     return groups

@@ -52,13 +52,13 @@ def merge_statistics(a: Statistics, b: Statistics) -> Statistics:
 def _merge_column(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
     count = a["count"] + b["count"]
     share = b["count"] / count
-    apart = b["mean"] - a["mean"]
+    shift = b["mean"] - a["mean"]
     variance = (1 - share) * a["std"] ** 2 + share * b["std"] ** 2
     return {
         "min": np.minimum(a["min"], b["min"]),
         "max": np.maximum(a["max"], b["max"]),
-        "mean": a["mean"] + share * apart,
-        "std": np.sqrt(variance + share * (1 - share) * apart**2),
+        "mean": a["mean"] + share * shift,
+        "std": np.sqrt(variance + share * (1 - share) * shift**2),
         "count": count,
         **{name: (1 - share) * a[name] + share * b[name] for name in QUANTILES},
     }

@@ -31,7 +31,7 @@ def test_plugins_add_formats(monkeypatch):
 
 
 def test_what_this_distribution_registers_is_there():
-    assert {"dataset", "demo"} <= plugins.found(plugins.COMMANDS).keys()
+    assert {"dataset", "demo"} <= plugins.registered(plugins.COMMANDS).keys()
     assert plugins.required(plugins.READERS, "lerobot") is Recordings
     assert plugins.required(plugins.ROBOTS, "upper_body") is upper_body_urdf
     assert plugins.required(plugins.TABLES, "pandas") is demonstrations_to_frame
