@@ -19,14 +19,9 @@ __all__ = ["read_tensors", "write_files"]
 
 
 def write_files(config: TPGMMConfig, tensors: Mapping[str, Tensor], directory: Path) -> None:
-    """Write configuration, numbers and both processors, all in one step.
+    """Write configuration, ``state_dict`` and both processors, all in one step.
 
-    Parameters
-    ----------
-    tensors : mapping of str to Tensor
-        The policy's ``state_dict``.
-    directory : Path
-        Other files in it stay.
+    Other files in the directory stay.
     """
     with replacing(directory.resolve(), keep=True) as folder:
         config.save_pretrained(folder)

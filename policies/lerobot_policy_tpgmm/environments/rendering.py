@@ -54,15 +54,7 @@ def offscreen() -> str | None:
 
 
 class Renderer:
-    """Draws a model, or nothing where that is impossible.
-
-    Parameters
-    ----------
-    width, height : int
-        Of the picture.
-    camera : str
-        Name of one of the model's cameras.
-    """
+    """Draws a model as one of its cameras sees it, or nothing where that is impossible."""
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int, camera: str) -> None:
         self._model = model
@@ -85,13 +77,7 @@ class Renderer:
         self._view = mujoco.MjrRect(0, 0, width, height)
 
     def __call__(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Draw.
-
-        Returns
-        -------
-        ndarray of shape (height, width, 3)
-            Black and small where nothing can be drawn.
-        """
+        """A picture (height, width, 3), black and small where nothing can be drawn."""
         if self._context is None:
             return np.zeros(BLANK, np.uint8)
         self._context.make_current()

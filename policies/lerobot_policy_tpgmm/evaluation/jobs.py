@@ -39,15 +39,7 @@ PACKAGES = ("tpgmm-torch", "lerobot", "torch", "numpy", "gymnasium", "mujoco", "
 
 
 def record(folder: Path, settings: Settings, n: int) -> None:
-    """Record the episodes that all policies learn from, unless they are there.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the comparison.
-    n : int
-        How many episodes are needed for training.
-    """
+    """Record the episodes that all policies learn from, unless ``n`` of them are there."""
     place = folder / "episodes"
     summary = place / "summary.json"
     if summary.exists():
@@ -61,15 +53,7 @@ def record(folder: Path, settings: Settings, n: int) -> None:
 
 
 def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
-    """Train a policy, unless that is done, and evaluate it in the conditions of some cells.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the comparison.
-    cells : sequence of Cell
-        Of one training.
-    """
+    """Train a policy, unless that is done, and evaluate it: all cells of one training."""
     torch.set_num_threads(1)  # the networks are small: a second thread only spins
     directory = folder / "policies" / cells[0].training
     if not (directory / RECORD).exists():

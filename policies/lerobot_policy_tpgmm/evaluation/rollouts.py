@@ -32,13 +32,7 @@ TIMED, WARM_UP = 300, 30
 
 @dataclass
 class Runner:
-    """A policy with its pipelines, as read from its directory.
-
-    Parameters
-    ----------
-    preprocessor, postprocessor
-        LeRobot's pipelines.
-    """
+    """A policy with LeRobot's pipelines before and behind it, as read from its directory."""
 
     policy: Any
     preprocessor: Any
@@ -64,13 +58,7 @@ class Runner:
 
     @torch.inference_mode()
     def act(self, observation: dict[str, Any]) -> Any:
-        """The action for an observation.
-
-        Parameters
-        ----------
-        observation : dict
-            As LeRobot's ``preprocess_observation`` makes it.
-        """
+        """The action for what LeRobot's ``preprocess_observation`` makes of an observation."""
         return self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
 
 
@@ -106,6 +94,13 @@ def _figures(info: Mapping[str, Any], index: int) -> dict[str, float]:
     }
 
 
+def _environments(config: EnvConfig, n: int) -> contextlib.closing[gym.vector.VectorEnv]:
+    """``n`` environments of one task, as LeRobot makes them."""
+    [tasks] = make_env(config, n_envs=n).values()
+    [vector] = tasks.values()
+    return contextlib.closing(vector)
+
+
 def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[dict[str, float]]:
     """Roll a policy out once for each seed.
 
@@ -121,8 +116,7 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
     """
     rows: list[dict[str, float]] = []
     size = min(BATCH, len(seeds))
-    [[vector]] = [list(tasks.values()) for tasks in make_env(config, n_envs=size).values()]
-    try:
+    with _environments(config, size) as vector:
         for start in range(0, len(seeds), size):
             # the last batch is filled up with episodes that do not count
             chosen = list(seeds[start : start + size])
@@ -144,8 +138,6 @@ def evaluate(runner: Runner, config: EnvConfig, seeds: Sequence[int]) -> list[di
                 figures = dict(env.outcomes[index] or {})
                 figures.pop("is_success", None)
                 rows.append({"seed": seed, "success": bool(successes[index]), **figures})
-    finally:
-        vector.close()
     return rows
 
 
@@ -159,12 +151,9 @@ def latency(runner: Runner, config: EnvConfig) -> dict[str, float]:
         the steps at which a policy that predicts chunks computes one (``chunk_...``); and
         ``chunk_size``, the steps from one to the next.
     """
-    [[vector]] = [list(tasks.values()) for tasks in make_env(config, n_envs=1).values()]
-    try:
+    with _environments(config, 1) as vector:
         observation, _ = vector.reset(seed=0)
         seen = preprocess_observation(observation)
-    finally:
-        vector.close()
     size = getattr(runner.policy.config, "n_action_steps", 1)
     seconds = []
     runner.reset()

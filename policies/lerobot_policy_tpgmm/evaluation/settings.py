@@ -60,13 +60,7 @@ class Settings:
         return benchmark(self.env, self.rate, self.options)
 
     def disturbed(self, condition: str) -> dict[str, Any]:
-        """The environment's options in a condition.
-
-        Parameters
-        ----------
-        condition : str
-            ``nominal``, or disturbances joined by ``+``.
-        """
+        """The environment's options in a condition, disturbances joined by ``+``."""
         benchmark = self.benchmark()
         disturbances, options = benchmark.disturbances, benchmark.options
         for name in () if condition == NOMINAL else condition.split("+"):

@@ -20,19 +20,12 @@ __all__ = ["Clock", "alignment"]
 def alignment(
     method: str, kinematics: Kinematics, features: Sequence[str] | None = None
 ) -> Alignment | None:
-    """The transformer that brings episodes onto one clock.
+    """The transformer that brings episodes onto one clock; None leaves each on its own.
 
     Parameters
     ----------
-    method : {"dtw", "barycenter", "linear", "none"}
-    features : sequence of str, optional
-        What dynamic time warping compares, as for
-        :class:`tpgmm_torch.alignment.DynamicTimeWarping`.
-
-    Returns
-    -------
-    Alignment or None
-        None leaves each episode on its own clock.
+    method, features
+        ``alignment`` and ``alignment_features`` of :class:`TPGMMConfig`.
     """
     if method == "none":
         return None

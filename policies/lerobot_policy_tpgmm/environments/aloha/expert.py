@@ -134,10 +134,6 @@ class AlohaExpert:
         References per second.
     duration : float, default=7.5
         Seconds; from the last way point on the arms stand still.
-
-    Attributes
-    ----------
-    robot : Robot
     """
 
     task: str = "transfer_cube"

@@ -69,13 +69,7 @@ class Conditions:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Self:
-        """Draw from a generator of random numbers.
-
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Its first draws are those of ``BottleShaking.situations(1, seed)``.
-        """
+        """Draw, first what ``BottleShaking.situations(1, seed)`` draws."""
         bottle = skill().bottle_poses(1, rng)[0]
         names = skill().robot.joint_names
         strong = [i for i, name in enumerate(names) if any(part in name for part in PUSHED)]
@@ -126,18 +120,7 @@ class Conditions:
         return dataclasses.replace(self, **given)
 
     def torques(self, start: int, steps: int) -> NDArray[np.float64]:
-        """The push, as torques of the joints.
-
-        Parameters
-        ----------
-        start, steps : int
-            Milliseconds.
-
-        Returns
-        -------
-        ndarray of shape (steps, 17)
-            [N m]
-        """
+        """The push, as torques (steps, 17) of the joints [N m], one for each millisecond."""
         torques = np.zeros((steps, len(self.joints)))
         first = round(1000 * self.push_start) - start
         last = first + round(1000 * self.push_length)

@@ -282,18 +282,9 @@ class BottleScene:
 
 
 def displaced(pose: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pose that is off by something.
+    """A pose (7,) that is off by ``error`` (6,).
 
-    Parameters
-    ----------
-    pose : ndarray of shape (7,)
-        Position [m] and unit quaternion.
-    error : ndarray of shape (6,)
-        Displacement [m] and, about the axes of the pose, rotation vector [rad].
-
-    Returns
-    -------
-    ndarray of shape (7,)
+    The error is a displacement [m] and, about the axes of the pose, a rotation vector [rad].
     """
     out = pose.copy()
     out[:3] += error[:3]

@@ -55,13 +55,7 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
     _count: int = field(default=0, init=False, repr=False)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Append the time and count one observation.
-
-        Parameters
-        ----------
-        observation : dict
-            With a batch dimension.
-        """
+        """Append the time to a batch, and count one observation."""
         environment = observation[OBS_ENV_STATE]
         features = time_features(torch.full(environment.shape[:-1], self._count / self.fps))
         observation[OBS_ENV_STATE] = torch.cat((environment, features.to(environment)), dim=-1)

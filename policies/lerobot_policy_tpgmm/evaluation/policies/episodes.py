@@ -43,13 +43,7 @@ class Episodes:
 
     @classmethod
     def read(cls, path: str | Path) -> Episodes:
-        """All episodes of a LeRobot data set of version 3.0.
-
-        Parameters
-        ----------
-        path : str or Path
-            Its folder.
-        """
+        """All episodes of the LeRobot data set, of version 3.0, in a folder."""
         import pyarrow.dataset
 
         from tpgmm_datasets import describe_lerobot
@@ -63,13 +57,7 @@ class Episodes:
 
     @classmethod
     def join(cls, fps: int, parts: Sequence[tuple[Tensor, Tensor, Tensor]]) -> Episodes:
-        """Episodes given one by one.
-
-        Parameters
-        ----------
-        parts : sequence of (Tensor, Tensor, Tensor)
-            State, environment and action of each.
-        """
+        """Episodes given one by one, each by its state, environment and action."""
         bounds = np.cumsum([0, *(len(state) for state, _, _ in parts)]).tolist()
         columns = [torch.cat(column).float() for column in zip(*parts, strict=True)]
         return cls(fps, dict(zip(COLUMNS, columns, strict=True)), tuple(bounds))

@@ -65,10 +65,7 @@ def _over_demonstrations(axes: Axes, table: pd.DataFrame) -> None:
 def draw_success(episodes: pd.DataFrame, path: Path) -> None:
     """Success rate with its 95 % interval over the number of demonstrations.
 
-    Parameters
-    ----------
-    episodes : DataFrame
-        Of one condition; episodes of several training seeds are taken together.
+    All episodes are of one condition; those of several training seeds are pooled.
     """
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
@@ -96,14 +93,7 @@ def draw_errors(
 ) -> None:
     """Median and quartiles of each figure over the number of demonstrations.
 
-    Parameters
-    ----------
-    episodes : DataFrame
-        Of one condition.
-    figures : mapping
-        Columns, with their heading.
-    criteria : mapping
-        Bounds of a success.
+    All episodes are of one condition; ``figures`` and ``criteria`` as in :class:`Benchmark`.
     """
     shown = [key for key in figures if key in episodes]
     figure = Figure(figsize=(3.2 * len(shown) + 1.5, 3.4), layout="constrained")

@@ -38,19 +38,11 @@ def wilson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float
 
 
 def cell_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row for each cell.
+    """One row for each cell, from what :class:`Results` holds.
 
-    Parameters
-    ----------
-    results : iterable of mapping
-        What :class:`Results` holds.
-
-    Returns
-    -------
-    DataFrame
-        What identifies the cell; ``success`` with its 95 % interval of Wilson; median and
-        95th percentile of each figure of the environment; latency, training, size, options,
-        seeds, versions and machine.
+    It has what identifies the cell; ``success`` with its 95 % interval of Wilson; median and
+    95th percentile of each figure of the environment; latency, training, size, options,
+    seeds, versions and machine.
     """
     return pd.DataFrame([_row(result) for result in results])
 
@@ -87,18 +79,10 @@ def _text(value: Any) -> Any:
 
 
 def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
-    """One row for each evaluation episode.
+    """One row for each evaluation episode, from what :class:`Results` holds.
 
-    Parameters
-    ----------
-    results : iterable of mapping
-        What :class:`Results` holds.
-
-    Returns
-    -------
-    DataFrame
-        What identifies the cell (the seed of its training as ``training_seed``), and what
-        the episode gave.
+    It has what identifies the cell (the seed of its training as ``training_seed``), and what
+    the episode gave.
     """
     rows = []
     for result in results:
