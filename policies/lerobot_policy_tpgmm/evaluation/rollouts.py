@@ -62,18 +62,21 @@ class Runner:
         return self.postprocessor(self.policy.select_action(self.preprocessor(observation)))
 
 
-class _Outcomes(gym.vector.VectorWrapper):  # type: ignore[misc]
+class _Outcomes:
     """A vector environment that keeps what ``info`` says when its episodes end first.
 
     LeRobot's rollout does not return it.
     """
 
     def __init__(self, env: gym.vector.VectorEnv) -> None:
-        super().__init__(env)
+        self._env = env
         self.outcomes: list[dict[str, float] | None] = [None] * env.num_envs
 
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
     def step(self, actions: Any) -> Any:
-        transition = super().step(actions)
+        transition = self._env.step(actions)
         _, _, terminated, truncated, info = transition
         for index in np.flatnonzero(terminated | truncated):
             if self.outcomes[index] is None:
