@@ -27,7 +27,7 @@ LINKED = ("tpgmm_torch", "datasets", "policies", "tests")
 #: constants of modules and decorated functions (properties, caches, abstract methods).
 EQUIVALENT = {
     "text of an error or warning": r"^raise \w+.*|warnings\.warn\(.*",
-    "device, where there is one": r"(?<=\()[\w.=]*\bdevice, |(, )?[\w.=]*\bdevice\b(?=[,)])",
+    "other device": r"(?<=\()[\w.=]*\bdevice, |(, )?[\w.=]*\bdevice(=None)?(?=[,)])",
     "zip that checks lengths which agree": r", strict=\w+",
     "type given to the type checker": r"(?<=\bcast\()[^,]+",
 }
@@ -40,8 +40,8 @@ also_copy = ["datasets", "policies"]
 pytest_add_cli_args_test_selection = ["tests/tpgmm_torch/{room}"]
 # the server forks tests from a process that has imported everything and run nothing
 process_isolation = "forkserver"
-timeout_constant = 5.0
-timeout_multiplier = 10.0
+timeout_constant = 20.0
+timeout_multiplier = 3.0
 """
 
 

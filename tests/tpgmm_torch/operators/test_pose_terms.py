@@ -25,7 +25,7 @@ STACKS = {
     "absolute": Stack(AbsoluteOrientation("r_hand", 1.0), AbsolutePosition("l_hand")),
     "two frames": Stack(
         Stack(RelativeOrientation("r_hand", "lid"), RelativePosition("l_hand", "cup")),
-        RelativeOrientation("l_hand", "cup", 1.5),
+        RelativeOrientation("l_hand", "cup", 1.1),
         AbsolutePosition("r_hand"),
     ),
 }
