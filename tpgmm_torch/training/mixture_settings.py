@@ -77,7 +77,7 @@ def kinematics_for(
 
 
 def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
-    """1 + D_j of each operator: time, and its local coordinates."""
+    """1 + D_j of each of the operators on the kinematics: time, and its local coordinates."""
     return tuple(1 + operator.dimension(kinematics) for operator in operators)
 
 
