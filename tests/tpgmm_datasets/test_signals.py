@@ -1,0 +1,61 @@
+"""What a data set calls its signals: names, units, rate, and where frames are."""
+
+import numpy as np
+import pytest
+
+from tests.support.lerobot_sets import change_info
+from tpgmm_datasets import FramePose, LinkPose, save_lerobot
+from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT
+from tpgmm_datasets.signals import Signals
+from tpgmm_torch import Demonstration, Frame
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    """Two joints in degrees, two objects."""
+    path = tmp_path_factory.mktemp("signals") / "set"
+    time, joints = np.arange(5) / 10, np.linspace([10.0, 100.0], [90.0, 120.0], 5)
+    frames = {name: Frame([0.1, 0.2, 0.3]) for name in ("bowl", "cup")}
+    demonstration = Demonstration(time, joints, frames, ("a.pos", "b.pos"))
+    units = {"a.pos": "raw", "b.pos": "raw"}
+    save_lerobot([demonstration] * 2, path, fps=10, task="stir", units=units)
+    return path
+
+
+class Arm:
+    joint_names = ("b", "a")
+
+
+def test_signals_of_a_data_set(stored):
+    told = Signals.of(stored, Arm(), units={"a.pos": "deg", "b": "mm"}, rate=5)
+    assert told.fps == 5 and told.state_names == told.action_names == ("a.pos", "b.pos")
+    assert told.units == {"a": (np.pi / 180, 0.0), "b": (1e-3, 0.0)}
+    assert told.frames == {"bowl": tuple(range(7)), "cup": tuple(range(7, 14))}
+    assert told.environment_names[7] == "cup.x"
+
+
+def test_frames_that_no_policy_could_observe_are_left_out(stored):
+    frames = {
+        "here": FramePose(ENVIRONMENT, slice(3, 10)),
+        "turned": FramePose(ENVIRONMENT, slice(0, 7), "xyzw"),
+        "hand": LinkPose("hand", "grasp"),
+        "table": Frame([0.0, 0.0, 0.0]),
+    }
+    told = Signals.of(stored, units="raw", frames=frames)
+    assert told.frames == {"here": tuple(range(3, 10))}
+    assert told.units == {} and told.fps == 10
+
+
+def test_actions_in_another_unit_than_states_are_refused(tmp_path):
+    demonstration = Demonstration(np.arange(5) / 10, np.zeros((5, 2)), joint_names=("a", "b"))
+    save_lerobot([demonstration], tmp_path / "set", fps=10, task="stir")
+    assert Signals.of(tmp_path / "set").units == {}
+    change_info(
+        tmp_path / "set",
+        lambda info: info["features"]["action"].update(info={"units": ["rad", "deg"]}),
+    )
+    with pytest.raises(DatasetError, match="column 'action': 'b' is in 'deg', but 'b'"):
+        Signals.of(tmp_path / "set")
+    with pytest.raises(DatasetError, match=r"column 'observation.state': 'b' is in 'rad'"):
+        Signals.of(tmp_path / "set", joints="action")
