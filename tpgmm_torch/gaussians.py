@@ -271,7 +271,7 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     residual = means - mean.unsqueeze(-2)
     within = (weights.unsqueeze(-2) @ covariances.flatten(-2)).squeeze(-2)
     between = (weights.unsqueeze(-1) * residual).mT @ residual
-    return mean, within.unflatten(-1, covariances.shape[-2:]) + between
+    return mean, within.view(*within.shape[:-1], *covariances.shape[-2:]) + between
 
 
 def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:

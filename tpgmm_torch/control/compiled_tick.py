@@ -114,8 +114,8 @@ class CompiledRegression(Regression):
         )
         if not math.isfinite(mean.sum().item()):  # the plain tick says what is wrong
             return super().tick(time, joints, frames, bounds)
-        activation = self._activation(components, results[0][2])
-        return self._bounded(Estimate(mean, covariance, activation), bounds)
+        estimate = Estimate(mean, covariance, results[0][2] @ components.places)
+        return self._bounded(estimate, bounds)
 
     def __getstate__(self) -> dict[str, Any]:
         """What can be stored: graphs are compiled again."""
@@ -196,9 +196,8 @@ class _Tick(torch.nn.Module):
         }
         time, *parts = inputs[1 + 2 * count :]
         marginals, conditionals = TimeMarginals(*parts[:3]), Conditionals(*parts[3:])
-        index = torch.arange(len(marginals.mean))  # counted outside
         robot = regression.kinematics
         assert isinstance(robot, Robot)
         state = RobotState(joints, robot.links, *robot.forward_kinematics(joints))
-        components = Components(index, marginals, (conditionals,))
+        components = Components(joints, joints, marginals, (conditionals,))
         return regression.fuse(components, time, state, frames)

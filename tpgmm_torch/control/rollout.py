@@ -75,12 +75,14 @@ def _run_together(
         for name in situations[0].frames
     }
     start = torch.stack([situation.joints for situation in situations])
-    still = {name: frame for name, frame in frames.items() if frame.position.ndim < 3}
+    alone = len(situations) == 1  # one robot is sooner computed without a batch
+    poses = {name: frame[..., 0] if alone else frame for name, frame in frames.items()}
+    moving = {name for name, frame in frames.items() if frame.position.ndim == 3}
     grid = time.tolist()
     controller = Controller(
         regression,
-        start,
-        still,
+        start[0] if alone else start,
+        poses,
         begin=grid[0],
         end=grid[-1],
         blend=blend,
@@ -88,15 +90,18 @@ def _run_together(
     )
     references, estimates = [], []
     for k, now in enumerate(grid):
-        here = _at(frames, k) if len(still) < len(frames) else None
-        estimates.append(controller.step(now - controller.time, frames=here))
+        here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
+        dt = now - controller.time
+        estimates.append(controller.step(dt, frames=here if moving else None))
         references.append(controller.reference)
     whole = Estimate(
-        torch.stack([estimate.joints for estimate in estimates]),
-        torch.stack([estimate.covariance for estimate in estimates]),
+        torch.stack([estimate.joints for estimate in estimates]).view(len(grid), *start.shape),
+        torch.stack([estimate.covariance for estimate in estimates]).view(
+            len(grid), *start.shape, -1
+        ),
         torch.stack([estimate.activation for estimate in estimates]),
     )
-    joints = torch.stack(references)
+    joints = torch.stack(references).view(len(grid), *start.shape)
     own: list[Candidate] = []
     if candidates:
         states = torch.cat((start[None], joints[:-1]))

@@ -83,14 +83,14 @@ class PoseTerms:
                 matrix[index, :, row : row + 3, block] = operator.gain * product[:, 1:]
                 matrix[index, :, height, block] = product[:, 0]
                 column += 4
-        # M transposed, since its rows are multiplied with, the present quaternions, and c: all
-        # are linear in products of two numbers of `numbers` below, positions in those with one
+        # M row by row, the present quaternions, and c: all are linear in products of two
+        # numbers of `numbers` below, positions in those with one
         size = (height + 1) * width
         terms = matrix.new_zeros(16 * len(operators) + 3 * n_poses, size + height)
-        terms[: 16 * len(operators), :size] = _columns_first(matrix, height).flatten(0, 1)
+        terms[: 16 * len(operators), :size] = matrix.flatten(2).flatten(0, 1)
         terms[16 * len(operators) :, size:] = shift.flatten(0, 1)
         self._terms = terms.to(device, dtype)
-        self._shape, self._sizes = (width, height), (height * width, width, height)
+        self._shape, self._sizes = (height, width), (height * width, width, height)
         identity = 7 * n_poses
         left = [
             3 * n_poses + 4 * pose + i for pose in first for i in range(4) for _ in range(4)
@@ -126,7 +126,7 @@ class PoseTerms:
         jacobian = state.jacobians.flatten(-3, -2)
         if self._rows is not None:
             jacobian = jacobian.index_select(-2, self._rows)
-        return Linearization(jacobian, matrix.view(*batch, *self._shape).mT, shift, present)
+        return Linearization(jacobian, matrix.view(*batch, *self._shape), shift, present)
 
 
 @lru_cache(maxsize=64)
@@ -166,12 +166,6 @@ def _product(row: Tensor, matrix: Tensor) -> Tensor:
     if torch.compiler.is_compiling() and row.numel() == row.shape[-1]:
         return (row.unsqueeze(-1) * matrix).sum(-2)
     return row @ matrix
-
-
-def _columns_first(matrix: Tensor, height: int) -> Tensor:
-    """Matrices (..., height + 1, width) as numbers: column by column, then the last row."""
-    columns = matrix[..., :height, :].mT.flatten(-2)
-    return torch.cat((columns, matrix[..., height, :]), -1)
 
 
 def _quaternion_products() -> Tensor:

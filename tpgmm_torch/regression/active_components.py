@@ -67,5 +67,6 @@ class ActiveComponents:
 
     def counts(self, time: Tensor) -> Tensor:
         """Whether each component counts at times of shape (...): bool of shape (..., K)."""
-        window = torch.bucketize(time.detach().double().cpu(), self._edges, right=True)
+        instants = time.detach().double().cpu().contiguous()
+        window = torch.bucketize(instants, self._edges, right=True)
         return self._counts[window].to(time.device)

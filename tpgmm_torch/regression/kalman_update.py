@@ -133,8 +133,9 @@ class KalmanUpdate:
         )
         # components stand in front of the batch: of each, all robots enter one product
         ones, n = [1] * len(batch), state.joints.shape[-1]
-        mean = conditionals.at(time.expand(batch) if time.ndim else time.view(ones))
-        mean, covariance = mean.movedim(-2, 0), conditionals.covariance
+        if batch:
+            time = time.expand(batch) if time.ndim else time.view(ones)
+        mean, covariance = conditionals.at(time).movedim(-2, 0), conditionals.covariance
         shape, width = (len(mean), *batch, -1, -1), mean.shape[-1] - n
         matrix = at.matrix
         if self._blocks is not None:
@@ -145,14 +146,18 @@ class KalmanUpdate:
             local = mean.narrow(-1, 0, width)
             signs = quaternions.hemisphere_signs(local, present, self._blocks)
             matrix = matrix * signs.unsqueeze(-2)
-        # tasks and joints are one vector (x, q - q_{t-1}), on which r = [M, -J] (x, ...) + c
+        # tasks and joints are one vector z = (x, q - q_{t-1}), with r = [M, -J] z + c
         mean = mean - torch.nn.functional.pad(state.joints, (width, 0))
-        rows = torch.cat((matrix.expand(shape), -at.jacobian.expand(shape)), -1)
+        jacobian = at.jacobian.contiguous()  # many robots' may be stored number by number
+        rows = torch.cat((matrix.expand(shape), -jacobian.expand(shape)), -1)
         residual = rows @ mean.unsqueeze(-1) + at.displacement.unsqueeze(-1)
         cross = (rows.flatten(1, -2) @ covariance).view_as(rows)
         right = torch.cat((cross.narrow(-1, width, n), residual), -1)
         white = gaussians.whiten(cross @ rows.mT, right, "the covariance of the tasks")
-        gain, residual = white.narrow(-1, 0, n), white.narrow(-1, n, 1)
-        steps = mean.narrow(-1, width, n) - (gain.mT @ residual).squeeze(-1)
-        prior = covariance[:, width:, width:].unflatten(0, (-1, *ones))
-        return steps.movedim(0, -2), (prior - gain.mT @ gain).movedim(0, -3)
+        update = white.narrow(-1, 0, n).mT @ white
+        steps = mean.narrow(-1, width, n) - update[..., n]
+        prior = covariance.narrow(1, width, n).narrow(2, width, n).view(-1, *ones, n, n)
+        covariances = prior - update.narrow(-1, 0, n)
+        if not batch:
+            return steps, covariances
+        return steps.movedim(0, -2), covariances.movedim(0, -3)

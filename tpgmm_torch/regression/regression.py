@@ -29,8 +29,9 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Components", "Estimate", "Regression"]
 
-#: Robots at a time on a processor, whose cache then holds what is between the operations.
-PART = 512
+#: Robots at a time on a processor: few enough that its cache holds what is between the
+#: operations, and that this memory is not given back and asked for again each time.
+PART = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,8 @@ class Components:
     ----------
     index : Tensor of shape (A,)
         Which ones they are.
+    places : Tensor of shape (A, K)
+        The same as rows of the identity.
     marginals : TimeMarginals
         Their weights and time marginals.
     conditionals : tuple of Conditionals
@@ -71,6 +74,7 @@ class Components:
     """
 
     index: Tensor
+    places: Tensor
     marginals: TimeMarginals
     conditionals: tuple[Conditionals, ...]
 
@@ -79,6 +83,7 @@ class Components:
         places = torch.tensor(index, device=self.index.device)
         return Components(
             self.index[places],
+            self.places[places],
             self.marginals.select(places),
             tuple(one.select(places) for one in self.conditionals),
         )
@@ -267,7 +272,8 @@ class Regression:
         if self._update is not None:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)
-        return Components(index, self._marginals, conditionals)
+        places = torch.eye(len(index), dtype=self.log_weights.dtype, device=index.device)
+        return Components(index, places, self._marginals, conditionals)
 
     @cached_property
     def _active(self) -> ActiveComponents | None:
@@ -332,12 +338,7 @@ class Regression:
     ) -> Estimate:
         components = self._components_at(time)
         joints, covariance, weights = self.fuse(components, time, state, frames)
-        return Estimate(joints, covariance, self._activation(components, weights))
-
-    def _activation(self, components: Components, weights: Tensor) -> Tensor:
-        """The weights of all components; those that do not count have none."""
-        whole = weights.new_zeros(*weights.shape[:-1], len(self.log_weights))
-        return whole.index_add(-1, components.index, weights)
+        return Estimate(joints, covariance, weights @ components.places)
 
     @staticmethod
     def _bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
@@ -345,7 +346,7 @@ class Regression:
         if bounds is None:
             return estimate
         joints = within(estimate.joints, estimate.covariance, *bounds)
-        return replace(estimate, joints=joints)
+        return estimate if joints is estimate.joints else replace(estimate, joints=joints)
 
     def _local(
         self,

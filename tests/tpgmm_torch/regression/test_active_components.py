@@ -45,15 +45,55 @@ def test_what_windows_leave_out_is_negligible_everywhere(seed, negligible):
     assert active.largest < 12 or negligible < 1e-3
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_what_a_window_keeps_counts_somewhere_near(seed):
-    of = marginals(seed)
-    active = ActiveComponents(of, 1e-9)
-    # a window is a quarter of a deviation wide: an instant apart, shares differ that much
-    width = float(of.precision.rsqrt().min()) / active_components.PER_DEVIATION
-    for instant in np.random.default_rng(seed).uniform(0, 10, 200):
-        near = shares(of, torch.linspace(instant - width, instant + width, 41).double())
-        log_bound = near.amax(0).log()
-        steepest = (2 * width * of.precision * (10 + width)).clamp(max=50)
-        kept = torch.tensor(active.at(float(instant)))
-        assert bool((log_bound + steepest)[kept].min() >= np.log(1e-9))
+def test_times_of_a_batch_are_asked_one_by_one():
+    active = ActiveComponents(marginals(0), 1e-6)
+    instants = torch.linspace(-20, 30, 101, dtype=torch.float64)
+    both = active.counts(instants.view(101, 1).expand(101, 2))
+    assert both.shape == (101, 2, 12)
+    for time, counts in zip(instants.tolist(), both, strict=True):
+        for row in counts:
+            assert tuple(row.nonzero()[:, 0].tolist()) == active.at(time)
+
+
+def test_near_a_component_only_its_neighbours_count():
+    active = evenly()
+    # a component at a distance of d s weighs exp(-25 d^2 / 2): its neighbours 4e-6 of it, those
+    # beyond 2e-22; halfway to the next one, both neighbours weigh 1e-11
+    assert active.at(5.0) == (4, 5, 6)
+    assert active.at(5.5) == (5, 6)
+    assert active.largest == 3
+
+
+def test_the_bound_is_the_share_that_is_asked_for():
+    # between two equal components the share of the farther one is exp(-(10 x)^2 / 2) at first
+    loose, tight = evenly(0.5), evenly(1e-30)
+    assert loose.at(5.01) == (5,)
+    assert loose.at(5.5) == (5, 6)
+    assert len(tight.at(5.0)) == 5
+
+
+@pytest.mark.parametrize("negligible", [1e-9, 0.5])
+def test_windows_reach_six_deviations_beyond_the_means(negligible):
+    active = evenly(negligible)
+    reach = 6 * 0.2
+    assert len(active.at(-reach + 0.01)) < 11
+    assert len(active.at(10 + reach - 0.01)) < 11
+    for beyond in (-reach - 0.01, 10 + reach + 0.01, 1e9):
+        assert active.at(beyond) == tuple(range(11))
+        assert bool(active.counts(torch.tensor([beyond], dtype=torch.float64)).all())
+
+
+def test_windows_are_a_quarter_of_the_narrowest_deviation_and_not_too_many():
+    active = evenly()
+    assert len(active.counts(torch.zeros(1).double())) == 1
+    assert len(active._sets) - 2 in (248, 249)  # 4 (10 + 12 * 0.2) / 0.2, and rounding
+    means = torch.tensor([0.0, 1e6], dtype=torch.float64)
+    zeros = torch.zeros(2, dtype=torch.float64)
+    many = ActiveComponents(TimeMarginals.of(zeros, means, torch.ones(2).double()), 1e-9)
+    assert len(many._sets) - 2 == active_components.MOST
+
+
+def test_keeping_all_keeps_all():
+    means = torch.tensor([0.0, 100.0], dtype=torch.float64)
+    zeros = torch.zeros(2, dtype=torch.float64)
+    assert ActiveComponents(TimeMarginals.of(zeros, means, zeros + 1), 0).at(0.0) == (0, 1)

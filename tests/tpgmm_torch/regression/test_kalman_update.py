@@ -8,6 +8,7 @@ import torch
 
 from tests.support.mixtures import CASES, Problem, conditionals_of, random_local, times
 from tpgmm_torch import Canonical, Frame, Stack
+from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.kalman_update import KalmanUpdate
 from tpgmm_torch.regression.regression import PART
 
@@ -107,3 +108,29 @@ def test_float32_is_float64_to_its_own_precision():
         actual.covariance.double(), expected.covariance, rtol=1e-3, atol=1e-5
     )
     torch.linalg.cholesky(actual.covariance)
+
+
+def test_a_task_without_variance_is_named():
+    problem = Problem.of(CASES["the paper's"], 4, 3)
+    regression = problem.regression()
+    regression._update.conditionals.covariance[2, :14, :14] *= -1
+    with pytest.raises(DataError, match=r"covariance of the tasks .*3 of 12"):
+        regression.step(times(), problem.state, problem.frames)
+
+
+@pytest.mark.parametrize("negligible", [1e-9, 1e-2])
+def test_robots_at_their_own_times_are_each_as_if_it_were_alone(negligible):
+    count = 40
+    problem = Problem.of(CASES["the paper's"], 5, count)
+    wide = problem.regression(negligible=negligible)
+    narrow = [replace(one, time_variance=one.time_variance / 40) for one in wide.conditionals]
+    regression = replace(wide, conditionals=narrow)
+    together = regression.tick(times(count), problem.state.joints, problem.frames)
+    left_out = 0
+    for index in range(count):
+        frames = {name: frame[index] for name, frame in problem.frames.items()}
+        alone = regression.step(times(count)[index], problem.state[index], frames)
+        torch.testing.assert_close(together.joints[index], alone.joints, rtol=0, atol=1e-12)
+        assert torch.equal(together.activation[index] == 0, alone.activation == 0)
+        left_out += int((alone.activation == 0).sum())
+    assert left_out > 0
