@@ -121,3 +121,14 @@ def m_step(expectation, family, floored=False):
     """The M step of a pass for one mixture."""
     flags = torch.full((len(expectation.bound),), floored)
     return expectation_maximization.m_step(expectation, family, flags)[0]
+
+
+def random_mixture(seed=0, count=4, widths=(2, 3)):
+    """Weights, means and covariances drawn at random."""
+    rng = np.random.RandomState(seed)
+    roots = [torch.from_numpy(rng.randn(count, width, width)) for width in widths]
+    return Parameters.from_covariances(
+        torch.from_numpy(rng.dirichlet(np.ones(count))),
+        [torch.from_numpy(rng.randn(count, width)) for width in widths],
+        [root @ root.mT + 0.1 * torch.eye(len(root[0])) for root in roots],
+    )

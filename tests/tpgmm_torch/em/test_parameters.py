@@ -4,20 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.em_reference import random_mixture as mixture
 from tpgmm_torch.em.parameters import Parameters, Standardization, check_blocks
 from tpgmm_torch.exceptions import DataError, ShapeError
 
 WIDTHS = (2, 3)
-
-
-def mixture(seed=0, count=4):
-    rng = np.random.RandomState(seed)
-    roots = [torch.from_numpy(rng.randn(count, width, width)) for width in WIDTHS]
-    return Parameters.from_covariances(
-        torch.from_numpy(rng.dirichlet(np.ones(count))),
-        [torch.from_numpy(rng.randn(count, width)) for width in WIDTHS],
-        [root @ root.mT + 0.1 * torch.eye(len(root[0])) for root in roots],
-    )
 
 
 def units():
