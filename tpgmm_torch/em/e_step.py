@@ -102,7 +102,6 @@ def e_step(
     ----------
     parameters : Parameters
         S mixtures, stacked.
-    points : Points
     group_size : int, default=1
         So many consecutive points have one responsibility together: that of the geometric
         mean of their densities. The chunks end where groups end.

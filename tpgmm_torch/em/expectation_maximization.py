@@ -124,10 +124,8 @@ def expectation_maximization(
     fits : sequence of Fit
         Starts, or fits that were interrupted, with equal numbers of components; they are
         changed.
-    points : Points
     family : CovarianceFamily, or sequence of CovarianceFamily
         Of all fits, or one for each.
-    tol : float
     max_iter : int
         Most M steps of a fit, at least 1.
     group_size : int, default=1

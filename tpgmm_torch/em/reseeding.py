@@ -60,7 +60,6 @@ def reseed(
     dead : Tensor of bool, of shape (K,)
     explaining : Parameters
         The mixture of the E step, which explains points well or badly.
-    points : Points
     rng : RandomState
         In the same state in all processes.
     group_size : int, default=1

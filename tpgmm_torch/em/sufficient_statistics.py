@@ -38,15 +38,11 @@ STRIDE = 4
 
 
 class WhitenedStatistics:
-    """Moments taken in whitened coordinates.
+    """Moments taken in the coordinates of a ``whitener``.
 
     What is summed is ``gamma (x; 1) (y; 1)^T``: the factors on the left are common to all
     components, so that one matrix product serves them all; they are whitened when all points
     have been summed.
-
-    Parameters
-    ----------
-    whitener : Whitener
 
     Attributes
     ----------

@@ -94,7 +94,6 @@ class Checkpoint:
             What shapes the result, by name.
         moments : ColumnMoments
             Of the data.
-        processes : Processes
 
         Raises
         ------

@@ -39,6 +39,9 @@ PATIENCE = timedelta(minutes=30)
 class Processes:
     """One process alone: there is nobody to talk to.
 
+    With several, each exchange raises a :class:`~tpgmm_torch.exceptions.DistributedError` if a
+    process has died, or does not answer.
+
     Attributes
     ----------
     rank : int
@@ -67,11 +70,6 @@ class Processes:
         -------
         tuple of Tensor
             To the last bit the same in every process.
-
-        Raises
-        ------
-        DistributedError
-            If a process has died, or does not answer.
         """
         return tensors
 
@@ -86,22 +84,11 @@ class Processes:
         Returns
         -------
         Tensor of shape (sum of n, ...)
-
-        Raises
-        ------
-        DistributedError
-            If a process has died, or does not answer.
         """
         return torch.cat(self.gather(values.cpu())) if self.count > 1 else values
 
     def gather(self, value: Any) -> list[Any]:
-        """The values of all processes, in their order: texts, numbers, lists.
-
-        Raises
-        ------
-        DistributedError
-            If a process has died, or does not answer.
-        """
+        """The values of all processes, in their order: texts, numbers, lists."""
         return [value]
 
     def share[T](self, items: Sequence[T]) -> list[T]:
@@ -179,7 +166,6 @@ def common_random_state(seed: Any, processes: Processes) -> np.random.RandomStat
     ----------
     seed : int, RandomState or None
         As scikit-learn takes it; what is not the same everywhere is taken from process 0.
-    processes : Processes
     """
     if processes.count == 1 or isinstance(seed, Integral):
         return check_random_state(seed)
@@ -195,7 +181,6 @@ def column_moments(
     ----------
     rows : iterable of array of shape (n, n_features)
         The batches of this process.
-    processes : Processes, optional
 
     Raises
     ------

@@ -261,7 +261,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         X : array-like of shape (n_samples, n_features), or iterable of such arrays
             Batches, for data larger than memory: each ``iter(X)`` has to give the same ones,
             from the first on, in one pass per iteration of EM.
-        y : Ignored
         checkpoint : Checkpoint, optional
             Where to keep the state of EM, and to go on from if there is one.
         processes : Processes, optional
@@ -311,8 +310,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             Of this process.
         moments : ColumnMoments, optional
             Of the rows of all processes, where they are known already.
-        checkpoint : Checkpoint, optional
-        processes : Processes, optional
 
         Returns
         -------
@@ -404,13 +401,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     ) -> list[Fit]:
         """Where EM starts, drawn as far as it is not given."""
         given = InitialParameters.checked(
-            *self._initial_parameters(), self.n_components, units.widths
-        ).standardize(units)
+            *self._initial_parameters(), self.n_components, units.widths, self.device
+        )
         check_distinct(rows, moments.count, self.n_components, processes)
         rng = common_random_state(self.random_state, processes)
         drawn: Sequence[Parameters | None] = [None]
         if not given.complete:
-            drawn = draw_starts(
+            standardized = draw_starts(
                 self.init_params,
                 self.n_init,
                 rows,
@@ -423,9 +420,10 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 group_size=self.group_size,
                 processes=processes,
             )
+            drawn = [units.restore(start) for start in standardized]
+        starts = [units.standardize(given.over(start)) for start in drawn]
         return [
-            Fit(family.admit(given.over(start)), RandomState(rng.randint(2**31 - 1)))
-            for start in drawn
+            Fit(family.admit(start), RandomState(rng.randint(2**31 - 1))) for start in starts
         ]
 
     def _loop(self) -> dict[str, Any]:

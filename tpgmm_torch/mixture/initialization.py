@@ -53,7 +53,6 @@ def check_distinct(
     n_rows : int
         Number of rows of all processes.
     n_components : int
-    processes : Processes, optional
 
     Raises
     ------
@@ -111,7 +110,6 @@ def sample_rows(
         Number of rows of all processes.
     rng : RandomState
         In the same state in all processes.
-    processes : Processes, optional
     columns : slice, optional
         Those that are wanted.
     every : int, default=1
@@ -163,7 +161,6 @@ def gaussians_of(
         Each gives every component at least one point of one of the processes.
     family : CovarianceFamily
     n_components : int
-    processes : Processes, optional
     group_size : int, default=1
         So many consecutive rows are labelled in one call.
     """
@@ -286,7 +283,6 @@ def bin_sizes(n_points: int, n_bins: int, rng: np.random.RandomState | None = No
 
     Parameters
     ----------
-    n_points : int
     n_bins : int
         At most ``n_points``.
     rng : RandomState, optional

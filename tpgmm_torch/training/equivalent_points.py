@@ -63,10 +63,6 @@ class Instants:
     def points(self, processes: Processes = ALONE) -> tuple[Array, int]:
         """Rows that stand for the demonstrations of all processes, and how many per instant.
 
-        Parameters
-        ----------
-        processes : Processes
-
         Returns
         -------
         array of shape (T * n, sum D_j)

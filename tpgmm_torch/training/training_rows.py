@@ -96,10 +96,6 @@ def checked_batches(
 def split_batches(X: Any) -> tuple[Any, Iterable[Sequence[Demonstration]] | None]:
     """Tell demonstrations from batches of demonstrations.
 
-    Parameters
-    ----------
-    X : iterable of Demonstration, or of sequences of Demonstration
-
     Returns
     -------
     object
@@ -128,7 +124,6 @@ def check_shares(batch: Sequence[Demonstration] | None, processes: Processes) ->
     ----------
     batch : sequence of Demonstration or None
         The first of this process, None if it has none.
-    processes : Processes
 
     Raises
     ------

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.skills import HANDLING, HANDS, canonical, handlings, hands_model, waves
+from tests.support.skills import canonical, handlings, hands_model, waves
 from tpgmm_datasets import EpisodeBatches, save_lerobot
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.training.equivalent_points import equivalent_points
-from tpgmm_torch.training.local_data import local_data
 
 
 class Batches:
@@ -115,17 +113,6 @@ def test_uneven_batches_have_no_instants():
 def test_no_demonstrations_are_refused():
     with pytest.raises(DataError, match="no demonstrations"):
         hands_model().fit([[], []])
-
-
-def test_a_few_points_have_the_moments_of_many():
-    rows = local_data(handlings(6), HANDLING, HANDS)
-    many = torch.stack(rows)[:, :, :5]  # demonstrations, instants, columns
-    mean = many.mean(0)
-    scatter = torch.einsum("mti,mtj->tij", many - mean, many - mean) / len(many)
-    few = equivalent_points(mean, scatter, 8)
-    torch.testing.assert_close(few.mean(1), mean)
-    spread = few - mean[:, None]
-    torch.testing.assert_close(spread.mT @ spread / 8, scatter, rtol=1e-12, atol=1e-15)
 
 
 def test_episodes_of_a_data_set_are_batches(tmp_path):
