@@ -27,7 +27,12 @@ PAGES = Path(__file__).parents[1] / "api"
 DIRECTIVE = re.compile(r"^\.\. auto(\w+):: ([\w.]+)\n((?:   .*\n)*)", re.MULTILINE)
 CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 #: The command line has a page of its own, of its help.
-NOT_CODE = ("tpgmm_torch.cli", "lerobot_policy_tpgmm.evaluation.command")
+NOT_CODE = (
+    "tpgmm_torch.cli",
+    "tpgmm_datasets.commands.dataset",
+    "tpgmm_datasets.commands.demo",
+    "lerobot_policy_tpgmm.evaluation.command",
+)
 
 
 def modules() -> Iterator[ModuleType]:

@@ -84,7 +84,7 @@ class Controller:
         joints: Tensor | None = None,
         frames: Mapping[str, Frame] | None = None,
     ) -> Estimate:
-        """Find the next :attr:`reference`.
+        """Find the next ``reference``.
 
         Parameters
         ----------
@@ -99,7 +99,7 @@ class Controller:
         Returns
         -------
         Estimate
-            That of :attr:`estimate`.
+            What the reference was made from.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Rows as points: sorted by time within batches, groups together, made once where they can be."""
+"""Rows as points: sorted by time within batches, groups together, made once if they can be."""
 
 import numpy as np
 import pytest
