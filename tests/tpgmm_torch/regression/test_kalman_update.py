@@ -134,3 +134,20 @@ def test_robots_at_their_own_times_are_each_as_if_it_were_alone(negligible):
         assert torch.equal(together.activation[index] == 0, alone.activation == 0)
         left_out += int((alone.activation == 0).sum())
     assert left_out > 0
+
+
+def test_a_grid_of_many_robots_may_have_times_along_one_side():
+    rows, columns = 3, PART // 2 + 1
+    problem = Problem.of(CASES["the paper's"], 4, rows, columns)
+    regression = problem.regression()
+    for now in (times(columns), times(rows)[:, None], times(rows, columns)):
+        whole = regression.tick(now, problem.state.joints, problem.frames)
+        assert whole.joints.shape == problem.state.joints.shape
+        for place in ((0, 0), (2, 1), (1, columns - 1)):
+            frames = {name: frame[place] for name, frame in problem.frames.items()}
+            time = now.expand(rows, columns)[place]
+            one = regression.tick(time, problem.state.joints[place], frames)
+            torch.testing.assert_close(whole.joints[place], one.joints, rtol=0, atol=1e-8)
+            torch.testing.assert_close(
+                whole.covariance[place], one.covariance, rtol=0, atol=1e-8
+            )
