@@ -547,3 +547,28 @@ def test_progress_is_printed(capsys):
         assert printed.count("\n") == lines
         assert ("start: not converged in 3 iterations, bound" in printed) == (verbose > 0)
         assert ("  iteration 1: bound" in printed) == (verbose > 1)
+
+
+@pytest.mark.parametrize(
+    ("measured", "counted"),
+    [
+        ([-1.0, -5.0], [-5.0]),  # the start, and what reseeding has lowered it to
+        ([-1.0, -0.5], [-1.0]),
+        ([-1.0, -5.0, -4.0, -3.0], [-5.0, -4.0]),
+        ([-1.0, -0.5, -0.4, -0.3], [-1.0, -0.5, -0.4]),
+    ],
+)
+def test_bounds_are_counted_from_where_reseeding_lowered_them(measured, counted, monkeypatch):
+    points, lambdas, parameters = problem(n_points=2000)
+    bounds = iter(measured)
+
+    def given(*arguments, **settings):
+        expectation = e_step(*arguments, **settings)
+        return replace(expectation, bound=torch.full_like(expectation.bound, next(bounds)))
+
+    monkeypatch.setattr(loop, "e_step", given)
+    [fit] = fits_of([with_a_component_far_away(parameters)])
+    max_iter = len(measured) - 1
+    expectation_maximization([fit], points, lambdas, tol=0.0, max_iter=max_iter)
+    assert (fit.n_reseeded, fit.n_iter) == (1, max_iter)
+    assert fit.bounds == counted
