@@ -81,8 +81,20 @@ class TreeKinematics:
         self._factors = constant(factors).unsqueeze(-1).unbind(0)  # (2N, 4, 4, 1) each
         self._follow, self._shift = constant(follow), constant(shift)  # (2N, n), (2N, 1)
 
-        # for few robots: each matrix's ancestor of degree 1, 2, 4, ...
-        self._ancestors = [index(hop + [count + p for p in hop]) for hop in _hops(parents)]
+        # for few robots: each matrix's ancestor of degree 1, 2, 4, ..., all robots' in one list
+        self._ancestors = [
+            [
+                index(
+                    [
+                        first + place
+                        for first in range(0, 2 * count * few, count)
+                        for place in hop
+                    ]
+                )
+                for hop in _hops(parents)
+            ]
+            for few in range(FEW + 1)
+        ]
         # for many: how many bodies each level has, and which of the one before carry them;
         # None for each its own
         self._counts = [1, *np.bincount(depths)[1:].tolist()]
@@ -146,7 +158,7 @@ class TreeKinematics:
             moved = self._shift + (self._follow.unsqueeze(-1) * joints.T).sum(1)
         else:
             moved = torch.addmm(self._shift, self._follow, joints.T)  # (2N, B)
-        local = self._local(moved[:, None, None])
+        local = self._local(moved.view(len(moved), 1, 1, count))
         numbers = self._products_of_few(local) if few else self._products(local)
         position, origin, axis, quaternion = numbers.split(self._sizes)
         columns, links = self._turns.shape[:2]
@@ -189,9 +201,8 @@ class TreeKinematics:
         """The same for few robots."""
         count = local.shape[-1]
         local = local.movedim(-1, 0).reshape(-1, 4, 4)  # (B * 2N, 4, 4)
-        for ancestors in self._ancestors:
-            before = local.view(count, -1, 16).index_select(1, ancestors)
-            local = torch.bmm(before.view(-1, 4, 4), local)
+        for ancestors in self._ancestors[count]:
+            local = torch.bmm(local.index_select(0, ancestors), local)
         return local.view(count, -1).index_select(1, self._in_matrices).T
 
 
