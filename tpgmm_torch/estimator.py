@@ -18,7 +18,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
-from tpgmm_torch import gaussians, persistence
+from tpgmm_torch import gaussians
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
@@ -34,6 +34,7 @@ from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.persistence import MODEL, decode, encode
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.joint_space import JointSpace
@@ -696,8 +697,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             parameters["random_state"] = None
         config = {
             "parameters": parameters,
-            "operators": [persistence.encode(operator) for operator in self.operators_],
-            "kinematics": persistence.encode(self.kinematics_),
+            "operators": [encode(operator) for operator in self.operators_],
+            "kinematics": encode(self.kinematics_),
             "frames": list(self.frame_names_),
             "n_iter": self.n_iter_,
             "converged": bool(self.converged_),
@@ -708,7 +709,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             zip(self.means_, self.covariances_, strict=True)
         ):
             tensors |= {f"means.{j}": mean, f"covariances.{j}": covariance}
-        persistence.write_model(path, config, tensors)
+        MODEL.write(path, config, tensors)
 
     @classmethod
     def load(
@@ -729,10 +730,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ModelFileError
             If it is truncated, tampered with, of another version, or does not fit together.
         """
-        config, tensors = persistence.read_model(path)
+        config, tensors = MODEL.read(path)
         try:
-            operators = [persistence.decode(item, custom) for item in config["operators"]]
-            kinematics = persistence.decode(config["kinematics"], custom)
+            operators = [decode(item, custom) for item in config["operators"]]
+            kinematics = decode(config["kinematics"], custom)
             for operator in operators:
                 operator.check(kinematics, config["frames"])
             if len(tensors) != 2 + 2 * len(operators) or not operators:

@@ -20,7 +20,6 @@ __all__ = [
     "condition",
     "from_information",
     "information",
-    "log_density",
     "moment_match",
     "product",
     "pseudo_inverse",
@@ -272,22 +271,6 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     within = (weights.unsqueeze(-2) @ covariances.flatten(-2)).squeeze(-2)
     between = (weights.unsqueeze(-1) * residual).mT @ residual
     return mean, within.view(*within.shape[:-1], *covariances.shape[-2:]) + between
-
-
-def log_density(x: Tensor, mean: Tensor, factor: Tensor) -> Tensor:
-    """Log-density of Gaussians at ``x``.
-
-    Parameters
-    ----------
-    x, mean : Tensor of shape (..., D)
-        Points and means.
-    factor : Tensor of shape (..., D, D)
-        Lower Cholesky factors of the covariances.
-    """
-    white = torch.linalg.solve_triangular(factor, (x - mean)[..., None], upper=False)[..., 0]
-    half_log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    constant = 0.5 * math.log(2 * math.pi) * x.shape[-1]
-    return -0.5 * white.square().sum(-1) - half_log_det - constant
 
 
 def pseudo_inverse(matrix: Tensor) -> Tensor:

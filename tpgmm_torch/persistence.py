@@ -9,10 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from pathlib import Path
 from typing import Any
-
-from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
 from tpgmm_torch.exceptions import ModelFileError
@@ -28,10 +25,9 @@ __all__ = [
     "TENSORS",
     "decode",
     "encode",
-    "read_model",
-    "write_model",
 ]
 
+#: How a model is written and read.
 MODEL = Folder("model", 1)
 TENSORS = MODEL.tensors
 KNOWN: dict[str, type] = {
@@ -114,46 +110,3 @@ def decode(description: Mapping[str, Any], custom: Sequence[type] = ()) -> Any:
 def _frozen(value: Any) -> Any:
     """JSON has lists, operators have tuples."""
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
-
-
-def write_model(
-    path: str | Path, config: Mapping[str, Any], tensors: Mapping[str, Tensor]
-) -> None:
-    """Write a model directory atomically, replacing one that is there.
-
-    Parameters
-    ----------
-    path : str or Path
-        The directory.
-    config : mapping
-        JSON values.
-    tensors : mapping of str to Tensor
-
-    Raises
-    ------
-    ModelFileError
-        If ``path`` exists and is no model directory, or holds other files too: it is left
-        alone. If the configuration is not of JSON's values.
-    """
-    MODEL.write(path, config, tensors)
-
-
-def read_model(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read a model directory, checking version, digests, names, shapes and dtypes.
-
-    Parameters
-    ----------
-    path : str or Path
-        The directory.
-
-    Returns
-    -------
-    config : dict
-    tensors : dict of str to Tensor
-
-    Raises
-    ------
-    ModelFileError
-        If a file is missing, truncated, changed, or of another version.
-    """
-    return MODEL.read(path)

@@ -238,14 +238,6 @@ def test_moment_match_counts_the_spread_between_the_components():
     assert_close(covariance, np.diag([1 + 0.25 * 0.75 * 16, 1.0]))
 
 
-@given(seeds, sizes)
-def test_log_density_is_that_of_torch(seed, size):
-    rng = np.random.default_rng(seed)
-    x, mean, covariance = normal(rng, 7, size), normal(rng, size), spd(rng, size)
-    density = gaussians.log_density(x, mean, torch.linalg.cholesky(covariance))
-    assert_close(density, MultivariateNormal(mean, covariance).log_prob(x))
-
-
 # Batches and gradients
 
 
@@ -257,7 +249,6 @@ def everything(mean: Tensor, linear: Tensor, covariance: Tensor, noise: Tensor) 
     return [
         *gaussians.affine(mean, covariance, linear, linear[..., 0]),
         *gaussians.information(linear, mean[..., :2, None], noise),
-        gaussians.log_density(mean, mean[..., :1], torch.linalg.cholesky(covariance)),
         *gaussians.from_information(covariance, mean),
     ]
 
@@ -300,13 +291,12 @@ def test_gradients_are_those_of_finite_differences():
         image = gaussians.affine(means, covariances, jacobian, means[..., :2])
         precision, vector, size = gaussians.information(jacobian, image[0][..., None], image[1])
         closed = precision + torch.eye(3, dtype=torch.float64)
-        factor = gaussians.cholesky(covariances, "the covariance")
         return (
             *gaussians.moment_match(weights.softmax(-1), means, covariances),
             *gaussians.product(means, covariances),
             *gaussians.from_information(closed, vector[..., 0]),
             *gaussians.condition(means, covariances, 1),
-            gaussians.log_density(means.flip(0), means, factor),
+            gaussians.whiten(covariances, means[..., None], "the covariance"),
             size,
         )
 

@@ -320,7 +320,7 @@ def sealed(saved: Path, monkeypatch, **changes) -> None:
     config = json.loads((saved / CONFIG).read_text()) | changes
     kept = {name: value for name, value in config.items() if value is not ...}
     own = ("format", "version", "tensors", "tensors_sha256", "digest")
-    persistence.write_model(
+    persistence.MODEL.write(
         saved, {k: v for k, v in kept.items() if k not in own}, load_file(saved / TENSORS)
     )
 
