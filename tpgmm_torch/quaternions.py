@@ -60,7 +60,9 @@ def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Structure constants: a product with one of them stands for dozens of operations."""
     key = dtype, device
     if key not in CONSTANTS:
-        CONSTANTS[key] = {n: matrix.to(device) for n, matrix in _structure(dtype).items()}
+        # what is made while inference mode is on could not serve where gradients are wanted
+        with torch.inference_mode(False):
+            CONSTANTS[key] = {n: matrix.to(device) for n, matrix in _structure(dtype).items()}
     return CONSTANTS[key][name]
 
 
@@ -73,23 +75,21 @@ def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
                 matrix[abs(place) - 1, column] = 1.0 if place > 0 else -1.0
         return matrix
 
-    # a constant made while inference mode is on could not serve where gradients are wanted
-    with torch.inference_mode(False):
-        conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
-        left, right = linear(LEFT, 4), linear(RIGHT, 4)
-        # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
-        turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
-        pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
-        return {
-            "one": torch.ones((), dtype=dtype),
-            "conjugate": conjugate,
-            "left": left,
-            "right": right,
-            "vector": right[:, 4:],
-            "rotation": pairs[..., 1:, 1:].reshape(16, 9),
-            "outer": linear(OUTER, 9),
-            "eye": torch.eye(4, dtype=dtype).flatten(),
-        }
+    conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
+    left, right = linear(LEFT, 4), linear(RIGHT, 4)
+    # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
+    turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
+    pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
+    return {
+        "one": torch.ones((), dtype=dtype),
+        "conjugate": conjugate,
+        "left": left,
+        "right": right,
+        "vector": right[:, 4:],
+        "rotation": pairs[..., 1:, 1:].reshape(16, 9),
+        "outer": linear(OUTER, 9),
+        "eye": torch.eye(4, dtype=dtype).flatten(),
+    }
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:

@@ -88,12 +88,17 @@ def _run_together(
         blend=blend,
         keep_limits=keep_limits,
     )
-    references, estimates = [], []
+    references: list[torch.Tensor] = []
+    estimates: list[Estimate] = []
+    inferring = torch.is_inference_mode_enabled()
     for k, now in enumerate(grid):
-        here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
-        dt = now - controller.time
-        estimates.append(controller.step(dt, frames=here if moving else None))
-        references.append(controller.reference)
+        if k == 1:  # what the first step does not record, none does; to ask so takes a third
+            inferring = inferring or not references[0].requires_grad
+        with torch.inference_mode(inferring):
+            here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
+            dt = now - controller.time
+            estimates.append(controller.step(dt, frames=here if moving else None))
+            references.append(controller.reference)
     whole = Estimate(
         torch.stack([estimate.joints for estimate in estimates]).view(len(grid), *start.shape),
         torch.stack([estimate.covariance for estimate in estimates]).view(

@@ -220,3 +220,35 @@ def test_a_robot_that_starts_beyond_its_limits_returns_to_them():
     [trajectory] = run(problem.regression(), given, keep_limits=True)
     assert bool(torch.isfinite(trajectory.joints).all())
     assert float(trajectory.joints[-1, 5]) <= float(kinematics.upper[5]) + 1e-9
+
+
+# Gradients
+
+
+@EVERY_WORLD
+def test_what_needs_no_gradient_serves_where_others_do(case: Case):
+    problem = Problem.of(case, 3, 1)
+    [trajectory] = run(problem.regression(), situations(problem, grid()))
+    own = trajectory.candidates[0]
+    for result in (trajectory.joints, trajectory.covariance, own.mean, own.covariance):
+        assert not result.is_inference() and not result.requires_grad
+    weight = torch.ones((), dtype=torch.float64, requires_grad=True)
+    (weight * trajectory.joints.square()).sum().backward()
+    assert_close(weight.grad, trajectory.joints.square().sum())
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_references_are_differentiable_in_the_pose_of_an_object(moves: bool):
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    regression, time = problem.regression(), grid(6, 1.0)
+    given = situations(problem, time, time, moves=moves)[1:]
+    pose, joints = given[0].frames[OBJECT], given[0].joints
+
+    def last(shift: Tensor) -> Tensor:
+        moved = Frame(pose.position + shift, pose.orientation)
+        situation = Situation(joints, {OBJECT: moved}, time)
+        [trajectory] = run(regression, [situation], candidates=False)
+        return trajectory.joints[-1]
+
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(last, shift, eps=1e-6, atol=1e-6)
