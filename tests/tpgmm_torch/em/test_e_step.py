@@ -270,3 +270,20 @@ def test_log_densities_are_those_of_the_mixture():
     mean = joint.unflatten(0, (-1, 5)).mean(1)
     expected = torch.logsumexp(mean, 1).repeat_interleave(5)
     torch.testing.assert_close(log_densities(parameters, chunk, 5), expected)
+
+
+def test_densities_in_float32_are_summed_in_float64(monkeypatch):
+    points, units = standardized(movements(), torch.float32)
+    parameters = binned(points, family(units), K)
+    densities = []
+
+    def recorded(joint, members):
+        result = normalize(joint, members)
+        assert result[1].dtype == torch.float32
+        densities.append(result[1].double())
+        return result
+
+    monkeypatch.setattr("tpgmm_torch.em.e_step.normalize", recorded)
+    found = e_step(one(parameters), points)
+    expected = torch.cat(densities, 1).mean(1)
+    torch.testing.assert_close(found.bound, expected, rtol=1e-13, atol=0)
