@@ -103,3 +103,15 @@ def test_a_frame_that_is_not_there_is_named():
     state, frames = scene()
     with pytest.raises(UnknownNameError, match=r"'cup'.*'lid'"):
         STACKS["two frames"].linearize(state, {"lid": frames["lid"]})
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (6,), (2, 3)])
+def test_what_a_compiler_is_given_is_the_same(batch, monkeypatch):
+    state, frames = scene(*batch)
+    stack = STACKS["two frames"]
+    expected = stack.linearize(state, frames)
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    traced = stack.linearize(state, frames)
+    for field in fields(traced):
+        one, other = getattr(traced, field.name), getattr(expected, field.name)
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
