@@ -128,7 +128,8 @@ def aloha_urdf() -> str:
     except ImportError as error:
         raise DependencyError(
             "the robot of aloha_state needs gym-aloha: "
-            "pip install 'lerobot_policy_tpgmm[environments]'"
+            "pip install 'lerobot_policy_tpgmm[environments]' "
+            "(on Python 3.12: one of its dependencies has no wheel for later ones)"
         ) from error
     model = mujoco.MjModel.from_xml_path(str(ASSETS_DIR / "bimanual_viperx_transfer_cube.xml"))
     robot = ElementTree.Element("robot", name="bimanual_viperx")

@@ -254,7 +254,8 @@ def _gym_aloha() -> SimpleNamespace:
             from gym_aloha.tasks import sim
     except ImportError as error:
         raise DependencyError(
-            "aloha_state needs gym-aloha: pip install 'lerobot_policy_tpgmm[environments]'"
+            "aloha_state needs gym-aloha: pip install 'lerobot_policy_tpgmm[environments]' "
+            "(on Python 3.12: one of its dependencies has no wheel for later ones)"
         ) from error
     return SimpleNamespace(
         mujoco=mujoco, control=control, constants=constants, utils=utils, sim=sim
