@@ -167,3 +167,13 @@ def test_what_is_no_feature_or_weight_is_refused(names, weights, error, message)
 def test_a_weight_of_nothing_leaves_a_group_out():
     features = AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, None, {"joints": 0})
     assert features.names == ("directions",)
+
+
+def test_each_quaternion_has_four_columns_wherever_it_stands():
+    poses = Poses(["left", "right"])
+    values = np.ones((3, 15))
+    names = ("lift", *poses.joint_names[7:], *poses.joint_names[:7])
+    named = Demonstration(np.arange(3.0), values, joint_names=names)
+    assert quaternion_columns(named, poses) == [[11, 12, 13, 14], [4, 5, 6, 7]]
+    plain = Demonstration(np.arange(3.0), values[:, :14])
+    assert quaternion_columns(plain, poses) == [[3, 4, 5, 6], [10, 11, 12, 13]]
