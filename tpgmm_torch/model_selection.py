@@ -126,7 +126,7 @@ def fit_folds(
     chosen = [_numbers(fold, len(demonstrations)) for fold in folds]
     shown = [[demonstrations[index] for index in fold] for fold in chosen]
     models = [clone(estimator) for _ in chosen]
-    estimator._validate_params()
+    estimator.check_parameters()
     operators = check_operators(estimator.operators)
     kinematics = kinematics_for(
         demonstrations,
