@@ -578,8 +578,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         kinematics : Kinematics
             What they act on.
         """
-        settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
-        settings["blocks"] = block_widths(operators, kinematics)
+        settings = self._shared_settings(operators, kinematics)
         settings["group_size"] = group_size
         settings["reg_covar"] = regularization(
             moments,
@@ -667,9 +666,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if not isinstance(robot, Kinematics):
             raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
         checked = check_operators(operators)
-        shared = {name: getattr(model, name) for name in MIXTURE_PARAMETERS}
         mixture = BlockGaussianMixture.from_parameters(
-            weights, means, covariances, **shared | {"blocks": block_widths(checked, robot)}
+            weights, means, covariances, **model._shared_settings(checked, robot)
         )
         # it checked them; what it keeps went through their factors, and was rounded
         mixture.weights_ = weights
@@ -788,8 +786,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def _kinematics_for(
         self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
     ) -> Kinematics:
-        dtype = getattr(torch, self.dtype)
-        return kinematics_for(demonstrations, operators, self.robot, dtype, self.device)
+        return kinematics_for(demonstrations, operators, self.robot, self.dtype, self.device)
+
+    def _shared_settings(
+        self, operators: Sequence[Operator], kinematics: Kinematics
+    ) -> dict[str, Any]:
+        """What the mixture has of the estimator's parameters, and its blocks."""
+        settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
+        return settings | {"blocks": block_widths(operators, kinematics)}
 
     def _situation(self, given: Situation | Demonstration) -> Situation:
         names, like = self.kinematics_.joint_names, self.time_

@@ -13,7 +13,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.metrics import check_scoring
@@ -129,11 +128,7 @@ def fit_folds(
     estimator.check_parameters()
     operators = check_operators(estimator.operators)
     kinematics = kinematics_for(
-        demonstrations,
-        operators,
-        estimator.robot,
-        getattr(torch, estimator.dtype),
-        estimator.device,
+        demonstrations, operators, estimator.robot, estimator.dtype, estimator.device
     )
     twice = any(len(set(fold)) < len(fold) for fold in chosen)
     # some folds would have one responsibility per instant, others not

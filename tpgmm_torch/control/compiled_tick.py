@@ -88,10 +88,8 @@ class CompiledRegression(Regression):
         components = self._components_at(time)
         large = len(components.index) > self._largest  # beyond the windows
         batch = gaussians.common_shape(joints.shape[:-1], *(pose.batch_shape for pose in poses))
-        count, fits = (
-            batch.numel(),
-            joints.shape[-1:] == like.shape and len(poses) == len(names),
-        )
+        count = batch.numel()
+        fits = joints.shape[-1:] == like.shape and len(poses) == len(names)
         if time.ndim or learning or large or not fits or count == 0:
             return super().tick(time, joints, frames, bounds)
         rows = [joints, *(pose.position for pose in poses)]

@@ -39,7 +39,7 @@ def kinematics_for(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     robot: Kinematics | None,
-    dtype: torch.dtype,
+    dtype: str,
     device: str,
 ) -> Kinematics:
     """What the operators act on, checked to have what they need.
@@ -51,8 +51,8 @@ def kinematics_for(
     operators : sequence of Operator
     robot : Kinematics, optional
         Without it the joints alone, a :class:`~tpgmm_torch.robots.joint_space.JointSpace`.
-    dtype, device
-        Where it shall compute.
+    dtype, device : str
+        In what precision and where it shall compute, as the estimator's parameters say.
 
     Raises
     ------
@@ -60,8 +60,9 @@ def kinematics_for(
         If the operators need links or frames that are not there.
     """
     needed = sorted({link for operator in operators for link in operator.links()})
+    precision = getattr(torch, dtype)
     if robot is not None:
-        kinematics = robot.to(dtype, device)
+        kinematics = robot.to(precision, device)
     elif needed:
         raise DataError(
             f"the operators need the pose of {needed}: pass robot=Robot.from_urdf(...), or "
@@ -70,7 +71,7 @@ def kinematics_for(
     else:
         default = tuple(f"joint_{index}" for index in range(demonstrations[0].n_joints))
         names = next((d.joint_names for d in demonstrations if d.joint_names), default)
-        kinematics = JointSpace(names, dtype, device)
+        kinematics = JointSpace(names, precision, device)
     for operator in operators:
         operator.check(kinematics, demonstrations[0].frames)
     return kinematics

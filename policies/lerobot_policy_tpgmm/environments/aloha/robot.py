@@ -37,6 +37,11 @@ __all__ = [
 
 SIDES = ("left", "right")
 ARM_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+#: What the error says where gym-aloha is missing.
+HOW_TO_INSTALL = (
+    "pip install 'lerobot_policy_tpgmm[environments]' (on Python 3.12: one of its "
+    "dependencies has no wheel for later ones)"
+)
 #: gym-aloha's order: the joints of an arm [rad], then its gripper (0 closed, 1 open).
 JOINTS = tuple(f"{side}_arm_{joint}" for side in SIDES for joint in (*ARM_JOINTS, "gripper"))
 #: The objects of each task, in the order of ``environment_state``.
@@ -127,9 +132,7 @@ def aloha_urdf() -> str:
         from gym_aloha.constants import ASSETS_DIR
     except ImportError as error:
         raise DependencyError(
-            "the robot of aloha_state needs gym-aloha: "
-            "pip install 'lerobot_policy_tpgmm[environments]' "
-            "(on Python 3.12: one of its dependencies has no wheel for later ones)"
+            f"the robot of aloha_state needs gym-aloha: {HOW_TO_INSTALL}"
         ) from error
     model = mujoco.MjModel.from_xml_path(str(ASSETS_DIR / "bimanual_viperx_transfer_cube.xml"))
     robot = ElementTree.Element("robot", name="bimanual_viperx")

@@ -17,7 +17,13 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_policy_tpgmm.environments.aloha.robot import ARM_JOINTS, JOINTS, OBJECTS, SIDES
+from lerobot_policy_tpgmm.environments.aloha.robot import (
+    ARM_JOINTS,
+    HOW_TO_INSTALL,
+    JOINTS,
+    OBJECTS,
+    SIDES,
+)
 from lerobot_policy_tpgmm.environments.base import Observation, StateEnv, finite_vector
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
@@ -253,10 +259,7 @@ def _gym_aloha() -> SimpleNamespace:
             from gym_aloha import constants, utils
             from gym_aloha.tasks import sim
     except ImportError as error:
-        raise DependencyError(
-            "aloha_state needs gym-aloha: pip install 'lerobot_policy_tpgmm[environments]' "
-            "(on Python 3.12: one of its dependencies has no wheel for later ones)"
-        ) from error
+        raise DependencyError(f"aloha_state needs gym-aloha: {HOW_TO_INSTALL}") from error
     return SimpleNamespace(
         mujoco=mujoco, control=control, constants=constants, utils=utils, sim=sim
     )
