@@ -104,15 +104,17 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             config.default_environment_state,
             environment.shape[0] if environment else None,
         )
-        self._learner: Learner | None = dataset_meta and Learner(
-            config,
-            self.kinematics,
-            self.operators,
-            self.mixture,
-            self.joints,
-            self.frames,
-            dataset_meta,
-        )
+        self._learner: Learner | None = None
+        if dataset_meta is not None:
+            self._learner = Learner(
+                config,
+                self.kinematics,
+                self.operators,
+                self.mixture,
+                self.joints,
+                self.frames,
+                dataset_meta,
+            )
         self.reset()
 
     @staticmethod
