@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
+    from tpgmm_torch.control.stiffness import Impedance, Stiffness
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.trajectories import Candidate, Trajectory
@@ -36,10 +38,12 @@ __all__ = [
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
+    "Command",
     "Controller",
     "Demonstration",
     "Estimate",
     "Frame",
+    "Impedance",
     "Kinematics",
     "Linearization",
     "Operator",
@@ -50,12 +54,16 @@ __all__ = [
     "RobotState",
     "Situation",
     "Stack",
+    "Status",
+    "Stiffness",
     "TaskParameterizedGMM",
     "Trajectory",
 ]
 
 _HOMES = {
+    "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
+    "control.stiffness": ("Impedance", "Stiffness"),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),

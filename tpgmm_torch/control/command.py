@@ -1,0 +1,159 @@
+"""What a running skill sends to its robots at one tick, and how each of them fares."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.control.stiffness import Impedance
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.regression.regression import Estimate
+
+__all__ = ["Command", "Status"]
+
+
+class Status(StrEnum):
+    """How a robot fares with its skill; in tensors by its :attr:`code`."""
+
+    RUNNING = "running"  #: the skill goes on
+    WAITING = "waiting"  #: its clock waits for the robot, or for something to happen
+    HOLDING = "holding"  #: it stands, because what came in cannot be trusted
+    FINISHED = "finished"  #: it stands at the end of the skill
+
+    @property
+    def code(self) -> int:
+        """Its number, from 0 for running on."""
+        return _CODES[self]
+
+
+_STATUSES = tuple(Status)
+_CODES = {status: code for code, status in enumerate(_STATUSES)}
+_NO_REASONS: Mapping[tuple[int, ...], str] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """What is sent to a batch of robots at one tick.
+
+    What a tick needs not be asked for every time (stiffness, damping, the status in words) is
+    worked out when it is.
+
+    Parameters
+    ----------
+    reference : Tensor of shape (..., n_joints)
+        Where the joints should be [rad or m].
+    velocity : Tensor of shape (..., n_joints)
+        How fast they should move there [rad/s or m/s].
+    time : Tensor of shape (...)
+        Each robot's progress in the skill [s].
+    estimate : Estimate
+        What the reference was made from.
+    codes : Tensor of shape (...)
+        :attr:`Status.code` of each robot, of an integer type.
+    reasons : mapping of tuple of int to str, optional
+        Why a robot does not simply run, by its index in the batch, ``()`` for a single robot.
+    impedance : Impedance, optional
+        What stiffness and damping are made with.
+    """
+
+    reference: Tensor
+    velocity: Tensor
+    time: Tensor
+    estimate: Estimate
+    codes: Tensor
+    reasons: Mapping[tuple[int, ...], str] = _NO_REASONS
+    impedance: Impedance | None = None
+
+    @property
+    def status(self) -> Any:
+        """A :class:`Status`, of a batch in (nested) lists.
+
+        It compares with text: ``command.status == "running"``.
+        """
+        return _statuses(self.codes.tolist())
+
+    def reason(self, robot: int | tuple[int, ...] = ()) -> str:
+        """Why a robot does not simply run, in words.
+
+        Parameters
+        ----------
+        robot : int or tuple of int
+            Its index in the batch.
+
+        Returns
+        -------
+        str
+            Empty if it runs.
+        """
+        return self.reasons.get((robot,) if isinstance(robot, int) else robot, "")
+
+    def of(self, status: Status | str) -> Tensor:
+        """Which robots have a status, as truth values (...).
+
+        Parameters
+        ----------
+        status : Status or str
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such status.
+        """
+        if status not in _CODES:
+            raise UnknownNameError("status", str(status), "a command", _STATUSES)
+        return torch.eq(self.codes, _CODES[Status(status)])
+
+    @property
+    def covariance(self) -> Tensor:
+        """Of the fused Gaussian that the reference was made from (..., n_joints, n_joints)."""
+        return self.estimate.covariance
+
+    @cached_property
+    def stiffness(self) -> Tensor:
+        """Of each joint (..., n_joints) [N m/rad]: stiff where demonstrations agree."""
+        return self.stiffness_matrix.diagonal(dim1=-2, dim2=-1)
+
+    @cached_property
+    def damping(self) -> Tensor:
+        """Of each joint (..., n_joints) [N m s/rad]."""
+        return self._impedance.joints.diagonal_damping(self.stiffness)
+
+    @cached_property
+    def stiffness_matrix(self) -> Tensor:
+        """With the couplings between joints (..., n_joints, n_joints) [N m/rad]."""
+        return self._impedance.joints.matrix(self.covariance)
+
+    def link_stiffness(self, link: str) -> Tensor:
+        """In task space at the reference: [translation; rotation] (..., 6, 6) [N/m, N m/rad].
+
+        Parameters
+        ----------
+        link : str
+
+        Raises
+        ------
+        UnknownNameError
+            If the robot has no such link.
+        """
+        return self._impedance.at_link(link, self.reference, self.covariance)
+
+    @property
+    def _impedance(self) -> Impedance:
+        if self.impedance is None:
+            raise DataError(
+                "this command has no stiffness: give the controller an impedance "
+                "(Impedance(kinematics))"
+            )
+        return self.impedance
+
+
+def _statuses(codes: Any) -> Any:
+    """In nested lists as the codes are."""
+    return _STATUSES[codes] if isinstance(codes, int) else [_statuses(part) for part in codes]
