@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.control.stiffness import Impedance, Stiffness
@@ -38,10 +39,12 @@ __all__ = [
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
+    "Clock",
     "Command",
     "Controller",
     "Demonstration",
     "Estimate",
+    "EvenClock",
     "Frame",
     "Impedance",
     "Kinematics",
@@ -58,9 +61,11 @@ __all__ = [
     "Stiffness",
     "TaskParameterizedGMM",
     "Trajectory",
+    "WaitingClock",
 ]
 
 _HOMES = {
+    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
     "control.stiffness": ("Impedance", "Stiffness"),

@@ -1,0 +1,245 @@
+"""Clocks: even, waiting; robots that lag, are held, are lost; their text forms."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.support.servos import Run, held
+from tests.support.skills import LAST, canonical, hands, new_handling, wave, waves
+from tpgmm_torch.control.clocks import (
+    Clock,
+    EvenClock,
+    Observation,
+    WaitingClock,
+    format_clock,
+    parse_clock,
+)
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.regression import Regression
+
+START = wave(torch.zeros(1, dtype=torch.float64))[0]
+WAITING = WaitingClock()
+
+
+@pytest.fixture(scope="module")
+def regression() -> Regression:
+    """Three joints that move by up to 3 rad/s, for two seconds."""
+    return canonical(reg_covar=1e-6).fit(waves(4, 60)).regression()
+
+
+def begun(regression: Regression, clock: Clock, *batch: int, **options) -> Run:
+    return Run(regression, clock, 0.0, LAST, START.expand(*batch, 3), **options)
+
+
+def seen(joints: Tensor | None, reference: Tensor = START) -> Observation:
+    return Observation(joints, reference, None, {})
+
+
+# Even
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5, 3.0])
+def test_even_time_is_dt_times_the_speed_for_all_robots_alike(regression, speed):
+    progress = EvenClock(speed).start(regression, 0.2, 1.4, START.expand(5, 3), {})
+    for k in range(1, 4):
+        progress = progress.advance(0.1, seen(START.expand(5, 3) + 9.0))
+        assert progress.time.shape == ()
+        assert float(progress.time) == pytest.approx(0.2 + speed * 0.1 * k, rel=1e-12)
+        assert not progress.relocalized
+
+
+def test_a_robot_on_hold_has_a_time_of_its_own(regression):
+    progress = EvenClock().start(regression, 0.0, 0.25, START.expand(2, 3), {})
+    step = torch.tensor([0.1, 0.0], dtype=torch.float64)
+    for _ in range(2):
+        progress = progress.advance(step, seen(None))
+    assert progress.time.tolist() == pytest.approx([0.2, 0.0])
+    progress = progress.advance(0.1, seen(None))
+    assert progress.time.tolist() == pytest.approx([0.25, 0.1])
+    assert progress.finished.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+def test_the_end_is_reached_and_held(regression, clock):
+    progress = clock.start(regression, 0.0, 0.3, START, {})
+    steps = 0
+    while not progress.finished:  # 0.1 + 0.1 + 0.1 is more than 0.3
+        progress, steps = progress.advance(0.1, seen(START)), steps + 1
+    assert steps == 3
+    assert float(progress.time) == 0.3
+    assert float(progress.advance(0.1, seen(START)).time) == 0.3
+
+
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+@pytest.mark.parametrize(("begin", "end"), [(1.0, 1.0), (0.0, math.nan), (0.0, math.inf)])
+def test_a_skill_without_a_span_is_refused(regression, clock, begin, end):
+    with pytest.raises(DataError, match=r"ends after its beginning, got .* s to"):
+        clock.start(regression, begin, end, START, {})
+
+
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+def test_looking_ahead_changes_nothing(regression, clock):
+    run = begun(regression, clock)
+    run.run(0.4)
+    before, ahead = run.progress.time.clone(), run.progress
+    for _ in range(5):
+        ahead = ahead.advance(0.04, seen(START + 9.0))
+    assert torch.equal(run.progress.time, before)
+
+
+# Waiting
+
+
+@pytest.mark.parametrize("dt", [0.04, 0.01, 0.001])
+@pytest.mark.parametrize("lag", [0.03, 0.1, 0.15])
+def test_an_ordinary_lag_does_not_slow_it(regression, dt, lag):
+    run = begun(regression, WAITING, dt=dt, lag=lag)
+    assert run.finish() == pytest.approx(LAST, rel=0.02)
+
+
+def test_noise_does_not_slow_it(regression):
+    run = begun(regression, WAITING, 20, dt=0.01, noise=0.005)
+    assert run.finish() == pytest.approx(LAST, rel=0.02)
+
+
+@pytest.mark.parametrize("dt", [0.04, 0.01, 0.001])
+def test_it_stands_still_while_the_robot_is_held_and_then_goes_on(regression, dt):
+    run = begun(regression, WAITING, dt=dt)
+    run.run(0.8)
+    at = run.joints
+    run.run(2.0, held(at))
+    stopped = run.progress.time
+    run.run(8.0, held(at))
+    assert torch.equal(run.progress.time, stopped)
+    assert float(stopped) < 1.2  # four times 0.1 rad away, at about 1 rad/s
+    assert run.finish() == pytest.approx(LAST + 10.0 - (float(stopped) - 0.8), abs=0.3)
+    assert torch.stack(run.times).diff().min() >= 0
+
+
+def test_it_restarts_smoothly(regression):
+    """As soon as the robot is back the rate rises, a share of the tick at a time."""
+    run = begun(regression, WAITING, dt=0.001)
+    run.run(0.8)
+    run.run(2.0, held(run.joints))
+    run.run(0.6)
+    rates = torch.stack(run.times).diff() / 0.001
+    assert rates.max() <= 1 + 1e-9
+    assert rates.diff().max() < 0.001 / 0.2 + 1e-9
+    assert rates[-1] == pytest.approx(1.0)
+
+
+def test_every_robot_has_its_own_time_whatever_its_batch(regression):
+    """Robot b of 64 is held from 0.02 b s on for a second; each alone does the same."""
+    since = 0.02 * torch.arange(64, dtype=torch.float64)
+
+    def disturbed(since: Tensor):
+        at = torch.full((*since.shape, 3), torch.nan, dtype=torch.float64)
+
+        def disturbance(passed: float, joints: Tensor) -> Tensor:
+            inside = ((passed > since) & (passed < since + 1.0))[..., None]
+            new = inside & at.isnan()
+            at[new] = joints[new]
+            return torch.where(inside, at, joints)
+
+        return disturbance
+
+    together = begun(regression, WAITING, 64)
+    together.run(1.9, disturbed(since))
+    assert together.progress.time.std() > 0.1
+    for robot in (0, 17, 63):
+        alone = begun(regression, WAITING)
+        alone.run(1.9, disturbed(since[robot]))
+        assert alone.progress.time.shape == ()
+        times = torch.stack(together.times)[:, robot]
+        torch.testing.assert_close(torch.stack(alone.times), times, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("joints", [None, torch.full((3,), torch.nan, dtype=torch.float64)])
+def test_where_nothing_is_measured_it_runs_evenly(regression, joints):
+    progress = WAITING.start(regression, 0.0, 1.0, START, {})
+    for _ in range(4):
+        progress = progress.advance(0.1, seen(joints))
+    assert float(progress.time) == pytest.approx(0.4)
+
+
+def test_a_coordinate_that_is_not_measured_says_nothing_others_do(regression):
+    progress = WAITING.start(regression, 0.0, 1.0, START, {})
+    away = START + torch.tensor([9.0, 0.0, torch.nan], dtype=torch.float64)
+    for _ in range(4):
+        progress = progress.advance(0.1, seen(away))
+    assert float(progress.time) == 0.0
+
+
+def test_what_the_model_leaves_open_is_no_error(regression):
+    """Half a radian away: nothing where the fused Gaussian is that wide."""
+    estimate = regression.tick(torch.tensor(1.0, dtype=torch.float64), START, {})
+    wide = torch.eye(3, dtype=torch.float64) * 0.5**2
+    for covariance, rate in ((estimate.covariance, 0.0), (wide, 1.0)):
+        told = type(estimate)(estimate.joints, covariance, estimate.activation)
+        observation = Observation(told.joints + 0.5, told.joints, None, {}, told)
+        progress = WAITING.start(regression, 0.0, 2.0, told.joints, {})
+        assert float(progress.advance(0.1, observation).time) == pytest.approx(0.1 * rate)
+
+
+def test_a_quaternion_and_its_negative_are_one_rotation():
+    situation, _ = new_handling()
+    model = hands()
+    progress = WAITING.start(model.regression(), 0.0, 1.0, situation.joints, situation.frames)
+    flipped = situation.joints.clone()
+    flipped[3:7] *= -1
+    progress = progress.advance(0.1, seen(flipped, situation.joints))
+    assert float(progress.time) == pytest.approx(0.1)
+
+
+# Texts
+
+
+@pytest.mark.parametrize(
+    ("text", "clock"),
+    [
+        ("even", EvenClock()),
+        ("even:speed=0.5", EvenClock(0.5)),
+        ("waiting", WaitingClock()),
+        ("waiting:tolerance=3,lag=0.05", WaitingClock(tolerance=3, lag=0.05)),
+    ],
+)
+def test_texts_and_clocks_are_each_others_inverse(text, clock):
+    assert parse_clock(text) == clock
+    assert format_clock(clock) == text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sundial", r"no 'sundial'; there are \['even', 'waiting'.*waiting:tolerance=3"),
+        ("", r"no ''; there are"),
+        ("even:tolerance=3", r"'tolerance' is no option; 'even' has \['speed'\].*NAME=VALUE"),
+        ("waiting:", r"'' is no option; 'waiting' has \['speed', 'tolerance'"),
+        ("waiting:lag=1,lag=2", r"'lag' is given twice"),
+        ("waiting:lag=soon", r"lag is a number, got 'soon'"),
+        ("waiting:lag=-1", r"lag of WaitingClock must be positive, got -1.0"),
+        ("even:speed=nan", r"speed of EvenClock must be positive, got nan"),
+    ],
+)
+def test_texts_that_are_no_clock_are_refused(text, message):
+    with pytest.raises(DataError, match=message):
+        parse_clock(text)
+
+
+def test_a_clock_of_somebodys_own_is_its_repr():
+    class Sundial(Clock):
+        def start(self, regression, begin, end, joints, frames):
+            raise NotImplementedError
+
+        def __repr__(self):
+            return "Sundial()"
+
+    assert format_clock(Sundial()) == "Sundial()"
+
+
+@pytest.mark.parametrize("speed", ["1", None, True])
+def test_a_setting_that_is_no_number_is_refused(speed):
+    with pytest.raises(DataError, match="speed of EvenClock is a number, got"):
+        EvenClock(speed)
