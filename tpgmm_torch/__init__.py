@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
+    from tpgmm_torch.control.linear_quadratic import LinearDynamics, TrackingPlan
     from tpgmm_torch.control.stiffness import Impedance, Stiffness
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
@@ -48,6 +49,7 @@ __all__ = [
     "Frame",
     "Impedance",
     "Kinematics",
+    "LinearDynamics",
     "Linearization",
     "Operator",
     "Poses",
@@ -60,6 +62,7 @@ __all__ = [
     "Status",
     "Stiffness",
     "TaskParameterizedGMM",
+    "TrackingPlan",
     "Trajectory",
     "WaitingClock",
 ]
@@ -68,6 +71,7 @@ _HOMES = {
     "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
+    "control.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
     "control.stiffness": ("Impedance", "Stiffness"),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
