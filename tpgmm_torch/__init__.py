@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.control.linear_quadratic import LinearDynamics, TrackingPlan
-    from tpgmm_torch.control.stiffness import Impedance, Stiffness
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.trajectories import Candidate, Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.impedance.linear_quadratic import LinearDynamics, TrackingPlan
+    from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
@@ -71,8 +71,8 @@ _HOMES = {
     "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
-    "control.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
-    "control.stiffness": ("Impedance", "Stiffness"),
+    "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
+    "impedance.stiffness": ("Impedance", "Stiffness"),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),

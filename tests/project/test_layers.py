@@ -27,7 +27,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("storage",),
         ("data", "em"),
         ("robots", "alignment", "large_data"),
-        ("operators", "mixture"),
+        ("operators", "mixture", "impedance"),
         ("training", "persistence", "metrics"),
         ("regression",),
         ("control",),

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.stiffness import Impedance
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.regression.regression import Estimate
 
 __all__ = ["Command", "Status"]

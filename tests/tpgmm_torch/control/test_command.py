@@ -6,8 +6,8 @@ import torch
 from tests.support.worlds import upper_body
 from tpgmm_torch import Estimate
 from tpgmm_torch.control.command import Command, Status
-from tpgmm_torch.control.stiffness import Impedance, Stiffness
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
 
 WORDS = ["running", "waiting", "holding", "finished"]
 

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from tests.support.worlds import upper_body
-from tpgmm_torch.control.stiffness import Impedance, Stiffness, geometric_mean
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.impedance.stiffness import Impedance, Stiffness, geometric_mean
 
 #: Bounds so wide that they do not count.
 FREE = {"lowest": 1e-9, "highest": 1e9}

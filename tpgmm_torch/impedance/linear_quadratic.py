@@ -39,9 +39,9 @@ class LinearDynamics:
     Parameters
     ----------
     transition : Tensor of shape (..., d, d)
-        A
+        The matrix A.
     control : Tensor of shape (..., d, m)
-        B
+        The matrix B.
 
     Raises
     ------
@@ -243,7 +243,7 @@ class TrackingPlan:
         Parameters
         ----------
         joints : Tensor of shape (..., T, n_joints)
-            [rad]
+            The path [rad].
         covariance : Tensor of shape (..., T, n_joints, n_joints)
             Theirs; its inverse is the cost of errors.
         dt : float

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from tests.support.skills import bottle_demonstrations, small_bottle
 from tpgmm_torch import Situation
-from tpgmm_torch.control.linear_quadratic import LinearDynamics, TrackingPlan, stationary_cost
-from tpgmm_torch.control.stiffness import Stiffness
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.impedance.linear_quadratic import LinearDynamics, TrackingPlan, stationary_cost
+from tpgmm_torch.impedance.stiffness import Stiffness
 
 DT = 0.05
 
