@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
+    from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Candidate, Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.impedance.linear_quadratic import LinearDynamics, TrackingPlan
@@ -47,6 +48,7 @@ __all__ = [
     "Estimate",
     "EvenClock",
     "Frame",
+    "Hold",
     "Impedance",
     "Kinematics",
     "LinearDynamics",
@@ -76,6 +78,7 @@ _HOMES = {
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
+    "data.holds": ("Hold",),
     "robots.kinematics": ("Kinematics", "RobotState"),
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
     "operators": (

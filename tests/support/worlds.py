@@ -15,7 +15,9 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Frame, Poses, Robot, RobotState, quaternions
 from tpgmm_torch.robots.robot import Kinematics
 
-LEFT, RIGHT, OBJECT = "l_hand", "r_hand", "object"
+LEFT, RIGHT, OBJECT, CARRIED = "l_hand", "r_hand", "object", "bottle"
+#: How the right hand holds what it carries.
+GRASP = Frame([0.05, -0.12, 0.08], np.array([0.6, -0.2, 0.5, -0.59]) / np.sqrt(0.9981))
 #: Where everything goes in laws of invariance.
 MOVED = Frame([0.4, -0.3, 0.7], np.array([0.6, -0.2, 0.5, 0.59]) / np.sqrt(0.9981))
 
@@ -44,6 +46,25 @@ def moved_upper_body() -> Robot:
         f'<child link="base"/><origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>'
     )
     return Robot.from_urdf(upper_body_urdf().replace("</robot>", stand), links=(LEFT, RIGHT))
+
+
+class Carrying(Kinematics):
+    """A robot whose right hand carries an object."""
+
+    def __init__(self, robot: Kinematics) -> None:
+        self.robot = robot
+        self.joint_names, self.links = robot.joint_names, robot.links
+        self.lower, self.upper, self.velocity = robot.lower, robot.upper, robot.velocity
+        self.quaternion_starts = robot.quaternion_starts
+
+    def state(self, joints):
+        return self.robot.state(joints).with_link(CARRIED, RIGHT, GRASP)
+
+    def retract(self, joints):
+        return self.robot.retract(joints)
+
+    def to(self, dtype=None, device=None):
+        return Carrying(self.robot.to(dtype, device))
 
 
 class World(ABC):
@@ -137,3 +158,18 @@ class OnPoses(World):
     def flipped_answer(self, joints: Tensor) -> Tensor:
         poses = joints.unflatten(-1, (2, 7))
         return torch.cat((poses[..., :3], -poses[..., 3:]), dim=-1).flatten(-2)
+
+
+class CarryingOnRobot(OnRobot):
+    """The upper body with an object in its right hand."""
+
+    kinematics = Carrying(OnRobot.kinematics)
+
+    def moved(self, joints: Tensor) -> RobotState:
+        return super().moved(joints).with_link(CARRIED, RIGHT, GRASP)
+
+
+class CarryingOnPoses(OnPoses):
+    """Tracked bodies, the right one with an object."""
+
+    kinematics = Carrying(OnPoses.kinematics)

@@ -15,7 +15,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "Reference", "frame_names"]
+__all__ = ["Linearization", "Operator", "Reference", "carried_objects", "frame_names"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,47 +33,101 @@ class Linearization:
     present : Tensor of shape (..., D), optional
         The present quaternions where the local coordinates hold some, zero elsewhere; None
         leaves it to :meth:`Operator.coordinates`.
+    noise : Tensor of shape (..., m), optional
+        A variance that is added to each row's: 1 in rows that say nothing (``0 = 0``), which
+        without it would be certain; None stands for zero.
     """
 
     jacobian: Tensor | None
     matrix: Tensor | None
     displacement: Tensor
     present: Tensor | None = None
+    noise: Tensor | None = None
+
+    def silent(self, rigid: bool | Tensor) -> Linearization:
+        """The rows as ``0 = 0``, where the joints cannot change what the operator measures.
+
+        Parameters
+        ----------
+        rigid : bool, or Tensor of bool, of shape (...)
+            For which robots.
+        """
+        if rigid is False:
+            return self
+        assert self.jacobian is not None and self.matrix is not None
+        speaks = ~torch.as_tensor(rigid, device=self.displacement.device)
+        displacement = self.displacement * speaks[..., None]
+        return Linearization(
+            self.jacobian * speaks[..., None, None],
+            self.matrix * speaks[..., None, None],
+            displacement,
+            self.present,
+            (~speaks[..., None]).to(displacement.dtype).expand_as(displacement),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Pose that relative operators refer to: an object, or another link of the robot.
+    """Pose that operators refer to: a link of the robot, or an object, free or held.
 
     Parameters
     ----------
     frame : Frame
         Its pose at present.
     linear_jacobian, angular_jacobian : Tensor of shape (..., 3, n_joints), optional
-        How the joints move it; None for an object, which they do not move.
+        How the joints move it; None for what they do not move.
+    carrier : int, or Tensor of int, of shape (...)
+        The index of the robot's link that it is, or that carries it; -1 for what is free.
+        What has one carrier is one rigid body: no joint moves the one against the other.
     """
 
     frame: Frame
     linear_jacobian: Tensor | None = None
     angular_jacobian: Tensor | None = None
+    carrier: int | Tensor = -1
 
     @classmethod
-    def of(cls, name: str, state: RobotState, frames: Mapping[str, Frame]) -> Reference:
-        """Look a name up, first among the robot's links, then among the frames.
+    def of(
+        cls, name: str, state: RobotState, frames: Mapping[str, Frame], held: bool = False
+    ) -> Reference:
+        """Look a name up, first among the links, then among the frames.
+
+        Parameters
+        ----------
+        name : str
+            Of a link of the robot, or of an object.
+        state : RobotState
+        frames : mapping of str to Frame
+            Poses of the objects when they were last free.
+        held : bool, default=False
+            Whether an object is meant as the thing that a link may carry, rather than as the
+            place where it was when it was last free.
 
         Raises
         ------
         UnknownNameError
             If it is neither.
         """
-        if name in state.links:
+        if name in (state.links if held else state.robot_links):
             pose = Frame._from(state.position(name), state.orientation(name))
-            return cls(pose, state.linear_jacobian(name), state.angular_jacobian(name))
+            jacobians = state.linear_jacobian(name), state.angular_jacobian(name)
+            return cls(pose, *jacobians, state.carrier(name))
         if name not in frames:
-            raise UnknownNameError(
-                "frame", name, "the situation or the robot's links", [*frames, *state.links]
-            )
+            known = [*frames, *state.links]
+            raise UnknownNameError("frame", name, "the situation or the robot's links", known)
         return cls(frames[name])
+
+    @classmethod
+    def world(cls, state: RobotState) -> Reference:
+        """The base frame, for a ``state``."""
+        like = state.positions
+        return cls(
+            Frame._from(like.new_zeros(3), quaternions.identity(like.dtype, like.device))
+        )
+
+    def rigid_with(self, other: Reference) -> bool | Tensor:
+        """Whether no joint moves the one against the other, for each robot."""
+        return self.carrier == other.carrier
 
 
 class Operator(ABC):
@@ -110,11 +164,11 @@ class Operator(ABC):
         return (0.0,) * self.dimension(kinematics)
 
     def links(self) -> tuple[str, ...]:
-        """Links of the robot whose pose is needed; none by default."""
+        """Links of the robot, and objects it may carry, whose pose is needed; default none."""
         return ()
 
     def references(self) -> tuple[str, ...]:
-        """Names of frames (or links) that the coordinates refer to; none by default."""
+        """Places that the coordinates refer to, as frames or links; none by default."""
         return ()
 
     @property
@@ -165,14 +219,16 @@ class Operator(ABC):
         Raises
         ------
         UnknownNameError
-            If one does not exist, or if a reference is both a link and a frame.
+            If one does not exist, or is both a link and a frame.
         """
         for link in self.links():
-            if link not in kinematics.links:
-                raise UnknownNameError("link", link, "the robot", kinematics.links)
+            if link not in kinematics.links and link not in frames:
+                known = [*kinematics.links, *frames]
+                raise UnknownNameError("link", link, "the robot or the frames", known)
         for name in self.references():
             if name not in frames and name not in kinematics.links:
                 raise UnknownNameError("frame", name, "the demonstration", frames)
+        for name in (*self.links(), *self.references()):
             if name in frames and name in kinematics.links:
                 raise UnknownNameError(
                     "frame",
@@ -190,5 +246,18 @@ def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[
     operators, kinematics : sequence of Operator, Kinematics
         What refers to frames, and whose links are none.
     """
-    references = (name for operator in operators for name in operator.references())
-    return tuple(dict.fromkeys(name for name in references if name not in kinematics.links))
+    references = [name for operator in operators for name in operator.references()]
+    names = (*references, *carried_objects(operators, kinematics))
+    return tuple(dict.fromkeys(name for name in names if name not in kinematics.links))
+
+
+def carried_objects(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
+    """Names of the objects that operators refer to as things that the robot may carry.
+
+    Parameters
+    ----------
+    operators, kinematics : sequence of Operator, Kinematics
+        What refers to objects, and whose links are none.
+    """
+    links = (name for operator in operators for name in operator.links())
+    return tuple(dict.fromkeys(name for name in links if name not in kinematics.links))

@@ -27,7 +27,8 @@ class AbsoluteOrientation(Operator):
     Parameters
     ----------
     link : str
-        Name of the link (end-effector).
+        Name of the link (end-effector), or of an object that the robot carries; see
+        :class:`AbsolutePosition`.
     gain : float, default=2.0
         The factor g; 1.0 is eq. (14) as printed.
 
@@ -47,11 +48,14 @@ class AbsoluteOrientation(Operator):
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) mu``."""
-        return Linearization(*state.orientation_map(self.link, self.gain))
+        if self.link in state.robot_links:
+            return Linearization(*state.orientation_map(self.link, self.gain))
+        link = Reference.of(self.link, state, frames, held=True)
+        return _turned(link, Reference.world(state), state, self.gain)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``eps_t``."""
-        return state.orientation(self.link)
+        return Reference.of(self.link, state, frames, held=True).frame.orientation
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """All of it is a quaternion."""
@@ -72,22 +76,27 @@ class RelativeOrientation(Operator):
     Parameters
     ----------
     link : str
-        Name of the link (end-effector).
+        Name of the link (end-effector), or of an object that the robot carries; see
+        :class:`RelativePosition`.
     frame : str
         Name of an object's frame, or of another link.
     gain : float, default=2.0
         The factor g; 1.0 is eq. (15) as printed.
+    held : bool, default=False
+        Whether the frame is the object as a thing that the robot may carry, or the place
+        where it was when it was last free; see :class:`RelativePosition`.
 
     Examples
     --------
     >>> from tpgmm_torch import RelativeOrientation
     >>> RelativeOrientation("left_hand", "bottle")
-    RelativeOrientation(link='left_hand', frame='bottle', gain=2.0)
+    RelativeOrientation(link='left_hand', frame='bottle', gain=2.0, held=False)
     """
 
     link: str
     frame: str
     gain: float = 2.0
+    held: bool = False
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Four: a quaternion (w, x, y, z)."""
@@ -95,30 +104,46 @@ class RelativeOrientation(Operator):
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``."""
-        reference = Reference.of(self.frame, state, frames)
-        turn = quaternions.left_matrix(reference.frame.orientation)
-        if reference.angular_jacobian is None:
+        reference = Reference.of(self.frame, state, frames, self.held)
+        place = reference.angular_jacobian is None and not self.held
+        if place and self.link in state.robot_links:
+            turn = quaternions.left_matrix(reference.frame.orientation)
             jacobian, matrix, displacement = state.orientation_map(self.link, self.gain)
             return Linearization(jacobian, matrix @ turn, displacement)
-        jacobian = state.angular_jacobian(self.link) - reference.angular_jacobian
-        present = quaternions.conjugate(state.orientation(self.link))
-        matrix = self.gain * quaternions.vector_matrix(present) @ turn
-        return Linearization(jacobian, matrix, state.joints.new_zeros(matrix.shape[:-1]))
+        link = Reference.of(self.link, state, frames, held=True)
+        return _turned(link, reference, state, self.gain)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``H+(conj eps_t^(j)) eps_t``."""
-        reference = Reference.of(self.frame, state, frames)
+        reference = Reference.of(self.frame, state, frames, self.held)
         turn = quaternions.conjugate(reference.frame.orientation)
-        return quaternions.product(turn, state.orientation(self.link))
+        link = Reference.of(self.link, state, frames, held=True)
+        return quaternions.product(turn, link.frame.orientation)
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """All of it is a quaternion."""
         return (0,)
 
     def links(self) -> tuple[str, ...]:
-        """The link."""
-        return (self.link,)
+        """The link; the frame too, if it is the held object that is meant."""
+        return (self.link, self.frame) if self.held else (self.link,)
 
     def references(self) -> tuple[str, ...]:
-        """The frame."""
-        return (self.frame,)
+        """The frame, if it is a place."""
+        return () if self.held else (self.frame,)
+
+
+def _turned(
+    link: Reference, reference: Reference, state: RobotState, gain: float
+) -> Linearization:
+    """How the joints turn a body as seen from a reference, eq. (11)."""
+    jacobian = link.angular_jacobian
+    if jacobian is None:
+        jacobian = state.joints.new_zeros(3, state.joints.shape[-1])
+    if reference.angular_jacobian is not None:
+        jacobian = jacobian - reference.angular_jacobian
+    present = quaternions.conjugate(link.frame.orientation)
+    turn = quaternions.left_matrix(reference.frame.orientation)
+    matrix = gain * quaternions.vector_matrix(present) @ turn
+    displacement = state.joints.new_zeros(matrix.shape[:-1])
+    return Linearization(jacobian, matrix, displacement).silent(link.rigid_with(reference))

@@ -108,7 +108,11 @@ class PoseTerms:
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J``, ``M``, ``c`` and the present quaternions of the stack."""
         poses = [Reference.of(name, state, frames).frame for name in self.names]
-        positions, orientations = state.positions, state.orientations
+        positions, orientations, jacobian = state.positions, state.orientations, state.jacobians
+        if state.carriers is not None:  # objects that others refer to
+            own = len(state.robot_links)
+            positions, orientations = positions[..., :own, :], orientations[..., :own, :]
+            jacobian = jacobian[..., :own, :, :]
         batch = common_shape(positions.shape[:-2], *(f.position.shape[:-1] for f in poses))
         if positions.shape[:-2] != batch:
             positions = positions.expand(*batch, -1, 3)
@@ -123,7 +127,7 @@ class PoseTerms:
             factors.narrow(-1, 0, half) * factors.narrow(-1, half, half), self._terms
         )
         matrix, present, shift = both.split(self._sizes, -1)
-        jacobian = state.jacobians.flatten(-3, -2)
+        jacobian = jacobian.flatten(-3, -2)
         if self._rows is not None:
             jacobian = jacobian.index_select(-2, self._rows)
         return Linearization(jacobian, matrix.view(*batch, *self._shape), shift, present)
@@ -142,7 +146,7 @@ def pose_terms(
     ----------
     operators : tuple of Operator
         Position and orientation operators in the base frame or in an object's frame; others,
-        and those that refer to another link, speak for themselves.
+        and those that refer to another link or an object that is held, speak for themselves.
     links : tuple of str
     dtype : torch.dtype
     device : torch.device
@@ -154,7 +158,8 @@ def pose_terms(
     for operator in operators:
         if type(operator) not in (*POSITIONS, *ORIENTATIONS):
             return None
-        if operator.links()[0] not in links or set(operator.references()) & set(links):
+        own, *held = operator.links()
+        if own not in links or held or set(operator.references()) & set(links):
             return None
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):

@@ -23,7 +23,8 @@ class AbsolutePosition(Operator):
     Parameters
     ----------
     link : str
-        Name of the link (end-effector).
+        Name of the link (end-effector), or of an object: while the robot carries it, of its
+        point on the link that does; while it is free, the operator says nothing.
 
     Examples
     --------
@@ -40,11 +41,15 @@ class AbsolutePosition(Operator):
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_p (q - q_{t-1}) = mu - x_{t-1}``."""
-        return Linearization(state.linear_jacobian(self.link), None, -state.position(self.link))
+        if self.link in state.robot_links:
+            jacobian = state.linear_jacobian(self.link)
+            return Linearization(jacobian, None, -state.position(self.link))
+        point = Reference.of(self.link, state, frames, held=True)
+        return _moved(point, Reference.world(state), state)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``x_t``."""
-        return state.position(self.link)
+        return Reference.of(self.link, state, frames, held=True).frame.position
 
     def links(self) -> tuple[str, ...]:
         """The link."""
@@ -62,19 +67,28 @@ class RelativePosition(Operator):
     Parameters
     ----------
     link : str
-        Name of the link (end-effector).
+        Name of the link (end-effector), or of an object: while the robot carries it, it is a
+        point of the link that does; while it is free, the operator says nothing.
     frame : str
         Name of an object's frame, or of another link.
+    held : bool, default=False
+        Whether the frame is the object as a thing, which moves with the joints while the
+        robot carries it: then the operator of the hand that carries it says nothing, that of
+        the other hand is the closed chain's. By default it is a place: the pose of the object
+        when it was last free.
 
     Examples
     --------
     >>> from tpgmm_torch import RelativePosition
     >>> RelativePosition("left_hand", "bottle")
-    RelativePosition(link='left_hand', frame='bottle')
+    RelativePosition(link='left_hand', frame='bottle', held=False)
+    >>> put = RelativePosition("bottle", "tray")
+    >>> other_hand = RelativePosition("right_hand", "bottle", held=True)
     """
 
     link: str
     frame: str
+    held: bool = False
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Three [m]."""
@@ -83,30 +97,37 @@ class RelativePosition(Operator):
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J (q - q_{t-1}) = R mu + p - x_{t-1}``.
 
-        For an object ``J = J_p``. For another link f, ``R_f mu + p_f`` moves too; with
-        ``d = x - p_f`` the present difference, ``J = J_p - J_pf + [d]x J_of``.
+        For a place ``J = J_p``. For another link f, ``R_f mu + p_f`` moves too; with
+        ``d = x - p_f`` the present difference, ``J = J_p - J_pf + [d]x J_of``. Between an
+        object and the link that carries it, or two places, this is ``0 = 0``.
         """
-        reference = Reference.of(self.frame, state, frames)
-        position = state.position(self.link)
-        jacobian = state.linear_jacobian(self.link)
-        displacement = reference.frame.position - position
-        if reference.linear_jacobian is not None and reference.angular_jacobian is not None:
-            swing = torch.linalg.cross(
-                reference.angular_jacobian, displacement[..., None], dim=-2
-            )
-            jacobian = jacobian - reference.linear_jacobian + swing
-        matrix = quaternions.to_matrix(reference.frame.orientation)
-        return Linearization(jacobian, matrix, displacement)
+        point = Reference.of(self.link, state, frames, held=True)
+        return _moved(point, Reference.of(self.frame, state, frames, self.held), state)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``R_t^T (x_t - p_t)``."""
-        reference = Reference.of(self.frame, state, frames)
-        return reference.frame.inverse_transform(state.position(self.link))
+        reference = Reference.of(self.frame, state, frames, self.held)
+        point = Reference.of(self.link, state, frames, held=True)
+        return reference.frame.inverse_transform(point.frame.position)
 
     def links(self) -> tuple[str, ...]:
-        """The link."""
-        return (self.link,)
+        """The link; the frame too, if it is the held object that is meant."""
+        return (self.link, self.frame) if self.held else (self.link,)
 
     def references(self) -> tuple[str, ...]:
-        """The frame."""
-        return (self.frame,)
+        """The frame, if it is a place."""
+        return () if self.held else (self.frame,)
+
+
+def _moved(point: Reference, reference: Reference, state: RobotState) -> Linearization:
+    """How the joints move a point as seen from a reference, eq. (6)."""
+    displacement = reference.frame.position - point.frame.position
+    jacobian = point.linear_jacobian
+    if jacobian is None:
+        jacobian = state.joints.new_zeros(3, state.joints.shape[-1])
+    if reference.linear_jacobian is not None and reference.angular_jacobian is not None:
+        angular = reference.angular_jacobian.expand(*displacement.shape[:-1], -1, -1)
+        swing = torch.linalg.cross(angular, displacement[..., None], dim=-2)
+        jacobian = jacobian - reference.linear_jacobian + swing
+    matrix = quaternions.to_matrix(reference.frame.orientation)
+    return Linearization(jacobian, matrix, displacement).silent(point.rigid_with(reference))

@@ -73,7 +73,7 @@ class Stack(Operator):
         like = state.joints
         # where a state maps orientations in its own way, so must each operator
         if type(state).orientation_map is RobotState.orientation_map:
-            terms = pose_terms(self.leaves, state.links, like.dtype, like.device)
+            terms = pose_terms(self.leaves, state.robot_links, like.dtype, like.device)
             if terms is not None:
                 return terms.linearize(state, frames)
         parts = [operator.linearize(state, frames) for operator in self.operators]
@@ -98,10 +98,17 @@ class Stack(Operator):
             m, d = matrix.shape[-2:]
             diagonal[..., row : row + m, column : column + d] = matrix
             row, column = row + m, column + d
+        noise = None
+        if any(part.noise is not None for part in parts):
+            each = [
+                torch.zeros_like(p.displacement) if p.noise is None else p.noise for p in parts
+            ]
+            noise = torch.cat([one.expand(*batch, one.shape[-1]) for one in each], dim=-1)
         return Linearization(
             torch.cat([j.expand(*batch, *j.shape[-2:]) for j in jacobians], dim=-2),
             diagonal,
             torch.cat([c.expand(*batch, c.shape[-1]) for c in displacements], dim=-1),
+            noise=noise,
         )
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:

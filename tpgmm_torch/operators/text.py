@@ -2,7 +2,8 @@
 
 ``position:l_hand@bottle + orientation:l_hand@bottle`` is a stack of two relative operators,
 ``position:l_hand`` an absolute one, ``pose:l_hand@bottle`` short for position and orientation,
-and ``canonical`` the joints themselves.
+``position:r_hand@held:bottle`` refers to the bottle as it is carried, ``position:bottle@tray``
+is where a carried bottle is on a tray, and ``canonical`` the joints themselves.
 """
 
 from __future__ import annotations
@@ -20,16 +21,18 @@ from tpgmm_torch.operators.stack import Stack
 __all__ = ["default_operators", "format_operator", "parse_operator"]
 
 #: By kind, the operator in the base frame and the one seen from a frame.
-KINDS: dict[str, tuple[Callable[[str], Operator], Callable[[str, str], Operator]]] = {
+KINDS: dict[str, tuple[Callable[[str], Operator], Callable[..., Operator]]] = {
     "position": (AbsolutePosition, RelativePosition),
     "orientation": (AbsoluteOrientation, RelativeOrientation),
 }
 TERM = re.compile(
-    r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)(@(?P<frame>[^\s:@+]+))?"
+    r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)"
+    r"(@(?P<held>held:)?(?P<frame>[^\s:@+]+))?"
 )
 GRAMMAR = (
     "'canonical', or 'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each "
-    "with '@FRAME' behind it if seen from a frame or another link; '+' stacks them, as in "
+    "with '@FRAME' behind it if seen from a frame or another link, '@held:FRAME' if from an "
+    "object as the robot carries it (LINK may be an object too); '+' stacks them, as in "
     "'position:l_hand@bottle + orientation:l_hand@bottle'"
 )
 
@@ -41,8 +44,9 @@ def parse_operator(text: str) -> Operator:
     ----------
     text : str
         One term, or several joined by ``+``. A term is ``canonical``, or ``position``,
-        ``orientation`` or ``pose`` (both), a colon and a link; ``@`` and the name of a frame
-        or of another link make it relative.
+        ``orientation`` or ``pose`` (both), a colon and a link or an object that is carried;
+        ``@`` and the name of a frame or of another link make it relative, ``@held:`` to an
+        object as it is carried.
 
     Raises
     ------
@@ -52,7 +56,7 @@ def parse_operator(text: str) -> Operator:
     Examples
     --------
     >>> parse_operator("position:l_hand@bottle")
-    RelativePosition(link='l_hand', frame='bottle')
+    RelativePosition(link='l_hand', frame='bottle', held=False)
     >>> parse_operator("pose:l_hand + canonical").operators[2]
     Canonical(tolerance=0.005)
     """
@@ -66,9 +70,12 @@ def _term(term: str, text: str) -> list[Operator]:
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
-    kind, link, frame = match["kind"], match["link"], match["frame"]
+    kind, link, frame, held = (match[name] for name in ("kind", "link", "frame", "held"))
     pairs = KINDS.values() if kind == "pose" else [KINDS[kind]]
-    return [relative(link, frame) if frame else absolute(link) for absolute, relative in pairs]
+    return [
+        relative(link, frame, held=bool(held)) if frame else absolute(link)
+        for absolute, relative in pairs
+    ]
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
@@ -99,6 +106,7 @@ def format_operator(operator: Operator) -> str:
         return "canonical"
     for kind, classes in KINDS.items():
         if type(operator) in classes:
-            frame = "".join(f"@{name}" for name in operator.references())
-            return f"{kind}:{operator.links()[0]}{frame}"
+            places = [f"@{name}" for name in operator.references()]
+            link, *held = operator.links()
+            return f"{kind}:{link}" + "".join([*places, *(f"@held:{name}" for name in held)])
     return repr(operator)

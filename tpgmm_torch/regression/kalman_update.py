@@ -5,7 +5,7 @@ Where the joints have an operator of their own (:class:`Canonical`), its conditi
 task ``J (q - q_{t-1}) = M x + c`` with ``x ~ N(mu, S)`` is a measurement of it. The product (2)
 of the projected Gaussians is then, by the matrix inversion lemma, the Kalman update
 
-    H = M S M^T + J C J^T,   r = M mu + c - J (m - q_{t-1}),
+    H = M S M^T + J C J^T,   r = M mu + c - J (m - q_{t-1}),   (rows 0 = 0: 1 added to H)
     q = m + C J^T H^-1 r,    C - C J^T H^-1 J C,
 
 with as many dimensions to factorise as the tasks have (12 for two hands) in place of as many as
@@ -153,7 +153,10 @@ class KalmanUpdate:
         residual = rows @ mean.unsqueeze(-1) + at.displacement.unsqueeze(-1)
         cross = (rows.flatten(1, -2) @ covariance).view_as(rows)
         right = torch.cat((cross.narrow(-1, width, n), residual), -1)
-        white = gaussians.whiten(cross @ rows.mT, right, "the covariance of the tasks")
+        square = cross @ rows.mT
+        if at.noise is not None:
+            square = square + at.noise.diag_embed()
+        white = gaussians.whiten(square, right, "the covariance of the tasks")
         update = white.narrow(-1, 0, n).mT @ white
         steps = mean.narrow(-1, width, n) - update[..., n]
         prior = covariance.narrow(1, width, n).narrow(2, width, n).view(-1, *ones, n, n)

@@ -44,6 +44,8 @@ class Projection:
         if at.matrix is not None:
             matrix = at.matrix[..., None, :, :]
             columns, covariance = matrix @ columns, matrix @ covariance @ matrix.mT
+        if at.noise is not None:
+            covariance = covariance + at.noise.diag_embed()[..., None, :, :]
         mean = columns[..., :1] + at.displacement[..., None, :, None]
         rates = columns[..., 1:].expand(*mean.shape[:-1], -1)
         jacobian = None if at.jacobian is None else at.jacobian[..., None, :, :]

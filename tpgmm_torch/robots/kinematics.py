@@ -18,7 +18,9 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.gaussians import common_shape
 
 __all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]
 
@@ -61,6 +63,9 @@ class RobotState:
         Unit quaternions of the links in the base frame.
     jacobians : Tensor of shape (..., L, 6, n_joints)
         Geometric Jacobians in the base frame: velocity, then angular velocity.
+    carriers : Tensor of int, of shape (..., V), optional
+        For each of the last V links, which are objects (:meth:`with_link`), the index of the
+        robot's link that carries it, -1 where it is free.
     """
 
     joints: Tensor
@@ -68,6 +73,12 @@ class RobotState:
     positions: Tensor
     orientations: Tensor
     jacobians: Tensor
+    carriers: Tensor | None = None
+
+    @property
+    def robot_links(self) -> tuple[str, ...]:
+        """The links of the robot itself, without objects."""
+        return self.links if self.carriers is None else self.links[: -self.carriers.shape[-1]]
 
     def position(self, link: str) -> Tensor:
         """``x_{t-1}`` of a link [m], shape (..., 3)."""
@@ -103,6 +114,99 @@ class RobotState:
         matrix = gain * quaternions.vector_matrix(quaternions.conjugate(orientation))
         return self.angular_jacobian(link), matrix, torch.zeros_like(orientation[..., 1:])
 
+    def carrier(self, link: str) -> int | Tensor:
+        """The index of the robot's link that a link is, or that carries it; -1 if none does."""
+        index = self._index(link) - len(self.robot_links)
+        if index < 0 or self.carriers is None:
+            return self._index(link)
+        return self.carriers[..., index]
+
+    def with_link(
+        self, name: str, link: str | None, pose: Frame, where: Tensor | None = None
+    ) -> Self:
+        """The state with an object as a link of its own, which a link of the robot carries.
+
+        With ``r = R_l p`` from the origin of the link to the object, this is at ``x_l + r``
+        and moves with ``J_p + J_o x r``, ``J_o``.
+
+        Parameters
+        ----------
+        name : str
+            Of the object. If the state has it already, it is replaced.
+        link : str or None
+            What carries it, a link or another object; None if it is free, so that the joints
+            do not move it.
+        pose : Frame
+            Its pose in the link, the grasp; in the base frame if it is free.
+        where : Tensor of bool, of shape (...), optional
+            For which robots that holds; for the others, the object is as the state has it.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such link.
+        DataError
+            If the name is that of a link of the robot, or ``where`` leaves out robots and the
+            state does not have the object yet.
+
+        Examples
+        --------
+        >>> import torch
+        >>> joints, turn = torch.zeros(1), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+        >>> hinge = torch.tensor([[[0.0], [0.0], [0.0], [0.0], [0.0], [1.0]]])
+        >>> state = RobotState(joints, ("hand",), torch.zeros(1, 3), turn, hinge)
+        >>> state.with_link("cup", "hand", Frame([0.5, 0, 0])).linear_jacobian("cup").T.tolist()
+        [[0.0, 0.5, 0.0]]
+        """
+        if name in self.robot_links:
+            raise DataError(f"{name!r} is a link of the robot: give the object another name")
+        position, orientation = (
+            x.to(self.positions) for x in (pose.position, pose.orientation)
+        )
+        jacobian = torch.zeros_like(self.jacobians[..., 0, :, :])
+        carrier: int | Tensor = -1
+        if link is not None:
+            arm = quaternions.rotate(self.orientation(link), position)
+            position = self.position(link) + arm
+            orientation = quaternions.product(self.orientation(link), orientation)
+            angular = self.angular_jacobian(link).expand(*arm.shape[:-1], -1, -1)
+            swing = torch.linalg.cross(angular, arm[..., None], dim=-2)
+            jacobian = torch.cat((self.linear_jacobian(link) + swing, angular), dim=-2)
+            carrier = self.carrier(link)
+        index = torch.as_tensor(carrier, device=position.device)
+        if where is not None:
+            if name not in self.links:
+                raise DataError(
+                    f"some robots do not hold {name!r}, and the state does not know where it "
+                    "is for them: add it as a free object first, with_link(name, None, pose)"
+                )
+            where = where.to(position.device)
+            position = torch.where(where[..., None], position, self.position(name))
+            orientation = torch.where(where[..., None], orientation, self.orientation(name))
+            here = self.jacobians[..., self._index(name), :, :]
+            jacobian = torch.where(where[..., None, None], jacobian, here)
+            index = torch.where(where, index, self.carrier(name))
+        state = self._without(name) if name in self.links else self
+        batch = common_shape(state.joints.shape[:-1], position.shape[:-1], index.shape)
+        carriers = [index.expand(batch)[..., None]]
+        if state.carriers is not None:
+            carriers = [state.carriers.expand(*batch, -1), *carriers]
+
+        def joined(known: Tensor, new: Tensor, shape: tuple[int, ...]) -> Tensor:
+            parts = known.expand(*batch, -1, *shape), new.expand(*batch, *shape)
+            return torch.cat((parts[0], parts[1].unsqueeze(-1 - len(shape))), -1 - len(shape))
+
+        n = state.joints.shape[-1]
+        return replace(
+            state,
+            joints=state.joints.expand(*batch, n),
+            links=(*state.links, name),
+            positions=joined(state.positions, position, (3,)),
+            orientations=joined(state.orientations, orientation, (4,)),
+            jacobians=joined(state.jacobians, jacobian, (6, n)),
+            carriers=torch.cat(carriers, -1),
+        )
+
     def __getitem__(self, index: Any) -> Self:
         """Select along the leading dimensions."""
         return replace(
@@ -111,6 +215,22 @@ class RobotState:
             positions=self.positions[index],
             orientations=self.orientations[index],
             jacobians=self.jacobians[index],
+            carriers=None if self.carriers is None else self.carriers[index],
+        )
+
+    def _without(self, name: str) -> Self:
+        """The state without one of its objects."""
+        assert self.carriers is not None
+        kept = [i for i, link in enumerate(self.links) if link != name]
+        own = len(self.robot_links)
+        objects = [i - own for i in kept if i >= own]
+        return replace(
+            self,
+            links=tuple(self.links[i] for i in kept),
+            positions=self.positions[..., kept, :],
+            orientations=self.orientations[..., kept, :],
+            jacobians=self.jacobians[..., kept, :, :],
+            carriers=self.carriers[..., objects] if objects else None,
         )
 
     def _index(self, link: str) -> int:

@@ -30,15 +30,18 @@ class PosesState(RobotState):
 
         Nothing is linearised, so that the gain has no effect: the Jacobian (..., 4, n_joints)
         selects the quaternion's columns, the matrix is the identity, the offset ``-eps_{t-1}``.
+        An object that a body carries is turned as by a robot.
 
         Raises
         ------
         DataError
             If the poses were made without orientation.
         """
+        if link not in self.robot_links:
+            return super().orientation_map(link, gain)
         place = self._index(link)
         n, batch = self.joints.shape[-1], self.joints.shape[:-1]
-        width = n // len(self.links)
+        width = n // len(self.robot_links)
         if width == 3:
             raise DataError(
                 f"link {link!r} has no orientation: the poses were made with orientation=False"

@@ -23,20 +23,30 @@ from tests.support.own_operators import (
     Q,
     planar_jacobian,
 )
-from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
+from tests.support.worlds import (
+    CARRIED,
+    GRASP,
+    LEFT,
+    OBJECT,
+    RIGHT,
+    OnPoses,
+    OnRobot,
+    World,
+)
 from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
     Canonical,
     Demonstration,
     Frame,
+    Linearization,
     Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
 )
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
-from tpgmm_torch.operators.base import Reference, frame_names
+from tpgmm_torch.operators.base import Reference, carried_objects, frame_names
 from tpgmm_torch.regression.regression import Regression
 
 WORLDS = pytest.mark.parametrize("world", [OnRobot(), OnPoses()], ids=["robot", "poses"])
@@ -83,7 +93,7 @@ LINKED = [
 @pytest.mark.parametrize("operator", LINKED, ids=repr)
 def test_an_unknown_link_is_named_with_those_that_exist(operator, world: World):
     state, frames = world.scene()
-    listed = r"link 'elbow' is not in the .*\['l_hand', 'r_hand'\]"
+    listed = r"'elbow' is not in the .*; it has \['l_hand', 'object', 'r_hand'\]"
     with pytest.raises(UnknownNameError, match=listed):
         operator.check(world.kinematics, frames)
     for call in (operator.linearize, operator.coordinates):
@@ -142,6 +152,104 @@ def test_a_reference_is_a_link_with_its_jacobians_or_a_frame_without():
         Reference.of("cup", state, frames)
 
 
+def test_an_object_is_the_place_or_the_thing_that_is_carried():
+    state, frames = OnRobot().scene(2)
+    place = {**frames, CARRIED: Frame([1.0, 2.0, 3.0])}
+    held = state.with_link(CARRIED, RIGHT, GRASP)
+    assert Reference.of(CARRIED, held, place).frame is place[CARRIED]
+    assert Reference.of(CARRIED, held, place).carrier == -1
+    thing = Reference.of(CARRIED, held, place, held=True)
+    assert torch.equal(thing.linear_jacobian, held.linear_jacobian(CARRIED))
+    assert thing.rigid_with(Reference.of(RIGHT, held, place)).all()
+    assert not thing.rigid_with(Reference.of(LEFT, held, place)).any()
+    free = Reference.of(CARRIED, state, place, held=True)
+    assert free.frame is place[CARRIED] and free.linear_jacobian is None
+    assert free.rigid_with(Reference.of(OBJECT, state, frames)) is True
+
+
+KINDS = pytest.mark.parametrize("kind", [RelativePosition, RelativeOrientation])
+ABSOLUTE = {RelativePosition: AbsolutePosition, RelativeOrientation: AbsoluteOrientation}
+
+
+def silent(at: Linearization) -> bool:
+    """Whether the rows are 0 = 0, exactly."""
+    parts = (at.jacobian, at.matrix, at.displacement)
+    return all(bool((part == 0).all()) for part in parts) and bool((at.noise == 1).all())
+
+
+@WORLDS
+@KINDS
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_nothing_is_said_of_what_no_joint_moves(kind, world: World, batch):
+    state, frames = world.scene(*batch)
+    frames[CARRIED] = Frame([0.1, 0.2, 0.3])
+    carrying = state.with_link(CARRIED, RIGHT, GRASP)
+    free = [kind(CARRIED, OBJECT), kind(CARRIED, OBJECT, held=True), ABSOLUTE[kind](CARRIED)]
+    for operator in free:
+        assert silent(operator.linearize(state, frames))
+        assert silent(operator.linearize(state.with_link(CARRIED, None, GRASP), frames))
+        assert (operator.linear(state, frames) == 0).all()
+        assert (operator.offset(state, frames) == state.joints).all()
+    for operator in (kind(RIGHT, CARRIED, held=True), kind(CARRIED, RIGHT)):
+        assert silent(operator.linearize(carrying, frames))
+        assert operator.linearize(state, frames).noise is None
+    for operator in (
+        kind(LEFT, CARRIED, held=True),
+        kind(CARRIED, OBJECT),
+        kind(CARRIED, LEFT),
+    ):
+        at = operator.linearize(carrying, frames)
+        assert (at.noise == 0).all()
+        assert torch.linalg.matrix_rank(at.jacobian).min() == 3
+
+
+@WORLDS
+@KINDS
+def test_to_a_place_nothing_changes_bit_for_bit(kind, world: World):
+    state, frames = world.scene(3)
+    operator = kind(LEFT, OBJECT)
+    before = operator.linearize(state, frames)
+    after = operator.linearize(state.with_link(OBJECT, RIGHT, GRASP), frames)
+    for name in ("jacobian", "matrix", "displacement"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
+    assert after.noise is None
+    assert torch.equal(
+        operator.coordinates(state, frames),
+        operator.coordinates(state.with_link(OBJECT, RIGHT, GRASP), frames),
+    )
+
+
+@WORLDS
+@KINDS
+def test_robots_that_carry_and_robots_that_do_not_are_each_as_if_alone(kind, world: World):
+    state, frames = world.scene(3)
+    frames[CARRIED] = Frame([0.1, 0.2, 0.3])
+    carries = torch.tensor([True, False, True])
+    mixed = state.with_link(CARRIED, None, frames[CARRIED])
+    mixed = mixed.with_link(CARRIED, RIGHT, GRASP, where=carries)
+    operators = (
+        kind(CARRIED, OBJECT),
+        kind(RIGHT, CARRIED, held=True),
+        kind(LEFT, CARRIED, held=True),
+        ABSOLUTE[kind](CARRIED),
+    )
+    for operator in (*operators, Stack(*operators)):
+        together = operator.linearize(mixed, frames)
+        for row, carrying in enumerate(carries):
+            here = {n: f[row] if f.batch_shape else f for n, f in frames.items()}
+            one = state[row]
+            alone = operator.linearize(
+                one.with_link(CARRIED, RIGHT, GRASP) if carrying else one, here
+            )
+            for name in ("jacobian", "matrix", "displacement"):
+                found, wanted = getattr(together, name)[row], getattr(alone, name)
+                torch.testing.assert_close(found, wanted, rtol=0, atol=1e-14)
+                assert torch.equal(found == 0, wanted == 0)
+            noise = torch.zeros_like(alone.displacement) if alone.noise is None else alone.noise
+            found = noise.new_zeros(3, len(noise)) if together.noise is None else together.noise
+            assert torch.equal(found[row], noise)
+
+
 def test_a_situation_needs_each_frame_once_and_no_link():
     operators = [
         Stack(RelativePosition(LEFT, "cup"), RelativePosition(RIGHT, "lid")),
@@ -150,8 +258,25 @@ def test_a_situation_needs_each_frame_once_and_no_link():
         Canonical(),
     ]
     assert frame_names(operators, OnRobot().kinematics) == ("cup", "lid")
-    assert frame_names(operators, PlanarArm()) == ("cup", "lid", RIGHT)
+    assert frame_names(operators, PlanarArm()) == ("cup", "lid", RIGHT, LEFT)
     assert frame_names([], PlanarArm()) == ()
+
+
+def test_a_situation_needs_the_objects_that_may_be_carried():
+    operators = [
+        Stack(RelativePosition(CARRIED, "tray"), RelativePosition(LEFT, CARRIED)),
+        RelativeOrientation(RIGHT, "lid", held=True),
+    ]
+    robot = OnRobot().kinematics
+    assert frame_names(operators, robot) == ("tray", CARRIED, "lid")
+    assert carried_objects(operators, robot) == (CARRIED, "lid")
+    frames = dict.fromkeys((CARRIED, "tray", "lid"))
+    for operator in operators:
+        operator.check(robot, frames)
+        with pytest.raises(
+            UnknownNameError, match=r"'tray'|'lid' is not in the robot or the f"
+        ):
+            operator.check(robot, [CARRIED])
 
 
 def test_by_default_an_operator_needs_nothing_and_knows_no_quaternion():

@@ -5,7 +5,16 @@ import torch
 
 from tests.support import oracles
 from tests.support.operator_battery import OrientationLaws, RelativeLaws
-from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot
+from tests.support.worlds import (
+    CARRIED,
+    LEFT,
+    OBJECT,
+    RIGHT,
+    CarryingOnPoses,
+    CarryingOnRobot,
+    OnPoses,
+    OnRobot,
+)
 from tpgmm_torch import (
     AbsoluteOrientation,
     RelativeOrientation,
@@ -97,3 +106,52 @@ def test_the_gain_is_without_effect_where_nothing_is_linearised():
     for kind, names in ((AbsoluteOrientation, [LEFT]), (RelativeOrientation, [LEFT, OBJECT])):
         exact, printed = kind(*names), kind(*names, gain=1.0)
         assert torch.equal(exact.linear(state, frames), printed.linear(state, frames))
+
+
+class CarriedOrientationLaws(OrientationLaws):
+    operator = AbsoluteOrientation(CARRIED)
+
+    def row(self, at):
+        return oracles.absolute_orientation(at, CARRIED)
+
+
+class TestCarriedOrientationOnRobot(CarryingOnRobot, CarriedOrientationLaws):
+    pass
+
+
+class TestCarriedOrientationOnPoses(CarryingOnPoses, CarriedOrientationLaws):
+    pass
+
+
+class CarriedToPlaceOrientationLaws(RelativeLaws, OrientationLaws):
+    operator = RelativeOrientation(CARRIED, OBJECT)
+
+    def row(self, at):
+        return oracles.relative_orientation(at, CARRIED, OBJECT)
+
+
+class TestCarriedToPlaceOrientationOnRobot(CarryingOnRobot, CarriedToPlaceOrientationLaws):
+    pass
+
+
+class TestCarriedToPlaceOrientationOnPoses(CarryingOnPoses, CarriedToPlaceOrientationLaws):
+    pass
+
+
+class OtherHandToCarriedOrientationLaws(RelativeLaws, OrientationLaws):
+    operator = RelativeOrientation(LEFT, CARRIED, held=True)
+
+    def row(self, at):
+        return oracles.relative_orientation(at, LEFT, CARRIED)
+
+
+class TestOtherHandToCarriedOrientationOnRobot(
+    CarryingOnRobot, OtherHandToCarriedOrientationLaws
+):
+    pass
+
+
+class TestOtherHandToCarriedOrientationOnPoses(
+    CarryingOnPoses, OtherHandToCarriedOrientationLaws
+):
+    pass

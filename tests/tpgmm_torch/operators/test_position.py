@@ -2,7 +2,16 @@
 
 from tests.support import oracles
 from tests.support.operator_battery import OperatorLaws, RelativeLaws
-from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot
+from tests.support.worlds import (
+    CARRIED,
+    LEFT,
+    OBJECT,
+    RIGHT,
+    CarryingOnPoses,
+    CarryingOnRobot,
+    OnPoses,
+    OnRobot,
+)
 from tpgmm_torch import (
     AbsolutePosition,
     RelativePosition,
@@ -51,4 +60,49 @@ class TestHandToHandPositionOnRobot(OnRobot, HandToHandPositionLaws):
 
 
 class TestHandToHandPositionOnPoses(OnPoses, HandToHandPositionLaws):
+    pass
+
+
+class CarriedPositionLaws(OperatorLaws):
+    operator = AbsolutePosition(CARRIED)
+
+    def row(self, at):
+        return oracles.absolute_position(at, CARRIED)
+
+
+class TestCarriedPositionOnRobot(CarryingOnRobot, CarriedPositionLaws):
+    pass
+
+
+class TestCarriedPositionOnPoses(CarryingOnPoses, CarriedPositionLaws):
+    pass
+
+
+class CarriedToPlacePositionLaws(RelativeLaws):
+    operator = RelativePosition(CARRIED, OBJECT)
+
+    def row(self, at):
+        return oracles.relative_position(at, CARRIED, OBJECT)
+
+
+class TestCarriedToPlacePositionOnRobot(CarryingOnRobot, CarriedToPlacePositionLaws):
+    pass
+
+
+class TestCarriedToPlacePositionOnPoses(CarryingOnPoses, CarriedToPlacePositionLaws):
+    pass
+
+
+class OtherHandToCarriedPositionLaws(RelativeLaws):
+    operator = RelativePosition(LEFT, CARRIED, held=True)
+
+    def row(self, at):
+        return oracles.relative_position(at, LEFT, CARRIED)
+
+
+class TestOtherHandToCarriedPositionOnRobot(CarryingOnRobot, OtherHandToCarriedPositionLaws):
+    pass
+
+
+class TestOtherHandToCarriedPositionOnPoses(CarryingOnPoses, OtherHandToCarriedPositionLaws):
     pass

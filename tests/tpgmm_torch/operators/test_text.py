@@ -24,6 +24,9 @@ OPERATORS = [
     AbsoluteOrientation("l_hand"),
     RelativeOrientation("l_hand", "r_hand"),
     Stack(RelativePosition("l_hand", "bottle"), AbsoluteOrientation("r_hand"), Canonical()),
+    RelativePosition("bottle", "tray"),
+    RelativeOrientation("r_hand", "bottle", held=True),
+    Stack(RelativePosition("lid", "bottle", held=True), RelativePosition("l_hand", "lid")),
 ]
 
 
@@ -43,11 +46,29 @@ def test_a_pose_is_position_and_orientation():
 
 
 @pytest.mark.parametrize(
-    "text", ["", "canonical +", "pos:l_hand", "position:", "position:a@", "position:a@b@c"]
+    "text",
+    [
+        "",
+        "canonical +",
+        "pos:l_hand",
+        "position:",
+        "position:a@",
+        "position:a@b@c",
+        "pose:a@held:",
+    ],
 )
 def test_what_is_no_operator_is_refused_and_explained(text):
     with pytest.raises(DataError, match="A term is 'canonical', or"):
         parse_operator(text)
+
+
+def test_an_object_may_be_meant_as_it_is_carried():
+    text = "position:r_hand@held:bottle"
+    assert parse_operator(text) == RelativePosition("r_hand", "bottle", held=True)
+    assert format_operator(RelativePosition("r_hand", "bottle", held=True)) == text
+    assert parse_operator("pose:bottle@tray").operators[1] == RelativeOrientation(
+        "bottle", "tray"
+    )
 
 
 def test_an_operator_of_ones_own_goes_by_its_repr():

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tests.support.mixtures import CASES, Problem, conditionals_of, random_local, times
-from tpgmm_torch import Canonical, Frame, Stack
+from tests.support.worlds import CARRIED, GRASP, OBJECT, RIGHT
+from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.kalman_update import KalmanUpdate
 from tpgmm_torch.regression.regression import PART
@@ -108,6 +109,56 @@ def test_float32_is_float64_to_its_own_precision():
         actual.covariance.double(), expected.covariance, rtol=1e-3, atol=1e-5
     )
     torch.linalg.cholesky(actual.covariance)
+
+
+SILENT = {
+    "free": [RelativePosition(CARRIED, OBJECT), RelativeOrientation(CARRIED, OBJECT)],
+    "in the hand": [RelativePosition(RIGHT, "cup", held=True), RelativePosition("cup", RIGHT)],
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"activation": "product"}], ids=["time", "product"])
+@pytest.mark.parametrize("form", [Canonical, Joints], ids=["update", "sum"])
+@pytest.mark.parametrize("operators", SILENT.values(), ids=list(SILENT))
+def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators, form, options):
+    paper = CASES["the paper's"]
+    [hands, _] = paper.operators
+    problem = Problem.of(paper, 4, 3)
+    state = problem.state.with_link("cup", RIGHT, GRASP)
+    frames = {**problem.frames, CARRIED: Frame([0.5, 0.1, -0.3])}
+    extra = Stack(*operators)
+    rng, width = np.random.default_rng(3), hands.dimension(None)
+    # far from what is measured, and sure of it: as observations they would decide everything
+    wide = random_local(rng, 4, np.zeros(width + extra.dimension(None)))
+    wide.means[:, 1 : 1 + width] = problem.mixtures[0].means[:, 1:]
+    narrow = slice(0, 1 + width)
+    both = conditionals_of(wide)
+    alone = conditionals_of(
+        replace(
+            wide, means=wide.means[:, narrow], covariances=wide.covariances[:, narrow, narrow]
+        )
+    )
+    plain = problem.regression(**options)
+    joints = plain.conditionals[1]
+    without = replace(plain, operators=[hands, form()], conditionals=[alone, joints])
+    stacked = replace(
+        plain, operators=[Stack(hands, extra), form()], conditionals=[both, joints]
+    )
+    assert (stacked._update is None) is (form is Joints or bool(options))
+    at = times(), state, frames
+    assert_same(stacked.step(*at, candidates=True), without.step(*at))
+    # and by itself
+    other = random_local(rng, 4, np.zeros(extra.dimension(None)))
+    three = replace(
+        plain,
+        operators=[hands, extra, form()],
+        conditionals=[alone, conditionals_of(other), joints],
+    )
+    estimate = three.step(*at, candidates=True)
+    if not options:  # its time marginal is its own
+        assert_same(estimate, without.step(*at))
+    assert (estimate.candidates[1].share == 0).all()
+    assert torch.equal(estimate.candidates[1].mean, state.joints.expand(3, 17))
 
 
 def test_a_task_without_variance_is_named():

@@ -12,9 +12,12 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from tests.support.own_operators import PlanarArm
 from tests.support.robot_zoo import assert_differences_agree, random_joints, upper_body, zoo
-from tpgmm_torch import quaternions
+from tpgmm_torch import Frame, RobotState, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import dtype_name, dtype_named
+
+#: A grasp.
+CUP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
 
 
 class TestTensors:
@@ -120,6 +123,102 @@ class TestState:
             jacobian, matrix, offset = state.orientation_map("l_hand", gain)
             error = (jacobian @ step - matrix @ wanted - offset).norm()
             assert bool(error < 1e-8) is agrees
+
+
+def carried(joints: torch.Tensor, **options: Any) -> RobotState:
+    return upper_body().state(joints).with_link("cup", "r_hand", CUP, **options)
+
+
+class TestObjects:
+    def test_an_object_is_where_the_link_has_it(self) -> None:
+        joints = random_joints(upper_body(), 5)
+        state, hand = carried(joints), upper_body().state(joints)
+        where = Frame(hand.position("r_hand"), hand.orientation("r_hand"))
+        torch.testing.assert_close(state.position("cup"), where.transform(CUP.position))
+        matrix = quaternions.to_matrix(where.orientation) @ quaternions.to_matrix(
+            CUP.orientation
+        )
+        torch.testing.assert_close(quaternions.to_matrix(state.orientation("cup")), matrix)
+        assert state.links == ("l_hand", "r_hand", "cup")
+        assert state.robot_links == hand.robot_links == hand.links
+        assert (state.position("l_hand") == hand.position("l_hand")).all()
+
+    def test_its_jacobian_is_the_derivative_of_its_pose(self) -> None:
+        joints, size = random_joints(upper_body(), 4), 1e-6
+        state = carried(joints)
+        for column, unit in enumerate(torch.eye(17, dtype=torch.float64)):
+            ahead, behind = carried(joints + size * unit), carried(joints - size * unit)
+            velocity = (ahead.position("cup") - behind.position("cup")) / (2 * size)
+            back = quaternions.conjugate(behind.orientation("cup"))
+            turn = quaternions.product(ahead.orientation("cup"), back)
+            # rounding of poses of size one, divided by the step
+            close = {"rtol": 0, "atol": 1e-8}
+            linear, angular = state.linear_jacobian("cup"), state.angular_jacobian("cup")
+            torch.testing.assert_close(linear[..., column], velocity, **close)
+            rate = quaternions.log(turn) / (2 * size)
+            torch.testing.assert_close(angular[..., column], rate, **close)
+
+    def test_robots_of_a_batch_may_hold_it_or_not(self) -> None:
+        joints = random_joints(upper_body(), 3)
+        free = Frame([0.3, 0.1, 0.2], [0.0, 1.0, 0.0, 0.0])
+        left = torch.tensor([True, False, False])
+        right = torch.tensor([False, False, True])
+        state = upper_body().state(joints).with_link("cup", None, free)
+        state = state.with_link("cup", "l_hand", CUP, where=left)
+        state = state.with_link("cup", "r_hand", CUP, where=right)
+        assert state.carrier("cup").tolist() == [0, -1, 1]
+        assert state.links == ("l_hand", "r_hand", "cup")
+        single = upper_body().state(joints[0]).with_link("cup", "l_hand", CUP)
+        for part in ("positions", "orientations", "jacobians", "carriers"):
+            assert (getattr(state[0], part) == getattr(single, part)).all()
+        assert (state.position("cup")[1] == free.position).all()
+        assert (state.orientation("cup")[1] == free.orientation).all()
+        assert (state.jacobians[1, 2] == 0).all()
+        torch.testing.assert_close(state[2].position("cup"), carried(joints[2]).position("cup"))
+
+    def test_grasps_of_many_robots_make_a_batch_of_one(self) -> None:
+        joints = random_joints(upper_body())
+        grasps = Frame(torch.randn(4, 3, dtype=torch.float64))
+        state = upper_body().state(joints).with_link("cup", "l_hand", grasps)
+        assert state.joints.shape == (4, 17)
+        assert state.jacobians.shape == (4, 3, 6, 17)
+        alone = upper_body().state(joints).with_link("cup", "l_hand", grasps[2])
+        torch.testing.assert_close(state[2].jacobians, alone.jacobians)
+
+    def test_what_stands_on_a_carried_object_is_carried_by_the_same_link(self) -> None:
+        state = carried(random_joints(upper_body())).with_link("spoon", "cup", CUP)
+        assert state.carrier("spoon") == state.carrier("r_hand") == 1
+        assert state.carrier("l_hand") == 0
+        direct = Frame(
+            CUP.transform(CUP.position), quaternions.product(CUP.orientation, CUP.orientation)
+        )
+        other = carried(state.joints).with_link("spoon", "r_hand", direct)
+        torch.testing.assert_close(state.jacobians, other.jacobians)
+        with_other_cup = other.with_link("cup", "l_hand", CUP)
+        assert with_other_cup.links == ("l_hand", "r_hand", "spoon", "cup")
+        assert (with_other_cup.position("spoon") == other.position("spoon")).all()
+        assert with_other_cup.carrier("spoon") == 1
+
+    def test_what_cannot_be_is_refused(self) -> None:
+        state = upper_body().state(torch.zeros(17))
+        with pytest.raises(UnknownNameError, match=r"link 'tail' is not in .*\['l_hand', 'r_h"):
+            state.with_link("cup", "tail", CUP)
+        with pytest.raises(DataError, match="'l_hand' is a link of the robot: give the object"):
+            state.with_link("l_hand", "r_hand", CUP)
+        with pytest.raises(
+            DataError, match=r"some robots do not hold 'cup', .*free object first"
+        ):
+            state.with_link("cup", "r_hand", CUP, where=torch.tensor(False))
+
+    def test_gradients_reach_joints_and_grasp(self) -> None:
+        joints = random_joints(upper_body()).requires_grad_()
+        point = CUP.position.clone().requires_grad_()
+
+        def jacobian(joints: torch.Tensor, point: torch.Tensor) -> torch.Tensor:
+            state = upper_body().state(joints)
+            return state.with_link("cup", "r_hand", Frame(point)).jacobians[..., 2, :, :]
+
+        assert gradcheck(jacobian, (joints, point), fast_mode=True)
 
 
 class TestOwnKinematics:
