@@ -9,7 +9,7 @@ of both hands, which share the waist, along minimum-jerk paths.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -42,6 +42,8 @@ GRASP_TURN = (math.cos(-math.pi / 4), 0.0, math.sin(-math.pi / 4), 0.0)
 APPROACH_POINT = {"l_hand": (-0.05, 0.14, 0.0), "r_hand": (-0.05, -0.14, 0.0)}
 #: Where the bottle is brought, upright [m].
 CHEST = np.array((0.24, 0.0, 0.18))
+#: The box in which bottles stand [m], and by how much they are turned to either side [deg].
+LOWEST, HIGHEST, YAW = (0.24, -0.05, 0.10), (0.32, 0.05, 0.20), 20.0
 #: Nominal seconds of each phase; 13 in all, as in the paper.
 PHASES = MappingProxyType(
     {
@@ -114,8 +116,8 @@ class BottleShaking:
 
     def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
         """``n`` bottle poses within reach: a box of 8 x 10 x 10 cm, turned by up to 20 deg."""
-        position = rng.uniform((0.24, -0.05, 0.10), (0.32, 0.05, 0.20), (n, 3))
-        half = np.radians(rng.uniform(-20, 20, n)) / 2
+        position = rng.uniform(LOWEST, HIGHEST, (n, 3))
+        half = np.radians(rng.uniform(-YAW, YAW, n)) / 2
         zero = np.zeros(n)
         return Frame(position, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=1))
 
@@ -162,11 +164,52 @@ class BottleShaking:
         ends = self._phase_ends(n, rng)
         amplitudes = self.amplitude * torch.from_numpy(rng.uniform(0.95, 1.05, n))
         chests = Frame(CHEST + rng.uniform(-self.chest_spread, self.chest_spread, (n, 3)))
-        lengths = torch.floor(ends[:, -1] * self.rate).long() + 1
+        return self._demonstrations(bottles, chests, starts, ends, amplitudes)
+
+    def nominal(self, situations: Sequence[Situation]) -> list[Demonstration]:
+        """The skill in given situations, without its spread in timing, chest and amplitude.
+
+        Parameters
+        ----------
+        situations : sequence of Situation
+            With the frame ``"bottle"``.
+
+        Returns
+        -------
+        list of Demonstration
+            As :meth:`demonstrations` gives them, of 13 s.
+        """
+        n = len(situations)
+        ends = torch.tensor(list(PHASES.values()), dtype=torch.float64).cumsum(0)
+        return self._demonstrations(
+            Frame.stack([situation.frames["bottle"] for situation in situations]),
+            Frame(CHEST).expand((n,)),
+            torch.stack([situation.joints for situation in situations]),
+            ends.expand(n, -1),
+            torch.full((n,), self.amplitude, dtype=torch.float64),
+        )
+
+    def usual(self, bottle: Frame) -> bool:
+        """Whether a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
+        low, high = (bottle.position.new_tensor(corner) for corner in (LOWEST, HIGHEST))
+        inside = (low - 1e-9 <= bottle.position) & (bottle.position <= high + 1e-9)
+        w, x, y, z = bottle.orientation.tolist()
+        turn = math.degrees(2 * math.atan2(z, w))
+        return bool(inside.all()) and math.hypot(x, y) < 1e-6 and abs(turn) < YAW + 1e-6
+
+    def _demonstrations(
+        self,
+        bottles: Frame,
+        chests: Frame,
+        starts: Tensor,
+        ends: Tensor,
+        amplitudes: Tensor,
+    ) -> list[Demonstration]:
+        lengths = torch.floor(ends[:, -1] * self.rate + 1e-9).long() + 1
         joints = self._follow(bottles, chests, starts, ends, amplitudes, int(lengths.max()))
         phases = list(PHASES)
         demonstrations = []
-        for i in range(n):
+        for i in range(len(starts)):
             end = dict(zip(phases, ends[i].tolist(), strict=True))
             events = {
                 "grasp": (end["close"] + end["hold"]) / 2,

@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.control_rate import rate_processors
 from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
+from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["AlohaStateConfig", "BottleShakingConfig"]
@@ -83,7 +84,7 @@ class BottleShakingConfig(_StateEnvConfig):
     ----------
     task, features, features_map, max_parallel_tasks, disable_env_checker
         As in every configuration of LeRobot.
-    fps, mode, episode_length, pushes, noise, track, frequency, amplitude
+    fps, mode, episode_length, pushes, noise, track, condition, frequency, amplitude
         Options of
         :class:`~lerobot_policy_tpgmm.environments.bottle.shaking.BottleShakingEnv`; its own
         defaults where None.
@@ -98,6 +99,7 @@ class BottleShakingConfig(_StateEnvConfig):
     pushes: bool = False
     noise: float = 0.0
     track: bool = False
+    condition: str = NOMINAL
     frequency: float | None = None
     amplitude: float | None = None
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tpgmm_datasets.bottle.skill import HANDS, PHASES, BottleShaking
-from tpgmm_torch import Situation, quaternions
+from tpgmm_torch import Frame, Situation, quaternions
 from tpgmm_torch.metrics import largest_velocity, sinusoid
 
 
@@ -98,3 +98,42 @@ def test_situations_start_within_limits_and_have_the_bottle_within_the_box(skill
         assert 0.24 <= x <= 0.32
         assert abs(y) <= 0.05
         assert 0.10 <= z <= 0.20
+
+
+def test_the_nominal_path_is_the_same_skill_without_its_spread(skill):
+    situations = skill.situations(2, seed=5)
+    paths = skill.nominal(situations)
+    for path, situation in zip(paths, situations, strict=True):
+        assert path.duration == 13.0
+        assert path.events == pytest.approx({"grasp": 4.25, "shake": 8.0, "rest": 12.5})
+        torch.testing.assert_close(path.joints[0], situation.joints)
+        bottle = path.frames["bottle"]
+        position, _ = skill.grasp_error(path.joints[round(4.25 * skill.rate)], bottle)
+        assert position < 1e-4
+        steady = slice(round(8.6 * skill.rate), round(11.9 * skill.rate))
+        for column in skill.shoulders(path)[steady].T:
+            assert sinusoid(path.time[steady], column).amplitude == pytest.approx(
+                skill.amplitude, rel=0.01
+            )
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "usual"),
+    [
+        ((0.24, -0.05, 0.10), -20, True),
+        ((0.32, 0.05, 0.20), 20, True),
+        ((0.33, 0.0, 0.15), 0, False),
+        ((0.28, 0.0, 0.09), 0, False),
+        ((0.28, 0.0, 0.15), 21, False),
+    ],
+)
+def test_where_bottles_usually_stand(skill, position, yaw, usual):
+    half = np.radians(yaw) / 2
+    assert skill.usual(Frame(position, [np.cos(half), 0, 0, np.sin(half)])) == usual
+    lying = Frame(position, [np.cos(0.1), np.sin(0.1), 0, 0])
+    assert not skill.usual(lying)
+
+
+def test_drawn_bottles_are_usual(skill):
+    for situation in skill.situations(50, seed=1):
+        assert skill.usual(situation.frames["bottle"])

@@ -7,6 +7,7 @@ Palms and bottle are so dimensioned that the palms just touch the bottle at the 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ except ModuleNotFoundError as error:
         "bottle_shaking needs MuJoCo: pip install 'lerobot_policy_tpgmm[environments]'"
     ) from error
 
-__all__ = ["CAMERA", "FOOT", "TABLE_LOW", "BottleScene", "bottle_model", "displaced"]
+__all__ = ["CAMERA", "FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "bottle_model"]
 
 #: Of the simulation and of the position control of the joints [s].
 TIMESTEP = 1e-3
@@ -118,6 +119,25 @@ def _add_view(spec: Any) -> None:
     )
 
 
+@dataclass(frozen=True)
+class Snapshot:
+    """Where everything is at an instant.
+
+    Parameters
+    ----------
+    positions : ndarray
+        Of all joints of the model.
+    held : bool
+        Whether the bottle is attached to both hands.
+    table : float
+        Its height [m].
+    """
+
+    positions: NDArray[np.float64]
+    held: bool
+    table: float
+
+
 class BottleScene:
     """The state of the simulated world, and what can happen in it.
 
@@ -153,6 +173,11 @@ class BottleScene:
     def bottle(self) -> NDArray[np.float64]:
         """The bottle's position [m] and orientation, a unit quaternion; shape (7,)."""
         return self.data.qpos[self._n :].copy()
+
+    @property
+    def objects(self) -> list[NDArray[np.float64]]:
+        """The poses of what is observed."""
+        return [self.bottle]
 
     def reset(self, bottle: ArrayLike, joints: ArrayLike, mass: float) -> None:
         """Stand still, the bottle on the table.
@@ -229,6 +254,33 @@ class BottleScene:
             data.qpos[n + 2] = self.model.body_pos[self._table, 2] + FOOT
         data.time += seconds
 
+    def rest(self) -> None:
+        """Stand still, as it is."""
+        data = self.data
+        data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
+        data.ctrl[:] = data.qpos[: self._n]
+        mujoco.mj_forward(self.model, data)
+
+    def put_bottle(self, pose: NDArray[np.float64]) -> None:
+        """Put the bottle somewhere, at rest; shape (7,)."""
+        data, n = self.data, self._n
+        data.qpos[n:], data.qvel[n:] = pose, 0
+        mujoco.mj_kinematics(self.model, data)
+
+    def snapshot(self) -> Snapshot:
+        """The state without velocities."""
+        height = float(self.model.body_pos[self._table, 2])
+        return Snapshot(self.data.qpos.copy(), self.held, height)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Bring everything to where it was, in hands that took hold of the bottle as now."""
+        self.data.qpos[:] = snapshot.positions
+        self.model.body_pos[self._table, 2] = snapshot.table
+        self.held = snapshot.held
+        self.data.eq_active[:] = snapshot.held
+        self.model.geom_conaffinity[self._surface] = _TABLE | (0 if self.held else _PALM)
+        mujoco.mj_kinematics(self.model, self.data)
+
     def gap(self) -> float:
         """Distance of the farther palm from the bottle's surface, negative inside it [m]."""
         model, data, points = self.model, self.data, np.empty(6)
@@ -279,14 +331,3 @@ class BottleScene:
     def _sink(self, seconds: float) -> None:
         height = self.model.body_pos[self._table, 2] - TABLE_SPEED * seconds
         self.model.body_pos[self._table, 2] = max(height, TABLE_LOW)
-
-
-def displaced(pose: NDArray[np.float64], error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pose (7,) that is off by ``error`` (6,).
-
-    The error is a displacement [m] and, about the axes of the pose, a rotation vector [rad].
-    """
-    out = pose.copy()
-    out[:3] += error[:3]
-    mujoco.mju_quatIntegrate(out[3:], error[3:], 1.0)
-    return out

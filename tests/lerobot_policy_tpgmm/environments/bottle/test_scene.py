@@ -1,20 +1,11 @@
-"""The simulated world: the robot of the kinematics, and poses that are off."""
+"""The simulated world: the robot of the kinematics, and what can be done to it."""
 
 import mujoco
 import numpy as np
 
 import lerobot_policy_tpgmm  # noqa: F401  registers the environment
 from lerobot_policy_tpgmm.environments.bottle.conditions import skill
-from lerobot_policy_tpgmm.environments.bottle.scene import BottleScene, displaced
-
-
-def test_a_displaced_pose():
-    half = np.sqrt(0.5)
-    pose = np.array([1.0, 2.0, 3.0, half, 0, 0, half])
-    out = displaced(pose, np.array([0.1, 0, 0, np.pi / 2, 0, 0]))
-    # a quarter about the pose's own x axis, after a quarter about z
-    np.testing.assert_allclose(out, [1.1, 2, 3, 0.5, 0.5, 0.5, 0.5], atol=1e-12)
-    assert pose[0] == 1
+from lerobot_policy_tpgmm.environments.bottle.scene import BottleScene
 
 
 def test_the_simulated_robot_is_the_one_of_the_kinematics():

@@ -12,10 +12,10 @@ from stable_baselines3.common.env_checker import check_env as check_by_stable_ba
 
 import lerobot_policy_tpgmm  # noqa: F401  registers the environment
 from lerobot_policy_tpgmm.environments.bottle.conditions import PUSHED, skill
+from lerobot_policy_tpgmm.environments.bottle.handling import GRIP_FORCE
 from lerobot_policy_tpgmm.environments.bottle.shaking import (
     AMPLITUDE,
     FREQUENCY,
-    GRIP_FORCE,
     BottleShakingEnv,
 )
 from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
