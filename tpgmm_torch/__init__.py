@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
+    from tpgmm_torch.data.affine import Affine
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
         RelativeOrientation,
         RelativePosition,
         Stack,
+        TaskParameters,
     )
     from tpgmm_torch.regression.regression import Estimate
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
+    "Affine",
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
@@ -64,6 +67,7 @@ __all__ = [
     "Status",
     "Stiffness",
     "TaskParameterizedGMM",
+    "TaskParameters",
     "TrackingPlan",
     "Trajectory",
     "WaitingClock",
@@ -75,6 +79,7 @@ _HOMES = {
     "control.controller": ("Controller",),
     "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
     "impedance.stiffness": ("Impedance", "Stiffness"),
+    "data.affine": ("Affine",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
@@ -90,6 +95,7 @@ _HOMES = {
         "RelativeOrientation",
         "RelativePosition",
         "Stack",
+        "TaskParameters",
     ),
     "robots.tracked_poses": ("Poses",),
     "regression.regression": ("Estimate",),

@@ -36,6 +36,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
 from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -106,9 +107,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         once, or that of the product, as in eq. (2).
     epsilon : float, default=1e-4
         Added to the diagonal of every projected covariance by ``fusion="covariance"`` [rad^2].
-    prior_std : float, default=10.0
+    prior_std : float, mapping of str to float, or array-like of shape (n_joints,), default=10.0
         Standard deviation of the prior around q_{t-1} where no operator determines every
-        joint [rad].
+        joint: for all joints [rad], for those that are lengths in units of the root mean square
+        of the learned positions; or joint by joint, each in its own unit.
     negligible : float, default=1e-9
         With ``activation="time"``, shares of the largest weight below this do not count.
     blend : float, default=1.0
@@ -180,7 +182,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "fusion": [StrOptions({"information", "covariance"})],
         "activation": [StrOptions({"time", "product"})],
         "epsilon": [Interval(Real, 0, None, closed="left")],
-        "prior_std": [Interval(Real, 0, None, closed="neither")],
+        "prior_std": [Interval(Real, 0, None, closed="neither"), dict, "array-like"],
         "negligible": [Interval(Real, 0, 1, closed="left")],
         "blend": [Interval(Real, 0, None, closed="left")],
         "keep_limits": ["boolean"],
@@ -210,7 +212,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         fusion: str = "information",
         activation: str = "time",
         epsilon: float = 1e-4,
-        prior_std: float = 10.0,
+        prior_std: float | Mapping[str, float] | Sequence[float] = PRIOR_STD,
         negligible: float = 1e-9,
         blend: float = 1.0,
         keep_limits: bool = True,
@@ -318,11 +320,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     ) -> list[Trajectory]:
         """Reproduce the skill: closed kinematic loop, q_{t-1} is the last reference.
 
+        Times beyond the skill's beginning or end, the first and last of ``time_``, are held:
+        nothing is extrapolated.
+
         Parameters
         ----------
         X : sequence of Situation or Demonstration
             Situations of equal time grids run as one batch. A demonstration stands for the
-            situation that it was made in.
+            situation that it was made in, :meth:`Situation.of`: its start and its frames, but
+            not its time.
         candidates : bool, default=True
             Whether to return each operator's own estimate too.
 
@@ -340,7 +346,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise DataError(f"predict takes a list of Situation, got {type(X).__name__}")
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
-        return rollout(self.regression(), situations, self.blend, self.keep_limits, candidates)
+        return rollout(
+            self.regression(), situations, self.time_, self.blend, self.keep_limits, candidates
+        )
 
     def step(
         self,
@@ -350,7 +358,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         *,
         candidates: bool = False,
     ) -> Estimate:
-        """One control tick for a batch of robots.
+        """One control tick for a batch of robots: the model's raw map.
+
+        It has no memory, and does at any time what the mixture says: beyond the skill's end
+        that is an extrapolation, and nothing but the limits of position bounds a step from
+        where the robot is. :meth:`controller` is what runs a skill.
 
         Parameters
         ----------
@@ -511,17 +523,31 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ]
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:
-        """Mean log-likelihood per time step of (new) demonstrations.
+        """Mean log-likelihood per time step of (new) demonstrations; higher is better.
 
-        It is the likelihood of the local data, so models with other operators are not
-        comparable: use :func:`tpgmm_torch.metrics.reproduction_scorer` for those.
+        The density is that of time and of all operators' local coordinates,
+        ``sum_i pi_i N(t | i) prod_j N(X_t^(j) | t, i)``. Time counts once, however many
+        operators there are, so that it makes no difference whether independent coordinates
+        come in one operator or in several. Models that look at *other* coordinates describe
+        other data, in other units, and are not comparable: use
+        :func:`tpgmm_torch.metrics.make_scorer` for those.
+
+        Unlike ``lower_bound_``, :meth:`bic` and :meth:`aic`, which are EM's and count time
+        once for each operator.
         """
         lengths = [len(demonstration) for demonstration in check_demonstrations(X)]
         return float(np.average(self.score_samples(X), weights=lengths))
 
     def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
-        """Mean log-likelihood per time step of each demonstration, shape (n,)."""
-        return np.array([self.mixture_.score(row) for row in self._rows(X)])
+        """Mean log-likelihood per time step of each demonstration, (n,); see :meth:`score`."""
+        rows, regression = self._rows(X), self.regression()
+        widths = block_widths(self.operators_, self.kinematics_)
+        scores = []
+        for row in rows:
+            blocks = torch.from_numpy(row).to(self.means_[0]).split(list(widths), 1)
+            local = [block[:, 1:] for block in blocks]
+            scores.append(float(regression.log_density(blocks[0][:, 0], local).mean()))
+        return np.array(scores)
 
     def bic(self, X: Sequence[Demonstration]) -> float:
         """Bayesian information criterion on demonstrations; lower is better."""
@@ -540,8 +566,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             self.fusion,
             self.activation,
             self.epsilon,
-            self.prior_std,
             self.negligible,
+            self.prior_std if isinstance(self.prior_std, Real) else repr(self.prior_std),
         )
         backend = self._backend
         prepared = getattr(self, "_prepared", None)
@@ -555,7 +581,17 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             if backend is not None:
                 make = functools.partial(CompiledRegression, backend=backend)
             fitted = self.kinematics_, self.operators_, conditionals, log_weights
-            regression = make(*fitted, *key)
+            mixture = self.weights_, self.means_, self.covariances_
+            regression = make(
+                *fitted,
+                fusion=self.fusion,
+                activation=self.activation,
+                epsilon=self.epsilon,
+                prior_std=prior_widths(
+                    self.prior_std, self.kinematics_, self.operators_, *mixture
+                ),
+                negligible=self.negligible,
+            )
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]
 
@@ -627,10 +663,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     @classmethod
     def from_parameters(
         cls,
-        weights: Tensor,
-        means: Sequence[Tensor],
-        covariances: Sequence[Tensor],
-        time: Tensor,
+        weights: Any,
+        means: Sequence[Any],
+        covariances: Sequence[Any],
+        time: Any,
         *,
         operators: Sequence[Operator] | None = None,
         robot: Kinematics,
@@ -640,7 +676,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
         Parameters
         ----------
-        weights, means, covariances, time
+        weights, means, covariances, time : array-like, or sequences of array-like
             As in the attributes of that name.
         operators : sequence of Operator, optional
         robot : Kinematics
@@ -660,6 +696,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DataError, ShapeError
             If they are no mixture, or do not fit the operators.
         """
+        weights, time = as_tensor(weights, "weights"), as_tensor(time, "time")
+        means = [as_tensor(mean, "a mean") for mean in means]
+        covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
         settings = {"n_components": len(weights)} | settings
         model = cls(operators=operators, robot=robot, **settings)
         model._validate_params()
@@ -687,7 +726,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """
         self._check_fitted()
         parameters = {
-            name: value.item() if isinstance(value, np.generic) else value
+            name: value.tolist() if isinstance(value, np.generic | np.ndarray) else value
             for name, value in self.get_params(deep=False).items()
             if name not in ("operators", "robot")
         }
@@ -798,9 +837,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def _situation(self, given: Situation | Demonstration) -> Situation:
         names, like = self.kinematics_.joint_names, self.time_
         if isinstance(given, Demonstration):
-            given = Situation.of(given.reordered(names))
+            given = Situation.of(given)
         if not isinstance(given, Situation):
             raise DataError(f"predict takes Situation objects, got {type(given).__name__}")
+        given = given.reordered(names)
         if len(given.joints) != len(names):
             raise ShapeError(
                 f"the start posture has {len(given.joints)} joints, the model has "
@@ -809,7 +849,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         for operator in self.operators_:
             operator.check(self.kinematics_, given.frames)
         time = self.time_ if given.time is None else given.time.to(like)
-        frames = {name: given.frames[name].to(like) for name in self.frame_names_}
+        present = given.frames_at(time)
+        frames = {name: present[name].to(like) for name in self.frame_names_}
         return Situation(given.joints.to(like), frames, time)
 
     def _rows(self, X: Sequence[Demonstration]) -> list[NDArray[np.float64]]:

@@ -52,6 +52,10 @@ OUTER = (
 )
 
 
+#: By how much R^T R of a rotation matrix may differ from the identity: data rounded to three
+#: digits are off by up to 2 * 3 * 0.5e-3.
+ROTATION_TOLERANCE = 3e-3
+
 #: What :func:`_constant` has made.
 CONSTANTS: dict[tuple[torch.dtype, torch.device], dict[str, Tensor]] = {}
 
@@ -284,6 +288,19 @@ def to_matrix(q: Tensor) -> Tensor:
     return (pairs @ _constant("rotation", q.dtype, q.device)).unflatten(-1, (3, 3))
 
 
+def _check_rotations(matrix: Tensor) -> None:
+    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+    error = (matrix.mT @ matrix - eye).abs().amax((-2, -1))
+    # written so that NaN is refused, too
+    if not bool((error <= ROTATION_TOLERANCE).all()):
+        raise DataError(
+            "a matrix is no rotation: R^T R differs from the identity by "
+            f"{float(error.max()):.3g}, the tolerance is {ROTATION_TOLERANCE}"
+        )
+    if bool((torch.linalg.det(matrix) < 0).any()):
+        raise DataError("a matrix is no rotation but a reflection: its determinant is -1")
+
+
 def from_matrix(matrix: Tensor) -> Tensor:
     """Unit quaternions of rotation matrices, real part non-negative.
 
@@ -299,9 +316,13 @@ def from_matrix(matrix: Tensor) -> Tensor:
     ------
     ShapeError
         If the last two dimensions are not 3 x 3.
+    DataError
+        If a matrix is no rotation: its columns are no right-handed system of orthogonal unit
+        vectors, by more than rounding to three digits would explain.
     """
     if matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
+    _check_rotations(matrix.detach())
     flat = matrix.flatten(-2) @ _constant("outer", matrix.dtype, matrix.device)
     outer = (flat + _constant("eye", matrix.dtype, matrix.device)).unflatten(-1, (4, 4))
     # the column of the symmetric 4 q q^T that belongs to the largest entry of q

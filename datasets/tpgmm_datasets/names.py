@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_groups
 
 __all__ = ["POSE_PARTS", "match_names", "pose_groups", "quaternion_groups", "value_names"]
-
-#: How the parts of a pose are called after its own name: metres, and (w, x, y, z).
-POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
 _SILENT = {"k", "joint", "pos", "position", "motor"}
@@ -91,33 +89,3 @@ def match_names(
             )
         matched[fits[0]] = name
     return matched
-
-
-def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
-    """Positions of the seven parts of every pose that the names tell of.
-
-    A pose ``bottle`` is there when ``bottle.x``, ... ``bottle.qz`` (or ``bottle_x``, ...) are.
-
-    Returns
-    -------
-    dict of str to tuple of int
-        By name of the pose, in the order of :data:`POSE_PARTS`.
-    """
-    return _groups(names, POSE_PARTS)
-
-
-def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
-    """Positions of (w, x, y, z) of every quaternion that the names tell of."""
-    return list(_groups(names, POSE_PARTS[3:]).values())
-
-
-def _groups(names: Sequence[str] | None, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    positions: Mapping[str, int] = {name: i for i, name in enumerate(names or ())}
-    groups = {}
-    for name in positions:
-        match = re.fullmatch(rf"(.*)([._]){parts[0]}", name)
-        if match:
-            stem = match[1] + match[2]
-            if all(stem + part in positions for part in parts):
-                groups[match[1]] = tuple(positions[stem + part] for part in parts)
-    return groups

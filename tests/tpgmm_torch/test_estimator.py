@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.stats import multivariate_normal
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 from sklearn.model_selection import GridSearchCV, KFold, LeaveOneOut, cross_val_score
@@ -47,6 +48,7 @@ from tpgmm_torch import (
     RelativePosition,
     Robot,
     Situation,
+    Stack,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import LinearTimeNormalization
@@ -703,8 +705,12 @@ def test_a_pipeline_aligns_and_learns():
     model = make_pipeline(LinearTimeNormalization(), TaskParameterizedGMM(4, blend=0.0))
     model.fit(uneven)
     assert model[-1].mixture_.group_size == 4
-    [trajectory] = model[-1].predict(uneven[:1])
-    assert trajectory.joints.shape == (30, 3)
+    [own], [given] = (
+        model[-1].predict(uneven[0]),
+        model[-1].predict(Situation.of(uneven[0], uneven[0].time)),
+    )
+    assert torch.equal(own.time, model[-1].time_)
+    assert torch.equal(given.time, uneven[0].time)
 
 
 def test_it_says_that_samples_are_no_rows():
@@ -861,9 +867,43 @@ def test_a_score_is_the_mean_over_all_time_steps():
     assert values.shape == (3,)
     assert model.score(uneven) == pytest.approx(values @ [30, 30, 12] / 72)
     rows = torch.cat(local_data(uneven, [Canonical()], model.kinematics_)).numpy()
+    # with one operator, time counts once in the mixture, too
     assert model.score(uneven) == pytest.approx(model.mixture_.score(rows))
     assert model.bic(uneven) == pytest.approx(model.mixture_.bic(rows))
     assert model.aic(uneven) == pytest.approx(model.mixture_.aic(rows))
+
+
+def test_time_counts_once_however_many_operators_there_are():
+    model, [shown] = hands(), handlings(1)
+    rows = local_data([shown], model.operators_, HANDS, model.regression().expected)[0].numpy()
+    sides, component = np.split(rows, 2, axis=1), []
+    for k in range(len(model.weights_)):
+        logs = [np.log(float(model.weights_[k]))]
+        for j, side in enumerate(sides):
+            mean, covariance = model.means_[j][k].numpy(), model.covariances_[j][k].numpy()
+            logs.append(multivariate_normal(mean, covariance).logpdf(side))
+            if j:  # time again
+                time = multivariate_normal(mean[0], covariance[0, 0]).logpdf(side[:, 0])
+                logs.append(-time)
+        component.append(sum(logs))
+    expected = np.logaddexp.reduce(component).mean()
+    assert model.score([shown]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_packages_of_independent_coordinates_are_comparable():
+    """With diagonal covariances one operator of all coordinates is as many operators."""
+    apart = hands_model(covariance_type="diag", operators=[*HANDLING]).fit(handlings())
+    means = torch.cat([apart.means_[0], apart.means_[1][:, 1:]], 1)
+    covariances = torch.diag_embed(
+        torch.cat(
+            [c.diagonal(dim1=1, dim2=2)[:, j:] for j, c in enumerate(apart.covariances_)], 1
+        )
+    )
+    together = TaskParameterizedGMM.from_parameters(
+        apart.weights_, [means], [covariances], apart.time_,
+        operators=[Stack(*HANDLING)], robot=HANDS,
+    )  # fmt: skip
+    assert together.score(handlings()) == pytest.approx(apart.score(handlings()), rel=1e-12)
 
 
 def test_another_motion_is_less_likely():

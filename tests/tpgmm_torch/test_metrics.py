@@ -1,21 +1,38 @@
 """Measures of reproductions, against signals whose answer is known."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+from sklearn.base import clone
+from sklearn.model_selection import GridSearchCV, KFold
 
-from tests.support.skills import JOINT_NAMES, handlings, hands, wave, waves
-from tpgmm_torch import Demonstration, Trajectory
+from tests.support.skills import (
+    HANDS,
+    JOINT_NAMES,
+    canonical,
+    handlings,
+    hands,
+    hands_model,
+    wave,
+    waves,
+)
+from tests.support.worlds import LEFT, OnPoses, upper_body
+from tpgmm_torch import Demonstration, Situation, Trajectory
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.metrics import (
     joint_rmse,
     largest_acceleration,
     largest_velocity,
+    make_scorer,
+    pose_errors,
     reproduction_scorer,
     sinusoid,
 )
+from tpgmm_torch.model_selection import cross_validate
 
 
 def trajectory(time: torch.Tensor, joints: torch.Tensor, names=JOINT_NAMES) -> Trajectory:
@@ -55,6 +72,165 @@ def test_the_scorer_is_minus_the_mean_error():
     assert reproduction_scorer(hands(), spoilt) < -0.1
     with pytest.raises(DataError, match="empty"):
         reproduction_scorer(hands(), [])
+
+
+def flipped(demonstration: Demonstration, steps: slice = slice(None)) -> Demonstration:
+    """The same poses with the other sign of their quaternions, at some steps."""
+    joints = demonstration.joints.clone()
+    joints[steps] = OnPoses().flipped_answer(joints[steps])
+    return replace(demonstration, joints=joints)
+
+
+def test_signs_of_recorded_quaternions_mean_nothing():
+    [shown] = handlings(1)
+    found = trajectory(shown.time, shown.joints, HANDS.joint_names)
+    for other in (flipped(shown), flipped(shown, slice(3, None, 4))):
+        assert joint_rmse(found, other) == 0.0
+        assert pose_errors(found, other, HANDS, "left").angle.max() < 1e-5
+        for scorer in (reproduction_scorer, make_scorer(), make_scorer(quantity="angle")):
+            assert scorer(hands(), [other]) == pytest.approx(scorer(hands(), [shown]), rel=1e-9)
+    moved = flipped(shown).joints.clone()
+    moved[:, 0] += 0.7
+    assert joint_rmse(found, replace(shown, joints=moved)) == pytest.approx(0.7 / 14**0.5)
+
+
+def shifted(shown: Demonstration, turn: Rotation, by: float) -> Trajectory:
+    """The right hand elsewhere by so many metres, and turned."""
+    joints = shown.joints.clone()
+    joints[:, 8] += by
+    before = Rotation.from_quat(joints[:, 10:14].numpy(), scalar_first=True)
+    after = (turn * before).as_quat(scalar_first=True)
+    joints[:, 10:14] = torch.from_numpy(after)
+    return trajectory(shown.time, joints, HANDS.joint_names)
+
+
+def test_pose_errors_are_distances_and_angles():
+    [shown] = handlings(1)
+    found = shifted(shown, Rotation.from_rotvec([0.0, 0.0, 30.0], degrees=True), 0.004)
+    errors = pose_errors(found, shown, HANDS, "right")
+    assert torch.equal(errors.time, shown.time)
+    torch.testing.assert_close(errors.position, torch.full((30,), 4.0).double())
+    torch.testing.assert_close(errors.angle, torch.full((30,), 30.0).double())
+    left = pose_errors(found, shown, HANDS, "left")
+    assert left.position.max() == 0.0
+    assert left.angle.max() < 1e-5
+    assert repr(errors) == "PoseErrors(30 instants, mean 4 mm, 30 deg)"
+
+
+def test_poses_of_a_robot_are_those_of_its_kinematics():
+    robot, time = upper_body(), torch.linspace(0, 1, 5, dtype=torch.float64)
+    joints = torch.linspace(-0.3, 0.3, 5, dtype=torch.float64)[:, None].expand(5, 17)
+    shown = Demonstration(time, joints.flip(1), joint_names=robot.joint_names[::-1])
+    found = trajectory(time, joints + 0.05, robot.joint_names)
+    errors = pose_errors(found, shown, robot, LEFT, at=0.5)
+    a, b = robot.state(joints[2] + 0.05), robot.state(joints[2])
+    expected = 1e3 * (a.position(LEFT) - b.position(LEFT)).norm()
+    torch.testing.assert_close(errors.position, expected[None])
+    turns = [Rotation.from_quat(s.orientation(LEFT).numpy(), scalar_first=True) for s in (a, b)]
+    expected = np.rad2deg((turns[0] * turns[1].inv()).magnitude())
+    assert float(errors.angle) == pytest.approx(expected)
+
+
+def test_instants_are_named_given_or_found():
+    [shown] = handlings(1)
+    shown = replace(shown, events={"close": 0.713})
+    late = trajectory(shown.time + 0.1, shown.joints, HANDS.joint_names)
+    by_name = pose_errors(late, shown, HANDS, "left", at="close")
+    assert by_name.time.tolist() == [0.713]
+    for at in (
+        0.713,
+        [0.713],
+        torch.tensor(0.713, dtype=torch.float64),
+        lambda d: d.events["close"],
+    ):
+        other = pose_errors(late, shown, HANDS, "left", at=at)
+        assert torch.equal(other.position, by_name.position)
+    both = pose_errors(late, shown, HANDS, "left", at=[0.2, 0.713])
+    assert both.position[1] == by_name.position[0]
+    assert by_name.position > 10
+    same = pose_errors(late, shown, HANDS, "left", at="close", reproduced_at=0.813)
+    assert same.position < 1e-9
+    held = pose_errors(late, shown, HANDS, "left", at=0.0)
+    assert held.position == 0.0  # it has not begun yet
+    one = Demonstration([1.0], shown.joints[:1], joint_names=HANDS.joint_names)
+    assert pose_errors(late, one, HANDS, "left").position.shape == (1,)
+
+
+@pytest.mark.parametrize(
+    ("at", "options", "error", "message"),
+    [
+        (
+            "grasp",
+            {},
+            UnknownNameError,
+            r"event 'grasp' is not in the demonstration; .*'close'",
+        ),
+        (2.5, {}, DataError, r"\[2.5\] s lie outside the demonstration, 0 to 2 s"),
+        (float("nan"), {}, DataError, "NaN"),
+        ([], {}, DataError, "outside"),
+        (0.5, {"reproduced_at": [0.1, 0.2]}, ShapeError, "1 instants.*2 in reproduced_at"),
+        (0.5, {"link": "hand"}, UnknownNameError, "'hand'.*'left', 'right'"),
+    ],
+)
+def test_instants_that_are_none_are_refused(at, options, error, message):
+    shown = replace(handlings(1)[0], events={"close": 0.7})
+    found = trajectory(shown.time, shown.joints, HANDS.joint_names)
+    options = {"link": "left", **options}
+    with pytest.raises(error, match=message):
+        pose_errors(found, shown, HANDS, at=at, **options)
+
+
+def test_a_pose_scorer_is_minus_the_mean_error():
+    shown = [replace(d, events={"close": 0.3 * (i + 1)}) for i, d in enumerate(handlings(3))]
+    model = hands()
+    situations = [Situation.of(d, d.time) for d in shown]
+    found = model.predict(situations, candidates=False)
+
+    def mean(quantity, at, *links):
+        return np.mean(
+            [
+                getattr(pose_errors(t, d, HANDS, link, at), quantity).mean()
+                for t, d in zip(found, shown, strict=True)
+                for link in links
+            ]
+        )
+
+    for event in ("close", 0.9, None, lambda d: d.events["close"] / 2):
+        for quantity in ("position", "angle"):
+            scorer = make_scorer("right", event, quantity)
+            assert scorer(model, shown) == pytest.approx(-mean(quantity, event, "right"))
+    every = make_scorer(event="close")
+    assert every(model, shown) == pytest.approx(-mean("position", "close", "left", "right"))
+    listed = make_scorer(event=[0.3, 0.6, 0.9])
+    assert listed(model, shown) == pytest.approx(every(model, shown))
+    assert pickle.loads(pickle.dumps(every)) == every
+    assert clone(every, safe=False) == every
+
+
+def test_a_pose_scorer_serves_scikit_learn():
+    shown = [replace(d, events={"close": 1.0}) for d in handlings(4)]
+    scorer = make_scorer("right", "close")
+    search = GridSearchCV(
+        hands_model(), {"n_components": [1, 6]}, scoring=scorer, cv=KFold(2)
+    ).fit(shown)
+    assert search.best_params_ == {"n_components": 6}
+    ours = cross_validate(hands_model(), shown, cv=KFold(2), scoring=scorer)
+    np.testing.assert_allclose(
+        ours["test_score"],
+        [search.cv_results_[f"split{i}_test_score"][1] for i in (0, 1)],
+        rtol=1e-6,
+    )
+
+
+def test_what_a_scorer_cannot_serve_is_refused():
+    with pytest.raises(DataError, match=r"'position' .mm. or 'angle' .deg., got 'both'"):
+        make_scorer(quantity="both")
+    with pytest.raises(ShapeError, match="2 instants for 4 demonstrations: for folds, name"):
+        make_scorer(event=[0.1, 0.2])(hands(), handlings(4))
+    with pytest.raises(DataError, match="no links"):
+        make_scorer()(canonical().fit(waves()), waves())
+    with pytest.raises(UnknownNameError, match="'wrist'"):
+        make_scorer("wrist")(hands(), handlings(1))
 
 
 @pytest.mark.parametrize("kind", [trajectory, lambda t, q: Demonstration(t, q)])

@@ -143,6 +143,23 @@ def test_from_matrix_refuses_other_shapes(shape):
         Q.from_matrix(torch.zeros(shape))
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: 1.01 * m, "R\\^T R differs from the identity by 0.02"),
+        (lambda m: -m, "a reflection"),
+        (lambda m: torch.full_like(m, torch.nan), "no rotation"),
+        (lambda m: torch.zeros_like(m), "no rotation"),
+        (lambda m: torch.stack((m, m.flip(-1))), "reflection"),
+    ],
+)
+def test_from_matrix_refuses_what_is_no_rotation(change, message):
+    turn = Q.to_matrix(Q.exp(torch.tensor([0.3, -1.0, 0.2], dtype=torch.float64)))
+    with pytest.raises(DataError, match=message):
+        Q.from_matrix(change(turn))
+    assert_same_rotation(Q.from_matrix(turn.round(decimals=3)), Q.from_matrix(turn), 2e-3)
+
+
 # Exponential and logarithm
 
 

@@ -16,7 +16,6 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.features import quaternion_columns
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, NotFittedError
 
 __all__ = ["Alignment", "retime", "seconds", "steps_at"]
@@ -74,11 +73,7 @@ def retime(
         turn = quaternions.normalize(demonstration.joints[:, list(block)])
         joints[:, list(block)] = _slerp(turn, lower, fraction)
     frames = {
-        name: Frame(
-            _lerp(frame.position, lower, fraction), _slerp(frame.orientation, lower, fraction)
-        )
-        if frame.batch_shape
-        else frame
+        name: frame.between(lower, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
     }
     steps = steps_at(demonstration, np.array(list(demonstration.events.values()))).tolist()

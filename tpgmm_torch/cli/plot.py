@@ -61,8 +61,11 @@ def plot(
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
     recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
     demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
-    [trajectory] = fitted.predict([Situation.of(demonstrations[0])])
-    shown: list[tuple[Any, Any, Any]] = [(trajectory, demonstrations[0].frames, {})]
+    situation = Situation.of(demonstrations[0])
+    [trajectory] = fitted.predict([situation])
+    shown: list[tuple[Any, Any, Any]] = [
+        (trajectory, situation.frames_at(trajectory.time.cpu()), {})
+    ]
     drawings: dict[str, Figure] = {}
     labels = [fill(format_operator(operator), 60) for operator in fitted.operators_]
     for index, operator in enumerate(fitted.operators_):

@@ -12,7 +12,7 @@ from tpgmm_torch.cli import options
 from tpgmm_torch.cli.plugins import TABLES, required
 
 if TYPE_CHECKING:
-    from tpgmm_torch.data.demonstrations import Demonstration, Situation
+    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -57,6 +57,7 @@ def reproduce(
     tpgmm_datasets.demonstrations_to_frame makes it, .csv with plain column names), or arrays
     (.npz). Prints a line per situation.
     """
+    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
@@ -69,7 +70,7 @@ def reproduce(
     kinematics = fitted.kinematics_
     if dataset is not None:
         wanted = [
-            situation_of(demonstration)
+            Situation.of(demonstration)
             for demonstration in options.recordings(
                 dataset, kinematics, frame, episodes, units, joints, rate
             ).demonstrations()
@@ -81,15 +82,6 @@ def reproduce(
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
     typer.echo(f"written to {out}")
-
-
-def situation_of(demonstration: Demonstration) -> Situation:
-    """The situation of a demonstration, on the model's clock unless its frames move."""
-    from tpgmm_torch.data.demonstrations import Situation
-
-    if any(frame.batch_shape for frame in demonstration.frames.values()):
-        return Situation.of(demonstration)
-    return Situation(demonstration.joints[0], demonstration.frames)
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
@@ -128,7 +120,7 @@ def _write(
 
     table = required(TABLES, "pandas")(
         [
-            Demonstration(t.time, t.joints, s.frames, t.joint_names)
+            Demonstration(t.time, t.joints, s.frames_at(t.time), t.joint_names)
             for t, s in zip(trajectories, situations, strict=True)
         ]
     )

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from tpgmm_torch.cli import options
-from tpgmm_torch.cli.reproduce import situation_of
 
 __all__ = ["app"]
 
@@ -84,6 +83,7 @@ def view(
     """
     import torch
 
+    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
@@ -107,7 +107,7 @@ def view(
     if situations is not None:
         wanted = read_situations(situations, fitted.kinematics_.joint_names)
     else:
-        wanted = [situation_of(demonstration) for demonstration in demonstrations]
+        wanted = [Situation.of(demonstration) for demonstration in demonstrations]
     if situation >= len(wanted):
         raise DataError(
             f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"

@@ -18,6 +18,7 @@ __all__ = ["rollout"]
 def rollout(
     regression: Regression,
     situations: Sequence[Situation],
+    skill_time: torch.Tensor,
     blend: float,
     keep_limits: bool,
     candidates: bool,
@@ -30,6 +31,8 @@ def rollout(
         What is asked for the joints at each step.
     situations : sequence of Situation
         With time grids.
+    skill_time : Tensor of shape (T,)
+        From when to when the skill lasts [s]: what comes before or after is held.
     blend : float
         How long the difference between the start posture and the first reference fades [s].
     keep_limits : bool
@@ -45,7 +48,7 @@ def rollout(
     trajectories: dict[int, Trajectory] = {}
     for members in _groups(situations):
         batch = [situations[index] for index in members]
-        together = _run_together(regression, batch, blend, keep_limits, candidates)
+        together = _run_together(regression, batch, skill_time, blend, keep_limits, candidates)
         trajectories.update(zip(members, together, strict=True))
     return [trajectories[index] for index in range(len(situations))]
 
@@ -63,6 +66,7 @@ def _groups(situations: Sequence[Situation]) -> list[list[int]]:
 def _run_together(
     regression: Regression,
     situations: Sequence[Situation],
+    skill_time: torch.Tensor,
     blend: float,
     keep_limits: bool,
     candidates: bool,
@@ -77,8 +81,9 @@ def _run_together(
     start = torch.stack([situation.joints for situation in situations])
     alone = len(situations) == 1  # one robot is sooner computed without a batch
     poses = {name: frame[..., 0] if alone else frame for name, frame in frames.items()}
-    moving = {name for name, frame in frames.items() if frame.position.ndim == 3}
-    grid = time.tolist()
+    moving = {name for name, frame in frames.items() if len(frame.batch_shape) == 2}
+    held = time.clamp(skill_time[0], skill_time[-1])  # nothing is extrapolated
+    grid = held.tolist()
     controller = Controller(
         regression,
         start[0] if alone else start,
@@ -94,6 +99,10 @@ def _run_together(
     for k, now in enumerate(grid):
         if k == 1:  # what the first step does not record, none does; to ask so takes a third
             inferring = inferring or not references[0].requires_grad
+        if k and now == grid[k - 1]:
+            estimates.append(estimates[-1])
+            references.append(references[-1])
+            continue
         with torch.inference_mode(inferring):
             here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
             dt = now - controller.time
@@ -110,7 +119,7 @@ def _run_together(
     own: list[Candidate] = []
     if candidates:
         states = torch.cat((start[None], joints[:-1]))
-        own = _candidates(regression, time, states, frames, whole)
+        own = _candidates(regression, held, states, frames, whole)
     return [
         Trajectory(
             time,
@@ -153,7 +162,7 @@ def _candidates(
 
 def _at(frames: Mapping[str, Frame], now: int | slice) -> dict[str, Frame]:
     """Frames of shape (B,) or, if they move, (T, B) at some instants."""
-    return {name: f[now] if f.position.ndim == 3 else f for name, f in frames.items()}
+    return {name: f[now] if len(f.batch_shape) == 2 else f for name, f in frames.items()}
 
 
 def _fields(candidate: Candidate) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

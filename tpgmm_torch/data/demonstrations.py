@@ -87,7 +87,8 @@ class Demonstration(_PlainFrames):
         Joint positions q_t [rad or m], in the order of the robot. Coordinates without
         kinematics (a gripper) are joints too.
     frames : mapping of str to Frame, optional
-        Object poses by name, constant or one per time step.
+        Object poses by name, constant or one per time step; or task parameters
+        :class:`Affine`.
     joint_names : sequence of str, optional
         Names of the columns of ``joints``; with them a robot may have another order.
     events : mapping of str to float, optional
@@ -178,12 +179,9 @@ class Demonstration(_PlainFrames):
         UnknownNameError
             If one of the names is not among the demonstration's.
         """
-        if self.joint_names is None or self.joint_names == tuple(joint_names):
+        columns = _columns(joint_names, self.joint_names, "the demonstration")
+        if columns is None:
             return self
-        for name in joint_names:
-            if name not in self.joint_names:
-                raise UnknownNameError("joint", name, "the demonstration", self.joint_names)
-        columns = [self.joint_names.index(name) for name in joint_names]
         return replace(self, joints=self.joints[:, columns], joint_names=tuple(joint_names))
 
     def __repr__(self) -> str:
@@ -199,12 +197,20 @@ class Situation(_PlainFrames):
 
     Parameters
     ----------
-    joints : array-like of shape (n_joints,)
-        The start posture q_0 [rad or m].
+    joints : array-like of shape (n_joints,), or mapping of str to float
+        The start posture q_0 [rad or m], in the order of the model, or by name. Names that
+        the model does not have are left out.
     frames : mapping of str to Frame, optional
-        Object poses by name, constant or one per time step of ``time``.
+        Object poses by name, constant or one per time step; or task parameters
+        :class:`Affine`.
     time : array-like of shape (T,), optional
         When references are wanted [s]; by default the time grid that the model learned.
+        Before the skill begins and after its end references are held.
+    joint_names : sequence of str, optional
+        Names of the values of ``joints``, in place of a mapping.
+    frames_time : array-like of shape (T_f,), optional
+        When the poses of frames that move were recorded [s]; by default at ``time``. In
+        between they are interpolated, before and after they stand still.
 
     Raises
     ------
@@ -213,29 +219,120 @@ class Situation(_PlainFrames):
 
     Examples
     --------
-    >>> situation = Situation(joints=[0.0, 1.0], frames={"cup": Frame([0.4, 0.0, 0.1])})
-    >>> list(situation.frames)
-    ['cup']
+    >>> situation = Situation({"elbow": 1.0, "shoulder": 0.0}, {"cup": Frame([0.4, 0.0, 0.1])})
+    >>> situation.reordered(["shoulder", "elbow"]).joints.tolist()
+    [0.0, 1.0]
     """
 
     joints: Tensor
     frames: Mapping[str, Frame] = field(default_factory=dict)
     time: Tensor | None = None
+    joint_names: tuple[str, ...] | None = None
+    frames_time: Tensor | None = None
 
     def __post_init__(self) -> None:
-        joints = as_tensor(self.joints, "the start posture")
+        joints: Any = self.joints
+        names = None if self.joint_names is None else tuple(self.joint_names)
+        if isinstance(joints, Mapping):
+            if names is not None:
+                raise DataError("joints are given by name: leave out joint_names")
+            names, joints = tuple(joints), _by_name(joints)
+        joints = as_tensor(joints, "the start posture")
         if joints.ndim != 1:
             raise ShapeError(
                 f"the start posture has shape (n_joints,), got {tuple(joints.shape)}"
             )
+        if names is not None and not len(set(names)) == len(names) == len(joints):
+            raise ShapeError(f"joint_names needs {len(joints)} different names, got {names}")
         time = None if self.time is None else _checked_time(self.time)
-        frames = _checked_frames(self.frames, None if time is None else len(time))
-        _set(self, time=time, joints=joints, frames=frames)
+        recorded = time if self.frames_time is None else _checked_time(self.frames_time)
+        frames = _checked_frames(self.frames, None if recorded is None else len(recorded))
+        if self.frames_time is None:
+            recorded = None
+        _set(self, joints=joints, frames=frames, time=time, joint_names=names)
+        _set(self, frames_time=recorded)
 
     @classmethod
-    def of(cls, demonstration: Demonstration) -> Situation:
-        """The situation that a demonstration was made in: its start, frames and time grid."""
-        return cls(demonstration.joints[0], demonstration.frames, demonstration.time)
+    def of(cls, demonstration: Demonstration, time: Any = None) -> Situation:
+        """The situation that a demonstration was made in: its start posture and its frames.
+
+        Parameters
+        ----------
+        demonstration : Demonstration
+            Frames that move do so when they did in the demonstration.
+        time : array-like of shape (T,), optional
+            When references are wanted [s]. By default the model's own time, not that of the
+            demonstration, which may be longer or shorter than the skill.
+        """
+        return cls(
+            demonstration.joints[0],
+            demonstration.frames,
+            time,
+            demonstration.joint_names,
+            demonstration.time,
+        )
+
+    def reordered(self, joint_names: Sequence[str]) -> Situation:
+        """The same situation with its joints in the order of ``joint_names``.
+
+        Other joints are left out. Without names, the order is trusted.
+
+        Raises
+        ------
+        UnknownNameError
+            If one of the names is not among the situation's.
+        """
+        columns = _columns(joint_names, self.joint_names, "the situation")
+        if columns is None:
+            return self
+        return replace(self, joints=self.joints[columns], joint_names=tuple(joint_names))
+
+    def frames_at(self, time: Tensor) -> dict[str, Frame]:
+        """The frames, those that move as they are at other times.
+
+        Parameters
+        ----------
+        time : Tensor of shape (T,)
+            In seconds.
+
+        Raises
+        ------
+        ShapeError
+            If it is not known when the poses of a frame that moves were recorded, and there
+            are not as many as times.
+        """
+        recorded = self.time if self.frames_time is None else self.frames_time
+        if recorded is None:
+            _checked_frames(self.frames, len(time))
+            return dict(self.frames)
+        recorded = recorded.to(time)
+        return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
+
+
+def _by_name(joints: Mapping[Any, Any]) -> Tensor:
+    """The values of joints that are given by name."""
+    if not joints:
+        raise ShapeError("the start posture has no joints")
+    values = [as_tensor(value, f"joint {name!r}") for name, value in joints.items()]
+    for name, value in zip(joints, values, strict=True):
+        if not isinstance(name, str) or value.ndim:
+            raise ShapeError(
+                f"the start posture maps names to numbers, got {name!r}: shape "
+                f"{tuple(value.shape)}"
+            )
+    return torch.stack([value.to(values[0]) for value in values])
+
+
+def _columns(
+    wanted: Sequence[str], present: tuple[str, ...] | None, where: str
+) -> list[int] | None:
+    """Where the wanted joints stand among those present; None if as they are, or unnamed."""
+    if present is None or present == tuple(wanted):
+        return None
+    for name in wanted:
+        if name not in present:
+            raise UnknownNameError("joint", name, where, present)
+    return [present.index(name) for name in wanted]
 
 
 def check_demonstrations(demonstrations: Any) -> list[Demonstration]:

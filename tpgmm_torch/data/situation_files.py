@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
@@ -19,8 +20,9 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
 
     Each is an object with ``joints``, a list of numbers or an object from joint names to
     numbers [rad or m]; ``frames``, an object from names to ``{"position": [x, y, z],
-    "orientation": [w, x, y, z]}``, the orientation optional, both also one per time step; and
-    optionally ``time``, a list of seconds.
+    "orientation": [w, x, y, z]}``, the orientation optional, or to task parameters
+    ``{"A": rows, "b": [...]}``, all also one per time step; and optionally ``time``, a list of
+    seconds.
 
     Parameters
     ----------
@@ -68,9 +70,14 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
     frames = item.get("frames", {})
     if not isinstance(frames, dict):
         raise DataError(f"'frames' maps names to poses, got {frames!r}")
-    poses = {}
+    poses: dict[str, Frame] = {}
     for name, pose in frames.items():
-        _check_keys(pose, f"frame {name!r}", required={"position"}, optional={"orientation"})
+        what = f"frame {name!r}"
+        if isinstance(pose, dict) and "A" in pose:
+            _check_keys(pose, what, required={"A", "b"}, optional=set())
+            poses[name] = Affine(pose["A"], pose["b"])
+            continue
+        _check_keys(pose, what, required={"position"}, optional={"orientation"})
         poses[name] = Frame(pose["position"], pose.get("orientation"))
     return Situation(_joints(item["joints"], joint_names), poses, item.get("time"))
 

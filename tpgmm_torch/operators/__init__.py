@@ -5,6 +5,7 @@ from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import Stack
+from tpgmm_torch.operators.task_parameters import TaskParameters
 
 __all__ = [
     "AbsoluteOrientation",
@@ -16,4 +17,5 @@ __all__ = [
     "RelativeOrientation",
     "RelativePosition",
     "Stack",
+    "TaskParameters",
 ]

@@ -137,7 +137,8 @@ class Operator(ABC):
     :meth:`coordinates`; make it a frozen dataclass, and ``clone``, ``repr``, ``==``, ``pickle``
     and grid search work. An operator given by its ``A`` and ``b`` (Definition 1 of the
     paper) returns ``Linearization(None, A, b - state.joints)``; where ``A`` is singular it
-    needs ``fusion="covariance"``.
+    needs ``fusion="covariance"``. Where A and b come with the situation, as an
+    :class:`Affine`, :class:`TaskParameters` does it.
     """
 
     @abstractmethod

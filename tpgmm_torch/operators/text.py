@@ -4,6 +4,8 @@
 ``position:l_hand`` an absolute one, ``pose:l_hand@bottle`` short for position and orientation,
 ``position:r_hand@held:bottle`` refers to the bottle as it is carried, ``position:bottle@tray``
 is where a carried bottle is on a tray, and ``canonical`` the joints themselves.
+``parameters@shelf`` takes task parameters A, b of the situation, on the joints,
+``parameters:l_hand@shelf`` on a link's position.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.operators.stack import Stack
+from tpgmm_torch.operators.task_parameters import TaskParameters
 
 __all__ = ["default_operators", "format_operator", "parse_operator"]
 
@@ -29,10 +32,15 @@ TERM = re.compile(
     r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)"
     r"(@(?P<held>held:)?(?P<frame>[^\s:@+]+))?"
 )
+#: Task parameters: of the joints or of a link, and how many columns A has.
+PARAMETERS = re.compile(
+    r"parameters(:(?P<link>[^\s:@+]+))?@(?P<frame>[^\s:@+\[\]]+)(\[(?P<size>[1-9]\d*)\])?"
+)
 GRAMMAR = (
     "'canonical', or 'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each "
     "with '@FRAME' behind it if seen from a frame or another link, '@held:FRAME' if from an "
-    "object as the robot carries it (LINK may be an object too); '+' stacks them, as in "
+    "object as the robot carries it (LINK may be an object too), or 'parameters@NAME' or "
+    "'parameters:LINK@NAME' (with '[D]' behind it if A has D columns); '+' stacks them, as in "
     "'position:l_hand@bottle + orientation:l_hand@bottle'"
 )
 
@@ -46,7 +54,8 @@ def parse_operator(text: str) -> Operator:
         One term, or several joined by ``+``. A term is ``canonical``, or ``position``,
         ``orientation`` or ``pose`` (both), a colon and a link or an object that is carried;
         ``@`` and the name of a frame or of another link make it relative, ``@held:`` to an
-        object as it is carried.
+        object as it is carried. ``parameters@NAME``, ``parameters:LINK@NAME`` are
+        :class:`TaskParameters`.
 
     Raises
     ------
@@ -67,6 +76,9 @@ def parse_operator(text: str) -> Operator:
 def _term(term: str, text: str) -> list[Operator]:
     if term == "canonical":
         return [Canonical()]
+    if general := PARAMETERS.fullmatch(term):
+        size = None if general["size"] is None else int(general["size"])
+        return [TaskParameters(general["frame"], general["link"], size)]
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
@@ -104,6 +116,10 @@ def format_operator(operator: Operator) -> str:
         return " + ".join(map(format_operator, operator.operators))
     if type(operator) is Canonical:
         return "canonical"
+    if type(operator) is TaskParameters:
+        link = "" if operator.link is None else f":{operator.link}"
+        size = "" if operator.size is None else f"[{operator.size}]"
+        return f"parameters{link}@{operator.frame}{size}"
     for kind, classes in KINDS.items():
         if type(operator) in classes:
             places = [f"@{name}" for name in operator.references()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -124,3 +125,12 @@ class Conditionals(_OfComponents):
         """Conditional means at times of shape (...): a tensor of shape (..., K, D)."""
         elapsed = time.unsqueeze(-1) - self.time_mean
         return torch.addcmul(self.mean, self.gain, elapsed.unsqueeze(-1))
+
+    def log_density(self, local: Tensor, time: Tensor) -> Tensor:
+        """``log N(x_t | t)`` of coordinates (T, D) at times (T,), by component, (T, K)."""
+        residual = (local.unsqueeze(-2) - self.at(time)).movedim(-2, 0)
+        white = gaussians.whiten(self.covariance, residual.mT, "the covariance of a component")
+        logdet = gaussians.cholesky(self.covariance, "the covariance of a component")
+        logdet = 2 * logdet.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        constant = local.shape[-1] * math.log(2 * math.pi) + logdet
+        return -0.5 * (white.square().sum(-2) + constant.unsqueeze(-1)).mT

@@ -8,6 +8,7 @@ mix the components.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,6 +25,7 @@ from tpgmm_torch.regression.active_components import ActiveComponents
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.joint_limits import within
 from tpgmm_torch.regression.kalman_update import KalmanUpdate
+from tpgmm_torch.regression.prior import PRIOR_STD
 from tpgmm_torch.regression.projections import Projection
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -107,9 +109,9 @@ class Regression:
         Whose time marginal the mixing weights h_i come from: the mixture's or the product's.
     epsilon : float
         Added to the diagonal of projected covariances by the covariance form [rad^2].
-    prior_std : float
-        Standard deviation of the prior N(q_{t-1}, .) that closes the information form where
-        no operator determines every joint [rad].
+    prior_std : float or Tensor of shape (n_joints,)
+        Standard deviations of the prior N(q_{t-1}, .) that closes the information form where
+        no operator determines every joint, in the joints' units.
     negligible : float
         Components with less than that share of the largest weight are left out: the mean moves
         by at most the weight left out times the distance of the components' means. 0 keeps
@@ -123,7 +125,7 @@ class Regression:
     fusion: str = "information"
     activation: str = "time"
     epsilon: float = 1e-4
-    prior_std: float = 10.0
+    prior_std: float | Tensor = PRIOR_STD
     negligible: float = 1e-9
 
     def step(
@@ -214,6 +216,24 @@ class Regression:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
         weights = torch.softmax(self._marginals.log_activation(time.unsqueeze(-1)), -1)
         return (weights.unsqueeze(-2) @ self.conditionals[operator].at(time)).squeeze(-2)
+
+    def log_density(self, time: Tensor, local: Sequence[Tensor]) -> Tensor:
+        """``log sum_i pi_i N(t | i) prod_j N(X_t^(j) | t, i)``: time counts once.
+
+        Parameters
+        ----------
+        time : Tensor of shape (T,)
+        local : sequence of Tensor of shape (T, D_j)
+            Local coordinates of each operator.
+
+        Returns
+        -------
+        Tensor of shape (T,)
+        """
+        total = self._marginals.log_activation(time.unsqueeze(-1)) - 0.5 * math.log(2 * math.pi)
+        for one, coordinates in zip(self.conditionals, local, strict=True):
+            total = total + one.log_density(coordinates, time)
+        return torch.logsumexp(total, -1)
 
     def candidates(
         self,

@@ -257,6 +257,8 @@ class Kinematics(abc.ABC):
         those of the robot.
     quaternion_starts : tuple of int, default=()
         Where unit quaternions start in the joint vector; robots have none.
+    lengths : tuple of int, default=()
+        Which coordinates are lengths [m]; others are angles, or numbers of another kind.
 
     Examples
     --------
@@ -281,6 +283,7 @@ class Kinematics(abc.ABC):
     upper: Tensor
     velocity: Tensor
     quaternion_starts: tuple[int, ...] = ()
+    lengths: tuple[int, ...] = ()
 
     @property
     def n_joints(self) -> int:

@@ -116,6 +116,9 @@ class Robot(Kinematics):
         self.joint_names = tuple(config["joints"])
         self.links = tuple(config["links"])
         column = {name: i for i, name in enumerate(self.joint_names) if name in model.joint}
+        self.lengths = tuple(
+            i for name, i in column.items() if model.joint[name].type == "prismatic"
+        )
         tree = reduce(model, *_wanted(model, config), column, config["locked"])
         options: dict[str, Any] = {"dtype": dtype_named(config["dtype"]), "device": device}
         # a robot made while inference mode is on must serve where gradients are wanted, and

@@ -85,6 +85,7 @@ class Poses(Kinematics):
         self.joint_names = tuple(f"{link}.{part}" for link in self.links for part in parts)
         width, n = len(parts), self.n_joints
         self.quaternion_starts = tuple(range(3, n, width)) if orientation else ()
+        self.lengths = tuple(i for i in range(n) if i % width < 3)
         # tensors made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
             unbounded = torch.full((n,), math.inf, dtype=dtype, device=device)

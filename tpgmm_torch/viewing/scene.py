@@ -103,7 +103,8 @@ class MotionScene:
         covariance = trajectory.covariance.cpu().to(state.joints)[steps]
         self.time = as_array(trajectory.time)[steps]
         self._link_poses = _poses(state.positions, state.orientations)  # (F, L, 7)
-        self._frame_poses = {name: _poses_at(f, steps) for name, f in situation.frames.items()}
+        frames = situation.frames_at(trajectory.time.cpu())
+        self._frame_poses = {name: _poses_at(f, steps) for name, f in frames.items()}
         if not self._links:
             self._set_up()
         few = np.linspace(0, len(steps) - 1, min(ELLIPSOIDS, len(steps))).astype(int)

@@ -12,7 +12,6 @@ from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import quaternion_groups
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
 
 __all__ = ["resample", "trim"]
 
@@ -66,9 +65,7 @@ def resample(demonstration: Demonstration, rate: float) -> Demonstration:
         unit = quaternions.normalize(quaternions.continuous(demonstration.joints[:, group]))
         joints[:, group] = quaternions.continuous(arc(unit))
     frames = {
-        name: Frame(linear(frame.position), arc(frame.orientation))
-        if frame.batch_shape
-        else frame
+        name: frame.between(right - 1, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
     }
     first, last = float(demonstration.time[0]), float(target[-1])

@@ -161,9 +161,12 @@ class Learner:
             model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
             config.n_steps = len(mixture.time)
+            # on the scale of the loss, which counts time once per operator, as EM does
+            expected = model.regression().expected
+            rows = torch.cat(local_data(aligned, model.operators_, model.kinematics_, expected))
             message += (
                 f"; {config.n_components} components fitted to them by {model.n_iter_} steps "
-                f"of EM: log-likelihood {model.score(aligned):.3f} per step"
+                f"of EM: log-likelihood {model.mixture_.score(rows.numpy()):.3f} per step"
             )
         log.info(message)
         self.clock = self._aligned_clock(aligner, numbers)

@@ -13,6 +13,7 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from tpgmm_torch import Frame, Kinematics, Operator, RobotState, quaternions
 from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.regression import Regression
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
@@ -56,6 +57,8 @@ def regression(
         first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
         local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
+    weights = mixture.logits.softmax(0)
+    covariances = [triangle @ triangle.mT for triangle in mixture.triangles()]
     return Regression(
         kinematics,
         operators,
@@ -64,7 +67,9 @@ def regression(
         config.fusion,
         config.activation,
         config.epsilon,
-        config.prior_std,
+        prior_widths(
+            config.prior_std, kinematics, operators, weights, list(mixture.means), covariances
+        ),
         config.negligible,
     )
 
@@ -96,7 +101,8 @@ def likelihood_loss(
 ) -> Tensor:
     """Negative mean log-likelihood per frame, over all local data sets.
 
-    It is what EM maximises with ``responsibilities="point"``. The regularisation ``Lambda``
+    It is what EM maximises with ``responsibilities="point"``, and counts time once for each
+    operator, which :meth:`TaskParameterizedGMM.score` does not. The regularisation ``Lambda``
     that EM adds to the covariances is kept by the penalty ``tr(Sigma_k^-1 Lambda) / 2`` for
     each component k, in proportion to what it answers for: EM's solution is stationary, and
     covariances do not shrink to nothing.

@@ -41,7 +41,7 @@ def situations(problem: Problem, *grids: Tensor, moves: bool = False) -> list[Si
 
 def run(regression: Regression, given: list[Situation], **options) -> list[Trajectory]:
     defaults = {"blend": 0.5, "keep_limits": False, "candidates": True}
-    return rollout(regression, given, **{**defaults, **options})
+    return rollout(regression, given, grid(), **{**defaults, **options})
 
 
 def assert_same(a: Trajectory, b: Trajectory) -> None:
@@ -109,6 +109,24 @@ def test_an_object_that_moves_is_followed_as_it_moves():
     assert_same(constant, repeated)
     assert_close(moved.joints[0], constant.joints[0])
     assert (moved.joints[-1] - constant.joints[-1]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("keep_limits", [False, True], ids=["free", "limited"])
+def test_before_the_beginning_and_after_the_end_references_are_held(keep_limits):
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    regression, step = problem.regression(), float(grid()[1])
+    longer = step * torch.arange(-3, 20, dtype=torch.float64)
+    for blend in (0.0, 0.5):
+        options = {"blend": blend, "keep_limits": keep_limits}
+        inside = run(regression, situations(problem, grid(), grid()), **options)
+        for one, found in zip(
+            inside, run(regression, situations(problem, longer, longer), **options), strict=True
+        ):
+            assert torch.equal(found.time, longer)
+            assert_close(found.joints[3:15], one.joints, 1e-10)
+            assert_close(found.joints[:3], one.joints[:1].expand(3, -1), 1e-10)
+            assert_close(found.joints[15:], one.joints[-1:].expand(8, -1), 1e-10)
+            assert_close(found.covariance[15:], one.covariance[-1:].expand(8, -1, -1), 1e-10)
 
 
 def test_situations_without_objects_need_none():

@@ -167,8 +167,37 @@ def test_the_situation_of_a_demonstration_is_its_start():
     demo = demonstration()
     situation = Situation.of(demo)
     assert situation.joints.tolist() == [0.0, 1.0]
-    assert torch.equal(situation.time, demo.time)
+    assert situation.joint_names == ("shoulder", "elbow")
+    assert situation.time is None  # the model's own
     assert dict(situation.frames) == dict(demo.frames)
+    assert Situation.of(demo, [0.0, 9.0]).time.tolist() == [0.0, 9.0]
+
+
+def test_frames_that_move_keep_the_clock_they_were_recorded_on():
+    demo = demonstration()
+    frames = Situation.of(demo).frames_at(torch.tensor([-1.0, 0.25, 2.0, 5.0]).double())
+    tray = demo.frames["tray"]
+    assert frames["bottle"] is demo.frames["bottle"]
+    assert torch.equal(frames["tray"].position[[0, 2, 3]], tray.position[[0, 4, 4]])
+    torch.testing.assert_close(frames["tray"].position[1], tray.position[:2].mean(0))
+    angles = 2 * torch.atan2(frames["tray"].orientation[:, 3], frames["tray"].orientation[:, 0])
+    torch.testing.assert_close(angles, torch.tensor([0.0, 0.125, 1.0, 1.0]).double())
+    short = Situation([0.0], {"tray": moving_frame(1)}, frames_time=[3.0])
+    assert short.frames_at(torch.arange(3.0).double())["tray"].batch_shape == (3,)
+    with pytest.raises(ShapeError, match=r"'tray' has leading shape \(5,\)"):
+        Situation([0.0], {"tray": tray}).frames_at(torch.arange(3.0))
+
+
+def test_joints_of_a_situation_may_be_named():
+    named = Situation({"elbow": 1, "shoulder": torch.tensor(0.5), "lift": 0.1})
+    assert named.joint_names == ("elbow", "shoulder", "lift")
+    assert named.reordered(["shoulder", "elbow"]).joints.tolist() == [0.5, 1.0]
+    twin = pickle.loads(pickle.dumps(named))
+    assert twin.joint_names == named.joint_names
+    with pytest.raises(UnknownNameError, match="joint 'wrist' is not in the situation; it has"):
+        named.reordered(["wrist"])
+    unnamed = Situation([0.0, 1.0])
+    assert unnamed.reordered(["a", "b"]) is unnamed
 
 
 def test_without_time_frames_per_step_have_one_length():
@@ -187,6 +216,19 @@ def test_without_time_frames_per_step_have_one_length():
             r"posture has shape \(n_joints,\), got \(1, 1\)",
         ),
         ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
+        ({"joints": {"a": math.nan}}, DataError, "joint 'a' holds 1 value"),
+        ({"joints": {"a": [1.0]}}, ShapeError, r"got 'a': shape \(1,\)"),
+        ({"joints": {1: 1.0}}, ShapeError, "maps names to numbers, got 1"),
+        ({"joints": {"a": "b"}}, DataError, "joint 'a' must be an array of numbers"),
+        ({"joints": {}}, ShapeError, "no joints"),
+        ({"joints": {"a": 1.0}, "joint_names": ("a",)}, DataError, "leave out joint_names"),
+        ({"joints": [1.0], "joint_names": ("a", "b")}, ShapeError, "1 different names"),
+        ({"frames_time": [1.0, 1.0]}, DataError, "time must increase strictly"),
+        (
+            {"frames_time": [0.0, 1.0], "frames": {"cup": moving_frame(3)}},
+            ShapeError,
+            r"frame 'cup' has leading shape \(3,\); .* \(2,\)",
+        ),
         ({"frames": {"cup": [0.0] * 3}}, DataError, "maps names to Frame objects, got 'cup'"),
         ({"time": [1.0, 0.0]}, DataError, "time must increase strictly"),
         (

@@ -13,6 +13,7 @@ from tpgmm_torch import (
     RelativeOrientation,
     RelativePosition,
     Stack,
+    TaskParameters,
 )
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
@@ -27,6 +28,10 @@ OPERATORS = [
     RelativePosition("bottle", "tray"),
     RelativeOrientation("r_hand", "bottle", held=True),
     Stack(RelativePosition("lid", "bottle", held=True), RelativePosition("l_hand", "lid")),
+    TaskParameters("shelf"),
+    TaskParameters("shelf", "l_hand"),
+    TaskParameters("shelf", size=3),
+    Stack(TaskParameters("shelf", "l_hand", 2), Canonical()),
 ]
 
 
@@ -55,6 +60,8 @@ def test_a_pose_is_position_and_orientation():
         "position:a@",
         "position:a@b@c",
         "pose:a@held:",
+        "parameters",
+        "parameters@a[0]",
     ],
 )
 def test_what_is_no_operator_is_refused_and_explained(text):

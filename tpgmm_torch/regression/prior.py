@@ -1,0 +1,101 @@
+"""How wide the prior is that closes the fusion where no operator determines every joint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["PRIOR_STD", "prior_widths"]
+
+#: The default, [rad] or times the learned positions' size.
+PRIOR_STD = 10.0
+
+
+def prior_widths(
+    prior_std: Any,
+    kinematics: Kinematics,
+    operators: Sequence[Operator],
+    weights: Tensor,
+    means: Sequence[Tensor],
+    covariances: Sequence[Tensor],
+) -> Tensor:
+    """Standard deviations of the prior around q_{t-1}, in the unit of each joint.
+
+    Parameters
+    ----------
+    prior_std : float, mapping of str to float, or array-like of shape (n_joints,)
+        A number counts in radians; for joints that are lengths in units of the learned
+        positions' root mean square, so that metres and millimetres make no difference. A
+        mapping has joints by name, in their own unit, and leaves the others at the default; an
+        array has them all.
+    kinematics : Kinematics
+    operators : sequence of Operator
+    weights, means, covariances
+        The mixture's parameters, as in :class:`TaskParameterizedGMM`.
+
+    Returns
+    -------
+    Tensor of shape (n_joints,)
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If a value is no positive number, there are more or fewer than joints, or a name is none
+        of theirs.
+    """
+    names, like = kinematics.joint_names, weights.detach()
+    if not isinstance(prior_std, Real | Mapping):
+        given = as_tensor(prior_std, "prior_std").to(like)
+        if given.shape != (len(names),):
+            raise ShapeError(
+                f"prior_std has one value for each of the joints {list(names)}, got shape "
+                f"{tuple(given.shape)}"
+            )
+        return _positive(given)
+    number = prior_std if isinstance(prior_std, Real) else PRIOR_STD
+    widths = like.new_full((len(names),), float(number))
+    lengths = list(kinematics.lengths)
+    if lengths:  # not detached: while a policy learns, it depends on what is learned
+        widths[lengths] = widths[lengths] * _size(
+            kinematics, operators, weights, means, covariances
+        )
+    if isinstance(prior_std, Mapping):
+        for name, value in prior_std.items():
+            if name not in names:
+                raise UnknownNameError("joint", name, "the model", names)
+            widths[names.index(name)] = as_tensor(value, f"prior_std of {name!r}").to(like)
+    return _positive(widths)
+
+
+def _positive(widths: Tensor) -> Tensor:
+    if not bool((widths > 0).all()):
+        raise DataError(f"prior_std must be positive, got {widths.tolist()}")
+    return widths
+
+
+def _size(
+    kinematics: Kinematics,
+    operators: Sequence[Operator],
+    weights: Tensor,
+    means: Sequence[Tensor],
+    covariances: Sequence[Tensor],
+) -> Tensor:
+    """Root mean square of the learned positions, in their unit; 1 where there are none."""
+    squares = []
+    for operator, mean, covariance in zip(operators, means, covariances, strict=True):
+        turns = {s + i for s in operator.quaternion_starts(kinematics) for i in range(4)}
+        if operator.links():
+            columns = [1 + i for i in range(mean.shape[-1] - 1) if i not in turns]
+            second = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
+            squares.append(weights @ second[:, columns])
+    together = torch.cat(squares) if squares else weights[:0]
+    return together.mean().sqrt() if bool(together.any()) else weights.new_ones(())
