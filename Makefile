@@ -17,7 +17,7 @@ PACKAGES_test := .[test] ./policies[test]
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare bench test mutants lint types docs check dist constraints clean
+.PHONY: help demo compare bench test fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -35,6 +35,10 @@ bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_A
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
+
+fuzz: $(VENV)/.installed-test ## Damage thousands of files and kill hundreds of saves: 15 minutes
+	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
+	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py $(PYTEST_ARGS)
 
 mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)

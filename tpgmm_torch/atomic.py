@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import shutil
+import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
-__all__ = ["replacing"]
+__all__ = ["open_whole", "read_whole", "recover", "replacing"]
 
 # How Linux and macOS let two names change places: <fcntl.h>, <linux/fs.h>, <sys/stdio.h>.
 AT_FDCWD, RENAME_EXCHANGE, RENAME_SWAP = -100, 2, 2
+
+#: How a file begins that stands for one which Git LFS has not fetched.
+POINTER = b"version https://git-lfs.github.com/spec/"
+
+#: How long a writer waits for another one of the same name [s].
+PATIENCE = 600.0
 
 
 @contextmanager
@@ -24,7 +34,9 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     It is written beside ``path``, brought to the disk, and moved there. If the block raises,
     or the process dies wherever it is, ``path`` is what it was, or all that is new. (Where
     the system or the file system cannot let two folders change places, one that dies in
-    between leaves the old one under the name ``.NAME.*.previous``.)
+    between leaves the old one under another name, from which :func:`recover` brings it back.)
+    Writers of one path wait for each other, so what the block reads of the old is still the
+    old at its end; what others left who died is removed.
 
     Parameters
     ----------
@@ -38,6 +50,11 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     Path
         Where to write: the block makes a file or a folder of this name.
 
+    Raises
+    ------
+    TimeoutError
+        If another process writes the same path for more than ten minutes.
+
     Examples
     --------
     >>> with tempfile.TemporaryDirectory() as folder:
@@ -48,21 +65,130 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     'new'
     """
     path = Path(path)
+    made = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(
-        prefix=f".{path.name}.", dir=path.parent, ignore_cleanup_errors=True
-    ) as folder:
-        new = Path(folder) / path.name
-        yield new
-        if keep and path.is_dir():
-            _take_over(path, new)
-        for item in [*new.rglob("*"), new]:
-            _synchronize(item)
-        if new.is_dir() and path.exists():
-            _exchange(new, path)
+    with _alone(path):
+        _recover(path)
+        for left in _left(path, "new"):
+            shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(
+            prefix=f".{path.name}.", suffix=".new", dir=path.parent, ignore_cleanup_errors=True
+        ) as folder:
+            new = Path(folder) / path.name
+            yield new
+            if keep and path.is_dir():
+                _take_over(path, new)
+            for item in [*new.rglob("*"), new]:
+                _synchronize(item)
+            if new.is_dir() and path.exists():
+                _exchange(new, path)
+            else:
+                new.replace(path)
+            for changed in (path.parent, *(folder.parent for folder in made)):
+                _synchronize(changed)
+
+
+def recover(path: str | Path) -> None:
+    """Put back what stood under ``path`` if its writer died between two renames.
+
+    Parameters
+    ----------
+    path : str or Path
+        What is to be read; where it is there, nothing is done.
+    """
+    path = Path(path)
+    if not path.exists() and _left(path, "previous"):
+        with _alone(path):
+            _recover(path)
+
+
+@contextmanager
+def open_whole(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file that is there as a whole, for reading.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file, or a link to one.
+
+    Raises
+    ------
+    OSError
+        If it is missing; if it cannot be read to its end, like a pipe that nobody writes to;
+        or if Git LFS has not fetched it.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    with os.fdopen(descriptor, "rb", closefd=True) as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(f"{path} is not a regular file")
+        if file.read(len(POINTER)) == POINTER:
+            raise OSError(
+                f"{path} is a Git LFS pointer in place of the file: run `git lfs pull` there"
+            )
+        file.seek(0)
+        yield file
+
+
+def read_whole(path: str | Path) -> bytes:
+    """The bytes of a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        As for :func:`open_whole`, whose errors are raised.
+    """
+    with open_whole(path) as file:
+        return file.read()
+
+
+def _left(path: Path, kind: str) -> list[Path]:
+    """What processes that died left beside ``path``: "new" or "previous"."""
+    name = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}\.{kind}")
+    with suppress(OSError):
+        return sorted(item for item in path.parent.iterdir() if name.fullmatch(item.name))
+    return []
+
+
+def _recover(path: Path) -> None:
+    for previous in _left(path, "previous"):
+        if path.exists():  # the new one came after it
+            shutil.rmtree(previous, ignore_errors=True)
         else:
-            new.replace(path)
-        _synchronize(path.parent)
+            previous.rename(path)
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Keep other writers of ``path`` waiting, by a lock that goes with the process."""
+    try:
+        import fcntl
+    except ImportError:  # on Windows, where nothing can be renamed that is in use
+        yield
+        return
+    lock, until = path.with_name(f".{path.name}.lock"), time.monotonic() + PATIENCE
+    while True:
+        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # the one before may have removed the file that was opened
+            if lock.exists() and os.path.samestat(os.fstat(descriptor), lock.stat()):
+                break
+        except BlockingIOError:
+            if time.monotonic() > until:
+                raise TimeoutError(
+                    f"another process writes {path} (it holds {lock}): wait until it is done"
+                ) from None
+            time.sleep(0.02)
+        except FileNotFoundError:
+            pass
+        except OSError:  # a file system without locks
+            break
+        os.close(descriptor)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(descriptor)
 
 
 def _take_over(old: Path, new: Path) -> None:
@@ -93,7 +219,7 @@ def _exchange(new: Path, path: Path) -> None:
     """Put ``new`` in the place of ``path``; what was there is removed, or is ``new`` then."""
     if _swap(new, path):
         return
-    previous = path.with_name(f"{new.parent.name}.previous")
+    previous = new.parent.with_suffix(".previous")
     path.rename(previous)
     try:
         new.rename(path)

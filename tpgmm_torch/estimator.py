@@ -765,7 +765,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Raises
         ------
         ModelFileError
-            If it is truncated, tampered with, of another version, or does not fit together.
+            If it is truncated, tampered with, of another version, or does not fit together,
+            or its device is not there.
         """
         config, tensors = MODEL.read(path)
         try:
@@ -780,7 +781,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 )
             settings = config["parameters"]
             settings["device"] = device or settings["device"]
-            here = {name: tensor.to(settings["device"]) for name, tensor in tensors.items()}
+            here = _moved(tensors, settings["device"], path)
             means, covariances = (
                 [here[f"{kind}.{j}"] for j in range(len(operators))]
                 for kind in ("means", "covariances")
@@ -798,7 +799,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
             known = config["lower_bound"] is not None
             model.lower_bound_ = config["lower_bound"] if known else math.nan
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, ModelFileError):
                 raise
             raise ModelFileError(f"{path} does not fit together: {error}") from error
@@ -873,3 +874,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         tags = super().__sklearn_tags__()
         tags.input_tags.two_d_array = False  # X is a list of demonstrations
         return tags
+
+
+def _moved(tensors: Mapping[str, Tensor], device: str, path: str | Path) -> dict[str, Tensor]:
+    """The tensors of a file on a device, which may be one of another machine."""
+    try:
+        return {name: tensor.to(device) for name, tensor in tensors.items()}
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).partition("\n")[0]
+        raise ModelFileError(
+            f"{path} is a model on the device {device!r}, which is not there ({reason}): "
+            'load it onto another, TaskParameterizedGMM.load(path, device="cpu")'
+        ) from error

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from tpgmm_torch.atomic import replacing
+from tpgmm_torch.atomic import read_whole, recover, replacing
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["Folder"]
@@ -79,10 +79,6 @@ class Folder:
             left alone. If the configuration is not of JSON's values.
         """
         path = Path(path)
-        if path.exists() and not self._replaceable(path):
-            raise ModelFileError(
-                f"{path} exists and is not a saved {self.kind} alone; choose another directory"
-            )
         blob = safetensors.torch.save(
             {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
         )
@@ -93,11 +89,16 @@ class Folder:
         full |= {"tensors": shapes, "tensors_sha256": _digest(blob)}
         try:
             full["digest"] = _digest(_canonical(full))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             raise ModelFileError(
                 f"the {self.kind} cannot be described in JSON: {error}"
             ) from error
         with replacing(path) as new:
+            if path.exists() and not self._replaceable(path):
+                raise ModelFileError(
+                    f"{path} exists and is not a saved {self.kind} alone; choose another "
+                    "directory"
+                )
             new.mkdir()
             (new / CONFIG).write_text(json.dumps(full, indent=1, allow_nan=False))
             (new / self.tensors).write_bytes(blob)
@@ -108,10 +109,10 @@ class Folder:
         if not path.is_dir() or {item.name for item in path.iterdir()} - files:
             return False
         try:
-            return json.loads((path / CONFIG).read_text())["format"] == self._format
+            return bool(json.loads(read_whole(path / CONFIG))["format"] == self._format)
         except FileNotFoundError:
             return not any(path.iterdir())
-        except (ValueError, TypeError, KeyError):
+        except (OSError, ValueError, TypeError, KeyError, RecursionError):
             return False
 
     def read(self, path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -133,15 +134,9 @@ class Folder:
             If a file is missing, truncated, changed, or of another version.
         """
         path = Path(path)
-        try:
-            config = json.loads((path / CONFIG).read_text())
-            blob = (path / self.tensors).read_bytes()
-        except FileNotFoundError as error:
-            raise ModelFileError(
-                f"{path} is not a saved {self.kind}: {error.filename} is missing"
-            ) from None
-        except (ValueError, OSError) as error:
-            raise ModelFileError(f"{path / CONFIG} cannot be read: {error}") from error
+        recover(path)
+        config = self._read(path / CONFIG, json.loads)
+        blob = self._read(path / self.tensors, bytes)
         if not isinstance(config, dict) or config.get("format") != self._format:
             raise ModelFileError(f"{path / CONFIG} does not describe a {self._format}")
         if config.get("version") != self.version:
@@ -152,7 +147,7 @@ class Folder:
             )
         try:
             digest = _digest(_canonical(config))
-        except ValueError:  # it holds NaN or infinity, which no model has
+        except (ValueError, RecursionError):  # NaN or infinity, which no model has, or too deep
             digest = ""
         if config.get("digest") != digest:
             raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
@@ -162,7 +157,7 @@ class Folder:
             )
         try:
             tensors = safetensors.torch.load(blob)
-        except SafetensorError as error:
+        except (SafetensorError, ValueError, KeyError) as error:
             raise ModelFileError(f"{path / self.tensors} cannot be read: {error}") from error
         described = {
             k: {"shape": list(v.shape), "dtype": str(v.dtype)} for k, v in tensors.items()
@@ -172,3 +167,13 @@ class Folder:
                 f"{path / self.tensors} holds {described}, expected {config.get('tensors')}"
             )
         return config, tensors
+
+    def _read[T](self, file: Path, parse: Callable[[bytes], T]) -> T:
+        try:
+            return parse(read_whole(file))
+        except (FileNotFoundError, NotADirectoryError):
+            raise ModelFileError(
+                f"{file.parent} is not a saved {self.kind}: {file} is missing"
+            ) from None
+        except (ValueError, OSError, RecursionError, MemoryError) as error:
+            raise ModelFileError(f"{file} cannot be read: {error}") from error

@@ -1,10 +1,14 @@
 """What is wrong with a data set on disk, and where."""
 
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CHECKS", "DatasetError", "DatasetWarning"]
+__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "summed_up"]
 
 #: The checks that ``relax`` may name, with what each of them refuses.
 CHECKS = {
@@ -56,3 +60,35 @@ class DatasetError(DataError):
 
 class DatasetWarning(UserWarning):
     """A relaxed check dropped something; the message says what and why."""
+
+
+def summed_up(problems: Iterable[DatasetError]) -> list[str]:
+    """One line for all problems that differ in nothing but numbers and episodes.
+
+    Parameters
+    ----------
+    problems : iterable of DatasetError
+
+    Returns
+    -------
+    list of str
+        In order of the first of each kind; it is given whole, of the others only the number
+        and the episodes.
+    """
+    kinds: dict[str, list[DatasetError]] = {}
+    for problem in problems:
+        kinds.setdefault(re.sub(r"[-+]?[\d.]+(e[-+]?\d+)?", "#", str(problem)), []).append(
+            problem
+        )
+    lines = []
+    for first, *others in kinds.values():
+        line = str(first)
+        if others:
+            line += f" (and {len(others)} more like it"
+            episodes = sorted({item.episode for item in others if item.episode is not None})
+            if episodes:
+                numbers = ", ".join(map(str, episodes[:10])) + ", ..." * (len(episodes) > 10)
+                line += f": episode{'s' * (len(episodes) > 1)} {numbers}"
+            line += ")"
+        lines.append(line)
+    return lines

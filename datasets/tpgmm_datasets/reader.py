@@ -11,8 +11,8 @@ from typing import Any
 
 from tpgmm_datasets.conversion.assembly import Assembly, EventSource, FrameSource, frame_sources
 from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
-from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.episodes import Policy, read_episodes, strict_policy
+from tpgmm_datasets.errors import DatasetError, summed_up
+from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Layout, open_layout
 from tpgmm_datasets.units import Units
@@ -31,19 +31,36 @@ class Recording:
         Which are wanted, in order.
     assembly : Assembly
         What a demonstration is made of.
-    policy : callable
-        What is done with a problem.
+    relax : collection of str
+        Checks whose problems leave an episode out, and are warned of.
     """
 
     episodes: tuple[Episode, ...]
     assembly: Assembly
-    policy: Policy
+    relax: Collection[str]
 
     def demonstrations(self) -> Iterator[Demonstration]:
-        """Read the wanted episodes, one when it is asked for."""
+        """Read the wanted episodes, one when it is asked for.
+
+        Raises
+        ------
+        DatasetError
+            As :func:`load_lerobot`; also if every episode was left out.
+        """
         layout, features = self.assembly.layout, self.assembly.features
-        rows = read_episodes(layout, self.episodes, features, self.policy)
-        return map(self.assembly.demonstration, rows)
+        policy, read = Relaxed(self.relax), 0
+        try:
+            for rows in read_episodes(layout, self.episodes, features, policy):
+                read += 1
+                yield self.assembly.demonstration(rows)
+            if self.episodes and not read:
+                reasons = "; ".join(summed_up(policy.problems))
+                raise DatasetError(
+                    f"none of the {len(self.episodes)} episodes is left by the checks that "
+                    f"are relaxed, {sorted(self.relax)}: {reasons}"
+                )
+        finally:
+            policy.warn()
 
 
 def open_recording(
@@ -72,10 +89,11 @@ def open_recording(
     DatasetError
         As :func:`load_lerobot`.
     """
-    policy = strict_policy(relax)
+    policy = Relaxed(relax)
     layout = open_layout(local_folder(path))
     for problem in layout.problems:
         policy(problem)
+    policy.warn()
     feature = layout.feature(joints or joint_feature(layout))
     assembly = Assembly(
         layout,
@@ -86,7 +104,7 @@ def open_recording(
         rate,
         trim,
     )
-    return Recording(tuple(select_episodes(layout, episodes)), assembly, policy)
+    return Recording(tuple(select_episodes(layout, episodes)), assembly, policy.names)
 
 
 def select_episodes(
@@ -101,9 +119,13 @@ def select_episodes(
     """
     by_index = {episode.index: episode for episode in layout.episodes}
     available = list(by_index.values())
+    if not available:
+        raise DatasetError("the set has no episodes", file="meta/info.json")
     if episodes is None:
         return available
     if isinstance(episodes, slice):
+        if not available[episodes]:
+            raise DatasetError(f"{episodes} chooses none of the {len(available)} episodes")
         return available[episodes]
     if isinstance(episodes, str):
         chosen = [episode for episode in available if episodes in episode.tasks]
@@ -149,7 +171,8 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     Parameters
     ----------
     path : str or Path
-        A folder in layout v2.1 or v3.0, or the id of a data set on the Hugging Face hub.
+        A folder in layout v2.1 or v3.0; ``"OWNER/NAME"``, a set that LeRobot keeps on this
+        machine; or ``"hf://datasets/OWNER/NAME"``, one on the Hugging Face hub.
     robot : object with ``joint_names`` and ``state(joints)``, optional
         The demonstrations then have its joints in its order, found by name (also if spelled
         in another way, ``kLeftElbow`` or ``l_elbow.pos`` for ``left_elbow_joint``); values
@@ -182,7 +205,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         Cut off the start and end where no joint is faster than this [rad/s].
     relax : collection of str, default=()
         Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
-        left out with a :class:`DatasetWarning`.
+        left out with a :class:`DatasetWarning`, those for one reason together.
 
     Returns
     -------

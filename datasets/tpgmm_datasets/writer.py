@@ -101,7 +101,8 @@ def save_lerobot(
 
     Notes
     -----
-    An interrupted write leaves the old set, or none where there was none.
+    An interrupted write leaves the old set, or none where there was none. Processes that
+    append to one set wait for each other.
 
     Examples
     --------
@@ -125,10 +126,6 @@ def save_lerobot(
             "file_megabytes must be > 0 and chunk_files >= 1, "
             f"got {file_megabytes!r} and {chunk_files!r}"
         )
-    if path.exists() and not append:
-        raise DatasetError(
-            f"{path} exists; remove it, or pass append=True to add episodes to that set"
-        )
     declared = {
         "codebase_version": "v3.0",
         "robot_type": robot_type,
@@ -140,9 +137,14 @@ def save_lerobot(
         "data_path": DATA_PATH,
         "video_path": None,
     }
-    old = open_layout(path) if path.exists() else None
-    info = declared if old is None else _extended(old, declared)
     with replacing(path, keep=True) as new:  # the files of old episodes stay as they are
+        if path.exists() and not append:
+            raise DatasetError(
+                f"{path} exists; remove it, or pass append=True to add episodes to that set"
+            )
+        # what another process has appended by now is there, and no third can come between
+        old = open_layout(path) if path.exists() else None
+        info = declared if old is None else _extended(old, declared)
         _Writer(new, info, old).write(demonstrations, tasks, commanded)
     return path
 

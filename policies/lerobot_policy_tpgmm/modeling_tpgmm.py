@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import torch
+from draccus.utils import DecodingError, ParsingError
+from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_STATE
@@ -22,10 +24,11 @@ from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
-from lerobot_policy_tpgmm.policy_files import read_tensors, write_files
+from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import Controller, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
+from tpgmm_torch.atomic import recover
+from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
 
 __all__ = ["TPGMMPolicy"]
@@ -330,6 +333,35 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             self._learner.check_saveable()
         self.to_estimator()  # refuses what could not be loaded
         write_files(self.config, state_dict or self.state_dict(), Path(save_directory))
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
+        """Load a policy from a folder, or from the Hugging Face hub by its id.
+
+        Parameters
+        ----------
+        pretrained_name_or_path : str or Path
+            A missing folder that is written as one, ``/home/me/policy``, is not looked up on
+            the hub.
+        **options
+            As for LeRobot's ``PreTrainedPolicy``.
+
+        Raises
+        ------
+        ModelFileError
+            If the folder is missing, or a file in it is damaged, missing, changed, or of
+            another save than the others.
+        """
+        folder = Path(pretrained_name_or_path)
+        recover(folder)
+        if folder.is_dir():
+            check_files(folder)
+        elif str(pretrained_name_or_path).startswith((".", "/", "~")):
+            raise ModelFileError(f"there is no folder {folder}")
+        try:
+            return super().from_pretrained(pretrained_name_or_path, **options)
+        except (DecodingError, ParsingError) as error:
+            raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
 
     @classmethod
     def _load_as_safetensor(

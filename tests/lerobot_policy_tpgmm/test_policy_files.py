@@ -1,10 +1,12 @@
 """The pretrained directory: complete, read strictly, and refused where it does not belong."""
 
 import json
+import os
 import shutil
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file, save_file
@@ -146,7 +148,7 @@ def loaded_alone(path):
 def test_a_truncated_file_is_refused(directory, keep):
     file = directory / "model.safetensors"
     file.write_bytes(file.read_bytes()[:keep])
-    with pytest.raises(ModelFileError, match="cannot be read"):
+    with pytest.raises(ModelFileError, match=r"cannot be read|truncated"):
         TPGMMPolicy.from_pretrained(directory)
     file.unlink()
     with pytest.raises(ModelFileError, match="cannot be read"):
@@ -168,11 +170,84 @@ def test_a_truncated_file_is_refused(directory, keep):
     ],
 )
 def test_a_configuration_of_something_else_is_refused(directory, field, value, message):
-    path = directory / "config.json"
-    config = json.loads(path.read_text()) | {field: value}
-    path.write_text(json.dumps(config))
+    config = PreTrainedConfig.from_pretrained(directory)
+    setattr(config, field, value)
     with pytest.raises((ModelFileError, DataError, KeyError), match=message):
+        TPGMMPolicy.from_pretrained(directory, config=config)
+
+
+# What is of two saves
+
+
+def replaced_text(path, old, new):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+@pytest.mark.parametrize("name", sorted(FILES - {"policy_postprocessor.json"}))
+def test_a_file_of_another_save_is_refused(directory, tmp_path, name):
+    other = changed(fitted(), chunk_size=3)
+    with torch.no_grad():
+        other.mixture.logits.add_(0.1 * torch.randn(8, dtype=torch.float64))
+    other.save_pretrained(tmp_path / "other")
+    replaced_text(tmp_path / "other" / "policy_preprocessor.json", "IDENTITY", "MEAN_STD")
+    shutil.copy(tmp_path / "other" / name, directory / name)
+    message = {"policy_preprocessor.json": name}.get(name, r"config.json is not what was saved")
+    with pytest.raises(ModelFileError, match=message):
         TPGMMPolicy.from_pretrained(directory)
+    with pytest.raises(ModelFileError, match=message):
+        loaded_alone(directory)
+
+
+def test_what_lerobot_train_writes_again_is_accepted(directory):
+    # its own device and names, and statistics that nothing is normalised with
+    path = directory / "policy_preprocessor.json"
+    replaced_text(path, '"rename_map": {}', '"rename_map": {"observation.images.a": "b"}')
+    replaced_text(path, '"device": "cpu"', '"device": "cuda"')
+    content = json.loads(path.read_text())
+    content["steps"][-1]["state_file"] = "policy_preprocessor_step_3.safetensors"
+    path.write_text(json.dumps(content))
+    (directory / "train_config.json").write_text("{}")
+    assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
+
+
+def test_a_policy_without_digests_loads_and_says_so(directory, caplog):
+    rewritten(directory, lambda tensors: None)
+    assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
+    assert "saved without digests" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("config.json", "[" * 100_000, "config.json"),
+        ("policy_preprocessor.json", "[" * 100_000, "policy_preprocessor.json cannot be read"),
+        ("policy_postprocessor.json", '{"steps": [3]}', "postprocessor.json cannot be read"),
+    ],
+)
+def test_json_that_cannot_be_read_is_refused(directory, name, content, message):
+    (directory / name).write_text(content)
+    with pytest.raises(ModelFileError, match=message):
+        TPGMMPolicy.from_pretrained(directory)
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_pipe_is_refused_at_once(directory, name):
+    (directory / name).unlink()
+    os.mkfifo(directory / name)
+    with pytest.raises(ModelFileError, match=rf"{name}.*not a regular file"):
+        TPGMMPolicy.from_pretrained(directory)
+
+
+def test_a_folder_that_is_not_there_is_not_looked_up_on_the_hub(tmp_path):
+    with pytest.raises(ModelFileError, match=r"there is no folder .*polciy"):
+        TPGMMPolicy.from_pretrained(tmp_path / "polciy")
+
+
+def test_the_old_one_is_found_again_where_a_save_died_between_two_renames(directory):
+    directory.rename(directory.with_name(".policy.abcdefgh.previous"))
+    assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
 
 
 # What is refused because robot, environment or data set are others

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tpgmm_torch import atomic
-from tpgmm_torch.atomic import replacing
+from tpgmm_torch.atomic import read_whole, recover, replacing
 
 #: A process that saves, and dies at the n-th thing that it asks of the system, for every n;
 #: prints what is there then.
@@ -143,6 +143,41 @@ def test_what_fails_leaves_the_old(tmp_path, monkeypatch, failing, nth):
     assert failed == (len(calls) >= nth)
     assert names(tmp_path) == ["saved"]
     assert {file.read_text() for file in path.iterdir()} == {"old" if failed else "new"}
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "pointer", "nothing"])
+def test_what_is_not_there_as_a_whole_is_not_read(tmp_path, kind):
+    path = tmp_path / "file"
+    if kind == "pipe":
+        os.mkfifo(path)  # nobody writes to it: reading would not end
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "pointer":
+        path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n")
+    message = {"pointer": "`git lfs pull`", "nothing": "No such file"}.get(
+        kind, "regular file|directory"
+    )
+    with pytest.raises(OSError, match=message):
+        read_whole(path)
+    with replacing(tmp_path / "other") as new:
+        new.write_bytes(b"version")
+    assert read_whole(tmp_path / "other") == b"version"
+
+
+def test_what_the_dead_left_is_used_or_removed_and_nothing_else(tmp_path):
+    path = tmp_path / "saved"
+    save(path, "old")
+    for name in (".saved.settings", ".saved.b.abcdefgh.new", ".saved.abcdefgh.new", ".other"):
+        (tmp_path / name).mkdir()
+    recover(path)  # nothing to do
+    path.rename(tmp_path / ".saved.abcdefgh.previous")
+    recover(path)
+    assert (path / "weights").read_text() == "old"
+    save(tmp_path / "later", "older")
+    (tmp_path / "later").rename(tmp_path / ".saved.12345678.previous")
+    save(path, "new")
+    assert (path / "weights").read_text() == "new"
+    assert names(tmp_path) == [".other", ".saved.b.abcdefgh.new", ".saved.settings", "saved"]
 
 
 @pytest.mark.parametrize("kind", WHOLE)

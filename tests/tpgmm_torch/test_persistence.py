@@ -378,6 +378,13 @@ def test_a_model_stands_on_its_files_alone(saved, tmp_path):
     assert torch.equal(a.joints, b.joints)
 
 
+def test_a_model_of_a_device_that_is_not_there_says_so(tmp_path):
+    model = canonical()
+    model.set_params(device="cuda:99").save(tmp_path / "model")
+    refused(tmp_path / "model", r"on the device 'cuda:99', which is not .*device=\"cpu\"")
+    assert TaskParameterizedGMM.load(tmp_path / "model", device="cpu").device == "cpu"
+
+
 def test_a_model_saved_on_another_device_loads_where_it_is_wanted(tmp_path):
     model = canonical()
     model.set_params(device="meta").save(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -152,7 +151,7 @@ def read_robot(
     DataError
         If they do not go together.
     """
-    from tpgmm_torch.exceptions import DataError, UnknownNameError
+    from tpgmm_torch.exceptions import DataError
 
     if poses:
         if robot or links or joints or coordinates:
@@ -165,18 +164,12 @@ def read_robot(
             raise DataError("--link, --robot-joint and --coordinate need --robot URDF")
         return None
     from tpgmm_torch.robots.robot import Robot
-    from tpgmm_torch.robots.urdf import read_urdf
 
     if robot in (named := plugins.registered(plugins.ROBOTS)):
         robot = str(named[robot].load()())
-    moving = None
-    if joints:
-        actuated = read_urdf(robot).actuated
-        for pattern in joints:
-            if not any(fnmatchcase(name, pattern) for name in actuated):
-                raise UnknownNameError("joint", pattern, "the URDF", actuated)
-        moving = [n for n in actuated if any(fnmatchcase(n, pattern) for pattern in joints)]
-    return Robot.from_urdf(robot, links or (), joints=moving, coordinates=coordinates or ())
+    return Robot.from_urdf(
+        robot, links or (), joints=joints or None, coordinates=coordinates or ()
+    )
 
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:

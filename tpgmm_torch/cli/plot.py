@@ -53,7 +53,7 @@ def plot(
     from tpgmm_torch.operators.text import format_operator
     from tpgmm_torch.plotting import figure, plot_candidates, plot_local
 
-    fitted = TaskParameterizedGMM.load(model)
+    fitted = TaskParameterizedGMM.load(model, device="cpu")
     kinematics = fitted.kinematics_
     chosen = joint or ()
     for name in chosen:

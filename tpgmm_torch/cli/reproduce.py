@@ -66,7 +66,7 @@ def reproduce(
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
         raise DataError("give either --situations FILE.json or --dataset DATASET")
-    fitted = TaskParameterizedGMM.load(model)
+    fitted = TaskParameterizedGMM.load(model, device="cpu")
     kinematics = fitted.kinematics_
     if dataset is not None:
         wanted = [

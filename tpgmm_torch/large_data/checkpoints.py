@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tpgmm_torch.atomic import recover
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.em.expectation_maximization import Fit
 from tpgmm_torch.em.parameters import Parameters
@@ -155,6 +156,7 @@ class Checkpoint:
 
     def _read(self) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
         path = Path(self.path)
+        recover(path)
         if not path.exists() or (path.is_dir() and not any(path.iterdir())):
             return None
         return FOLDER.read(path)

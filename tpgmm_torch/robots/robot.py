@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any, Self
 
 import numpy as np
@@ -23,6 +24,9 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dt
 from tpgmm_torch.robots.urdf import UrdfModel, read_urdf
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
+
+#: A joint vector or a chain longer than this is no robot's, and Jacobians grow with its square.
+MOST_JOINTS = 1000
 
 
 class Robot(Kinematics):
@@ -55,8 +59,10 @@ class Robot(Kinematics):
         links : sequence of str
             Names of the links (or ``tools``) whose poses are wanted.
         joints : sequence of str, optional
-            Names and order of the joint vector. The default is every movable joint that is
-            neither locked nor mimics another, in document order. The others stand still.
+            Names and order of the joint vector. A pattern, ``"left_*"``, stands for all that
+            fit it (:mod:`fnmatch`) and are not named beside it, in document order. The default
+            is every movable joint that is neither locked nor mimics another, in document
+            order. The others stand still.
         locked : mapping of str to float, optional
             Where joints stand that are not in the joint vector [rad or m], 0 by default.
         coordinates : sequence of str, default=()
@@ -93,14 +99,15 @@ class Robot(Kinematics):
         fixed = dict(locked or {})
         if joints is None:
             joints = [name for name in model.actuated if name not in fixed]
-        columns = _names("joints", joints)
+        columns = _joints_named(model, _names("joints", joints), extra)
         columns += tuple(name for name in extra if name not in columns)
         _check_joints(model, columns, extra, fixed)
+        chosen = set(columns)
         config = {
             "urdf": model.text,
             "links": list(_names("links", links)),
             "joints": list(columns),
-            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in columns},
+            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in chosen},
             "coordinates": list(extra),
             "base": model.root if base is None else base,
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
@@ -120,6 +127,12 @@ class Robot(Kinematics):
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
         tree = reduce(model, *_wanted(model, config), column, config["locked"])
+        if max(len(self.joint_names), len(tree.frames)) > MOST_JOINTS:
+            raise DataError(
+                f"the robot has {len(self.joint_names)} joints, {len(tree.frames)} of them "
+                f"between its base and links; more than {MOST_JOINTS} are not supported: "
+                "choose some, joints=[...], or lock some, locked={...}"
+            )
         options: dict[str, Any] = {"dtype": dtype_named(config["dtype"]), "device": device}
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device
@@ -202,6 +215,25 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     return listed
 
 
+def _joints_named(
+    model: UrdfModel, names: Sequence[str], coordinates: Sequence[str]
+) -> tuple[str, ...]:
+    """The names, with what fits the patterns among them in the place of each."""
+    columns = dict.fromkeys(name for name in names if name in model.joint)
+    listed: dict[str, None] = {}
+    for name in names:
+        if name in columns or name in coordinates or not set(name) & set("*?["):
+            listed[name] = None
+            continue
+        fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
+        if not fits:
+            raise UnknownNameError(
+                "joint", name, "the movable joints of the URDF", model.actuated
+            )
+        listed |= dict.fromkeys(fit for fit in fits if fit not in columns)
+    return tuple(listed)
+
+
 def _check_joints(
     model: UrdfModel,
     columns: Sequence[str],
@@ -209,6 +241,7 @@ def _check_joints(
     locked: Mapping[str, float],
 ) -> None:
     """Whether each coordinate, joint and locked joint can be what it is said to be."""
+    actuated = set(model.actuated)
     for name in coordinates:
         if name in model.joint:
             raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
@@ -219,7 +252,7 @@ def _check_joints(
                 f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
                 f"choose or lock {model.leader(name).joint!r}"
             )
-        if name not in model.actuated:
+        if name not in actuated:
             where = "the movable joints of the URDF (a coordinate without kinematics, like a "
             where += "gripper, is named in coordinates)"
             raise UnknownNameError("joint", name, where, model.actuated)

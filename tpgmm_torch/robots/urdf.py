@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
@@ -24,6 +25,8 @@ __all__ = ["Mimic", "UrdfJoint", "UrdfModel", "placement", "read_urdf"]
 MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
 #: Joints of more than one degree of freedom: read, but no :class:`Robot` can be moved by them.
 MULTIPLE_TYPES = ("floating", "planar")
+#: Lengths [m] and factors beyond this are mistakes, and their products would not be finite.
+LARGEST = 1e9
 
 
 @dataclass(frozen=True)
@@ -99,10 +102,15 @@ class UrdfModel:
         """The joints by name."""
         return {joint.name: joint for joint in self.joints}
 
-    @property
+    @cached_property
+    def movable(self) -> dict[str, UrdfJoint]:
+        """The joints of one degree of freedom by name, in document order."""
+        return {joint.name: joint for joint in self.joints if joint.movable}
+
+    @cached_property
     def actuated(self) -> tuple[str, ...]:
-        """Names of the movable joints that follow no other joint, in document order."""
-        return tuple(j.name for j in self.joints if j.movable and j.mimic is None)
+        """Names of those that follow no other joint."""
+        return tuple(name for name, joint in self.movable.items() if joint.mimic is None)
 
     def leader(self, name: str) -> Mimic:
         """The actuated joint on which a movable joint depends, and how.
@@ -119,15 +127,14 @@ class UrdfModel:
         DataError
             If joints mimic one another in a circle.
         """
-        movable = {joint.name for joint in self.joints if joint.movable}
         multiplier, offset, at = 1.0, 0.0, name
-        for _ in movable:
+        for _ in self.movable:
             mimic = self.joint[at].mimic
             if mimic is None:
                 return Mimic(at, multiplier, offset)
-            if mimic.joint not in movable:
+            if mimic.joint not in self.movable:
                 where = f"the movable joints of the URDF (joint {at!r} mimics it)"
-                raise UnknownNameError("joint", mimic.joint, where, movable)
+                raise UnknownNameError("joint", mimic.joint, where, self.movable)
             offset += multiplier * mimic.offset
             multiplier *= mimic.multiplier
             at = mimic.joint
@@ -179,7 +186,7 @@ def _text(source: str | bytes | os.PathLike[str]) -> str:
         return source.lstrip("\ufeff \t\r\n")
     if not isinstance(source, bytes):
         try:
-            source = Path(source).read_bytes()
+            source = read_whole(Path(source))
         except (OSError, ValueError) as error:
             raise DataError(f"the URDF file cannot be read: {error}") from error
     declared = re.match(rb"""\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)""", source)
@@ -191,15 +198,15 @@ def _text(source: str | bytes | os.PathLike[str]) -> str:
 
 
 def _names(root: ElementTree.Element, tag: str) -> list[str]:
-    names: list[str] = []
+    names: dict[str, None] = {}
     for index, element in enumerate(root.findall(tag)):
         name = element.get("name")
         if not name:
             raise DataError(f"<{tag}> number {index + 1} of the URDF has no name")
         if name in names:
             raise DataError(f"the URDF has two {tag}s named {name!r}")
-        names.append(name)
-    return names
+        names[name] = None
+    return list(names)
 
 
 def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
@@ -215,14 +222,15 @@ def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
         _numbers(element, name, "origin", "rpy", (0.0, 0.0, 0.0)),
     )
     axis = _numbers(element, name, "axis", "xyz", (1.0, 0.0, 0.0))
-    norm = float(np.linalg.norm(axis))
     if kind not in MOVABLE_TYPES:
         return UrdfJoint(name, kind, parent, child, origin, axis)
-    if norm == 0:
+    largest = np.abs(axis).max()
+    if largest == 0:
         raise DataError(f"joint {name!r} has the axis 0 0 0: it needs a direction")
+    axis = axis / largest  # a direction alone: the square of a length may overflow
     lower, upper, velocity = _limits(element, name, kind)
     mimic = _mimic(element, name)
-    axis = axis / norm
+    axis = axis / np.linalg.norm(axis)
     return UrdfJoint(name, kind, parent, child, origin, axis, lower, upper, velocity, mimic)
 
 
@@ -252,9 +260,18 @@ def _numbers(
     if values.shape != (len(default),) or not np.isfinite(values).all():
         raise DataError(
             f"joint {joint!r}: <{tag} {attribute}> needs {len(default)} finite number(s), "
-            f"got {text!r}"
+            f"got {_short(text)}"
+        )
+    if tag in ("origin", "mimic") and np.abs(values).max() > LARGEST:
+        raise DataError(
+            f"joint {joint!r}: <{tag} {attribute}> is {_short(text)}, and no robot's is beyond "
+            f"{LARGEST:g}"
         )
     return values
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 100 else f"{text[:100]} ...")
 
 
 def placement(xyz: Array, rpy: Array) -> Array:
@@ -311,9 +328,10 @@ def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:
     """The one link from which all others hang."""
     children: dict[str, list[str]] = {}
     held: set[str] = set()
+    known = set(links)
     for joint in joints:
         for link in (joint.parent, joint.child):
-            if link not in links:
+            if link not in known:
                 raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
         if joint.child in held:
             raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")

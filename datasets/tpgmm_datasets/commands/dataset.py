@@ -34,6 +34,7 @@ CONVERT = "Example: tpgmm dataset convert recordings/arm out/arm --units deg --r
 def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
     from tpgmm_datasets.description import describe_lerobot
+    from tpgmm_datasets.errors import summed_up
 
     description = describe_lerobot(path)
     for name, value in _summary(description).items():
@@ -45,7 +46,7 @@ def info(path: options.Dataset) -> None:
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
         typer.echo("  ".join(cells).rstrip())
-    for problem in description.problems:
+    for problem in summed_up(description.problems):
         typer.echo(f"problem: {problem}")
 
 
@@ -53,9 +54,10 @@ def info(path: options.Dataset) -> None:
 def check(path: options.Dataset) -> None:
     """List all problems of a data set; the exit code is 1 if there are any."""
     from tpgmm_datasets.description import describe_lerobot
+    from tpgmm_datasets.errors import summed_up
 
     description = describe_lerobot(path)
-    for problem in description.problems:
+    for problem in summed_up(description.problems):
         typer.echo(problem)
     if description.problems:
         raise typer.Exit(1)

@@ -12,19 +12,21 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
+from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning, summed_up
 from tpgmm_datasets.lerobot.files import METADATA_KEY
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Episode, Feature, Layout
 from tpgmm_datasets.lerobot.parquet import episode_tables, open_parquet
 from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
-__all__ = ["EpisodeRows", "Policy", "read_episodes", "strict_policy"]
+__all__ = ["EpisodeRows", "Policy", "Relaxed", "read_episodes"]
 
 Array = np.ndarray[Any, Any]
 #: What is done with a problem: raise it, or let it pass.
 Policy = Callable[[DatasetError], None]
 #: How arrow calls the types that it names differently.
 ARROW_NAMES = {"float32": "float", "float64": "double", "float16": "halffloat"}
+#: What may be in the file in place of what info.json declares: nothing of it is lost.
+WIDER = {("float32", "double"), ("float16", "double"), ("float16", "float")}
 
 
 @dataclass(frozen=True)
@@ -46,27 +48,41 @@ class EpisodeRows:
     values: Mapping[str, Array]
 
 
-def strict_policy(relax: Collection[str]) -> Policy:
-    """What to do with a problem: raise it, or warn if its check is among ``relax``.
+class Relaxed:
+    """What to do with a problem: raise it, or keep it if its check is among ``relax``.
+
+    Parameters
+    ----------
+    relax : collection of str
+        Names of :data:`CHECKS`.
 
     Raises
     ------
     DatasetError
-        If ``relax`` names a check that does not exist.
+        If one does not exist.
     """
-    names = {relax} if isinstance(relax, str) else set(relax)
-    if not names <= set(CHECKS):
-        raise DatasetError(
-            f"relax names {sorted(names - set(CHECKS))}; the checks are {sorted(CHECKS)}"
-        )
 
-    def policy(problem: DatasetError) -> None:
-        if problem.check not in names:
+    def __init__(self, relax: Collection[str]) -> None:
+        self.names = {relax} if isinstance(relax, str) else set(relax)
+        self.problems: list[DatasetError] = []
+        if not self.names <= set(CHECKS):
+            raise DatasetError(
+                f"relax names {sorted(self.names - set(CHECKS))}; the checks are "
+                f"{sorted(CHECKS)}"
+            )
+
+    def __call__(self, problem: DatasetError) -> None:
+        """Raise a problem, or keep it."""
+        if problem.check not in self.names:
             raise problem
-        # the caller is some levels up, how many depends on the way
-        warnings.warn(f"left out or not checked: {problem}", DatasetWarning, stacklevel=2)
+        self.problems.append(problem)
 
-    return policy
+    def warn(self) -> None:
+        """Tell of the problems that were kept since, those that are alike as one."""
+        for text in summed_up(self.problems):
+            # the caller is some levels up, how many depends on the way
+            warnings.warn(f"left out or not checked: {text}", DatasetWarning, stacklevel=3)
+        self.problems = []
 
 
 def read_episodes(
@@ -97,7 +113,8 @@ def _read_file(
     expected = {episode.index: episode for episode in episodes}
     listed = {episode.index for episode in layout.episodes if episode.file == file}
     seen: set[int] = set()
-    with open_parquet(layout.root / file, layout.root, ["episode_index", *keys]) as parquet:
+    path, needed = layout.root / file, ["episode_index", *keys]
+    with open_parquet(path, layout.root, needed, BOOKKEEPING) as parquet:
         schema = parquet.schema_arrow
         for problem in _declaration_problems(layout, file, schema.metadata or {}):
             policy(problem)
@@ -205,9 +222,10 @@ def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array
     """The values of a feature, shape (T, width), without a copy where arrow allows."""
     where, rows = episode.where | {"column": feature.key}, len(table)
     flat = _flat(table[feature.key].combine_chunks(), where)
-    if str(flat.type) != ARROW_NAMES.get(feature.dtype, feature.dtype):
+    declared, stored = feature.dtype, str(flat.type)
+    if stored != ARROW_NAMES.get(declared, declared) and (declared, stored) not in WIDER:
         raise DatasetError(
-            f"it holds {flat.type}, info.json declares {feature.dtype}",
+            f"it holds {stored}, info.json declares {declared}",
             check="metadata",
             **where,
         )

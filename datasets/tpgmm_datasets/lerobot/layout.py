@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,18 @@ from typing import Any
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.parquet import read_columns
 from tpgmm_datasets.names import value_names
+from tpgmm_torch.atomic import read_whole
 
 __all__ = ["Episode", "Feature", "Layout", "open_layout"]
 
 #: Columns that LeRobot keeps for itself.
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+CAMERAS = ("video", "image")
+#: Of a row: what is longer is a mistake, and would fill the memory.
+MOST_VALUES = 100_000
+#: Indices beyond this are mistakes: floats could not count them.
+LARGEST_INDEX = 2**53
+HIGHEST_FPS = 1e6
 EPISODE_COLUMNS = (
     "episode_index",
     "length",
@@ -64,7 +72,7 @@ class Feature:
     @property
     def is_camera(self) -> bool:
         """Whether it is a video or image, which this project does not read."""
-        return self.dtype in ("video", "image")
+        return self.dtype in CAMERAS
 
 
 @dataclass(frozen=True)
@@ -168,8 +176,11 @@ def open_layout(root: Path) -> Layout:
             file="meta/info.json",
         )
     fps = info.get("fps")
-    if not isinstance(fps, (int, float)) or isinstance(fps, bool) or not 0 < fps < math.inf:
-        raise DatasetError(f"fps is {fps!r}, not a positive number", file="meta/info.json")
+    if not isinstance(fps, (int, float)) or isinstance(fps, bool) or not 0 < fps < HIGHEST_FPS:
+        raise DatasetError(
+            f"fps is {str(fps)[:20]}, not a number above 0 and below {HIGHEST_FPS:g}",
+            file="meta/info.json",
+        )
     features = _features(info)
     modern = version == "v3.0"
     rows = list(_episodes_v3(root) if modern else _episodes_v2(root))
@@ -195,10 +206,17 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DatasetError(
             f"{root} is not a LeRobot data set: it has no meta/info.json", check="missing"
         )
-    info = _json(path.read_bytes(), "meta/info.json")
+    info = _json(_bytes(root, "meta/info.json"), "meta/info.json")
     if not isinstance(info, dict):
         raise DatasetError("the file does not hold a JSON object", file="meta/info.json")
     return info
+
+
+def _bytes(root: Path, file: str) -> bytes:
+    try:
+        return read_whole(root / file)
+    except OSError as error:
+        raise DatasetError(str(error), check="missing", file=file) from error
 
 
 def _json(text: bytes, file: str, line: int | None = None) -> Any:
@@ -226,9 +244,16 @@ def _feature(key: str, entry: Any) -> Feature:
             file="meta/info.json",
             column=key,
         )
+    width = math.prod(sizes)
+    if width > MOST_VALUES and dtype not in CAMERAS:
+        raise DatasetError(
+            f"a row has {width} values, by its shape {shape!r}; no more than {MOST_VALUES} are "
+            "read",
+            file="meta/info.json",
+            column=key,
+        )
     extra = entry.get("info")
     units = extra.get("units") if isinstance(extra, dict) else None
-    width = math.prod(sizes)
     return Feature(
         key,
         dtype,
@@ -263,7 +288,7 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[int, dict[str, Any]]]:
     path = root / file
     if not path.is_file():
         raise DatasetError("the file is missing", check="missing", file=file)
-    for number, text in enumerate(path.read_bytes().splitlines(), start=1):
+    for number, text in enumerate(_bytes(root, file).splitlines(), start=1):
         if text.strip():
             row = _json(text, file, number)
             if not isinstance(row, dict):
@@ -279,9 +304,11 @@ def _episode(
     if modern:
         whole += [name for name in EPISODE_COLUMNS if name not in ("tasks", *whole)]
     for name in whole:
-        if type(row.get(name)) is not int or row[name] < 0:
+        if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
             raise DatasetError(
-                f"{row.get(name)!r} is not a whole number >= 0", file=place, column=name
+                f"{row.get(name)!r} is not a whole number from 0 to 2^53",
+                file=place,
+                column=name,
             )
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
@@ -313,12 +340,15 @@ def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) ->
         "chunk_index": chunk,
         "file_index": row["data/file_index"] if modern else index,
     }
-    try:
-        file = Path(template.format(**numbers))  # type: ignore[union-attr]
-    except (AttributeError, KeyError, IndexError, ValueError) as error:
+    # no attributes, and no width that would fill the memory
+    fields = rf"({{({'|'.join(numbers)})(:0?\d?\dd)?}}|[^{{}}])+"
+    if not isinstance(template, str) or not re.fullmatch(fields, template):
         raise DatasetError(
-            f"data_path {template!r} cannot be filled in: {error!r}", file="meta/info.json"
-        ) from error
+            f"data_path {template!r} cannot be filled in: it has fields like "
+            f"{{chunk_index:03d}}, of {sorted(numbers)}",
+            file="meta/info.json",
+        )
+    file = Path(template.format(**numbers))
     if file.is_absolute() or ".." in file.parts or "\0" in str(file):
         raise DatasetError(f"data_path {template!r} leaves the set", file="meta/info.json")
     return file

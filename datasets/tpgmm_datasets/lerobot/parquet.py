@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_torch.atomic import open_whole
 
 __all__ = ["episode_tables", "open_parquet", "read_columns"]
 
@@ -24,8 +25,6 @@ BATCH_ROWS = 1 << 16
 def _named(file: Path) -> Iterator[None]:
     try:
         yield
-    except FileNotFoundError as error:
-        raise DatasetError("the file is missing", check="missing", file=file) from error
     # what pyarrow raises on corrupted bytes is not one class: text that is no UTF-8, sizes
     # that overflow, columns that vanish
     except (
@@ -47,20 +46,29 @@ def _named(file: Path) -> Iterator[None]:
         ) from error
 
 
-def open_parquet(path: Path, root: Path, columns: Sequence[str]) -> pq.ParquetFile:
+def open_parquet(
+    path: Path, root: Path, columns: Sequence[str], optional: Sequence[str] = ()
+) -> pq.ParquetFile:
     """Open a parquet file, page checksums verified where it has them.
 
     Raises
     ------
     DatasetError
-        If it is missing or unreadable, or a column is not in it.
+        If it is missing or unreadable, or a column is not in it, or one is twice.
     """
     file = path.relative_to(root)
+    try:
+        with open_whole(path):
+            pass
+    except FileNotFoundError as error:
+        raise DatasetError("the file is missing", check="missing", file=file) from error
+    except (OSError, ValueError) as error:
+        raise DatasetError(str(error), check="missing", file=file) from error
     with _named(file):
         # buffering ahead would hold the whole file
         parquet = pq.ParquetFile(path, pre_buffer=False, page_checksum_verification=True)
         present = parquet.schema_arrow.names
-    for column in columns:
+    for column in (*columns, *(name for name in optional if name in present)):
         if present.count(column) != 1:
             raise DatasetError(
                 f"the file has {present.count(column)} columns of that name; it has "
@@ -153,6 +161,7 @@ def _groups(parquet: pq.ParquetFile, wanted: set[int]) -> list[int]:
         if (
             statistics is None
             or not statistics.has_min_max
+            or not isinstance(statistics.min, int)
             or any(statistics.min <= index <= statistics.max for index in wanted)
         ):
             groups.append(group)

@@ -47,13 +47,49 @@ STATE, POSE = "observation.state", "observation.environment_state"
 
 
 def test_declared_type_and_shape_must_be_those_of_the_data(root, tmp_path):
-    for name, value in (("dtype", "float32"), ("shape", [2])):
+    for name, value in (("dtype", "int64"), ("shape", [2])):
         plain = to_v21(root, tmp_path / name)
         change = {name: value, "names": None, "info": None}
         change_info(plain, lambda i, c=change: i["features"]["observation.state"].update(c))
         with pytest.raises(DatasetError, match=r"info\.json declares") as caught:
             load_lerobot(plain)
         assert caught.value.column == "observation.state"
+
+
+def test_numbers_that_are_more_precise_than_declared_are_read(root, tmp_path):
+    expected = joints_of(load_lerobot(root))
+    plain = to_v21(root, tmp_path / "plain")
+    change_info(plain, lambda i: i["features"][STATE].update(dtype="float32"))
+    assert_equal(joints_of(load_lerobot(plain)), expected)
+
+    def rounded(table):
+        values = table[STATE].combine_chunks().cast(pa.list_(pa.float32(), 3))
+        return set_column(table, STATE, values)
+
+    change_info(plain, lambda i: i["features"][STATE].update(dtype="float64"))
+    for file in sorted((plain / "data").rglob("*.parquet")):
+        change_table(plain, file.relative_to(plain), rounded)
+    with pytest.raises(DatasetError, match=r"it holds float, info\.json declares float64"):
+        load_lerobot(plain)
+
+
+def test_a_column_that_is_there_twice_is_refused(root):
+    change_table(root, DATA, lambda t: t.append_column("timestamp", t["timestamp"]))
+    with pytest.raises(DatasetError, match="2 columns of that name") as caught:
+        load_lerobot(root)
+    assert (caught.value.file, caught.value.column) == (DATA, "timestamp")
+
+
+def test_equal_problems_are_told_once_and_an_empty_list_is_an_error(root):
+    in_data(STATE, spoil(slice(1, 36, 5), 1, np.nan))(root)
+    with (
+        pytest.warns(
+            DatasetWarning, match=r"episode 0.* \(and 2 more like it: episodes 1, 2\)"
+        ) as told,
+        pytest.raises(DatasetError, match=r"none of the 3 episodes is left .*\['nan'\]"),
+    ):
+        load_lerobot(root, relax={"nan"})
+    assert len(told) == 1
 
 
 @pytest.mark.parametrize("check", ["nan", "time", "gaps", "metadata", "duplicates"])

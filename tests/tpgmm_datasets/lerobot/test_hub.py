@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,7 +32,7 @@ def test_an_id_is_fetched_without_videos(root, tmp_path, monkeypatch):
 
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
-    assert len(load_lerobot("someone/bottles")) == 3
+    assert len(load_lerobot("hf://datasets/someone/bottles")) == 3
     assert asked["repo_id"] == "someone/bottles"
     assert not any("videos" in pattern for pattern in asked["allow_patterns"])
 
@@ -43,17 +44,28 @@ def test_an_id_out_of_reach_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
     monkeypatch.setattr("huggingface_hub.snapshot_download", fetch)
     with pytest.raises(DatasetError, match="hf download --repo-type dataset someone/bottles"):
-        load_lerobot("someone/bottles")
+        load_lerobot("hf://datasets/someone/bottles")
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(DependencyError, match="pip install"):
-        load_lerobot("someone/bottles")
+        load_lerobot("hf://datasets/someone/bottles")
 
 
-def test_an_exchange_that_was_killed_is_pointed_out(tmp_path):
+@pytest.mark.parametrize("path", ["recordings/botles", Path("recordings/botles"), "botles"])
+def test_a_folder_that_is_not_there_is_never_looked_up_on_the_hub(path, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
+    monkeypatch.setattr("huggingface_hub.snapshot_download", asked.append)
+    with pytest.raises(DatasetError, match="there is no folder") as caught:
+        load_lerobot(path)
+    assert not asked
+    said = "hub is hf://datasets/recordings/botles" in str(caught.value)
+    assert said == (path == "recordings/botles")
+
+
+def test_an_exchange_that_was_killed_is_undone(tmp_path):
     root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
-    root.rename(tmp_path / ".set.0123.previous")
-    with pytest.raises(DatasetError, match=r"interrupted.*\.set\.0123\.previous"):
-        load_lerobot(root)
+    root.rename(tmp_path / ".set.abcdefgh.previous")
+    assert len(load_lerobot(root)) == 1
 
 
 def test_a_folder_that_is_not_there_is_refused(root):

@@ -28,6 +28,15 @@ def listed_twice(root):
     change_table(root, EPISODES, lambda table: set_column(table, "episode_index", index))
 
 
+def huge(file, column):
+    values = pa.array([0, 2**62, 1])
+    return lambda root: change_table(root, file, lambda t: set_column(t, column, values))
+
+
+def wide(root):
+    change_info(root, lambda i: i["features"]["observation.state"].update(shape=[10**12]))
+
+
 def test_an_edit_of_the_metadata_is_noticed_by_the_data_files(root):
     change_info(root, lambda i: i["features"]["observation.state"].update(names=list("abc")))
     with pytest.raises(DatasetError, match="written with"):
@@ -49,6 +58,13 @@ def test_an_edit_of_the_metadata_is_noticed_by_the_data_files(root):
         ("", in_info(features={}), INFO),
         ("", in_info(data_path="../{chunk_index}"), INFO),
         ("", in_info(data_path="{file}"), INFO),
+        ("", in_info(data_path="{chunk_index:099999999d}/{file_index}"), INFO),
+        ("", in_info(data_path=7), INFO),
+        ("", in_info(fps=10**400), INFO),
+        ("", lambda root: (root / "meta/info.json").write_text("[" * 100_000), INFO),
+        ("", huge(EPISODES, "data/chunk_index"), (f"{EPISODES}", None, "data/chunk_index")),
+        ("", huge(EPISODES, "dataset_from_index"), (EPISODES, None, "dataset_from_index")),
+        ("", wide, (*INFO, None, "observation.state")),
     ],
 )
 def test_metadata_that_are_wrong_are_refused_and_located(root, check, damage, place):

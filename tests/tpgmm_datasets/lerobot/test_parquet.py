@@ -1,11 +1,14 @@
 """Parquet files: read in parts, and named where they are damaged."""
 
+import os
+
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from tests.support.lerobot_sets import (
     DATA,
+    EPISODES,
     assert_equal,
     assert_refused,
     change_info,
@@ -15,6 +18,7 @@ from tests.support.lerobot_sets import (
     to_v21,
 )
 from tpgmm_datasets import (
+    DatasetError,
     DatasetWarning,
     load_lerobot,
 )
@@ -68,6 +72,23 @@ def test_a_missing_file_can_be_relaxed(root, tmp_path):
 def test_a_file_that_is_missing_or_cut_off_is_named(root, damage):
     damage(root)
     assert_refused(root, "missing", DATA)
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [("pipe", "is not a regular file"), ("pointer", "Git LFS pointer.*`git lfs pull`")],
+)
+@pytest.mark.parametrize("file", [DATA, EPISODES, "meta/info.json"])
+def test_what_stands_in_place_of_a_file_is_told(root, place, message, file):
+    (root / file).unlink()
+    if place == "pipe":
+        os.mkfifo(root / file)
+    else:
+        text = "version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 345\n"
+        (root / file).write_text(text)
+    with pytest.raises(DatasetError, match="no meta/info.json|" + message) as caught:
+        load_lerobot(root)
+    assert caught.value.check == "missing"
 
 
 @pytest.mark.parametrize("column", ["observation.state", "episode_index"])

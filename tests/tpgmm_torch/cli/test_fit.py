@@ -73,7 +73,7 @@ def test_only_chosen_joints_move(dataset, tmp_path):
     assert len(names) == 7
     assert all(name.startswith("l_") for name in names)
     line = refusal("fit", dataset, *robot[:-1], "left_*", "--out", tmp_path / "x")
-    assert "joint 'left_*' is not in the URDF" in line
+    assert "joint 'left_*' is not in the movable joints of the URDF" in line
 
 
 def test_a_file_in_the_way_is_left_alone(dataset, tmp_path):

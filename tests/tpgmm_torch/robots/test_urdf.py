@@ -72,8 +72,9 @@ class TestReading:
         assert j.origin[0, 3] == 0.1234567890123456
 
     def test_axes_become_unit_vectors(self) -> None:
-        (j,) = read_urdf(one('<axis xyz="0 3 4"/>')).joints
-        assert j.axis.tolist() == [0, 0.6, 0.8]
+        for scale in ("", "e200", "e-200"):  # of which the squares are no float64
+            (j,) = read_urdf(one(f'<axis xyz="0 3{scale} 4{scale}"/>')).joints
+            assert j.axis.tolist() == pytest.approx([0, 0.6, 0.8], abs=1e-15)
 
     def test_leaders_are_found_through_followers(self) -> None:
         links = LINKS + '<link name="d"/>'
@@ -130,6 +131,7 @@ class TestRefusing:
             (one('<axis xyz="0 1"/>'), "<axis xyz> needs 3 finite number.*got '0 1'"),
             (one('<origin xyz="0 nan 0"/>'), "<origin xyz> needs 3 finite"),
             (one('<origin rpy="0 ${pi} 0"/>'), "<origin rpy> needs 3 finite"),
+            (one('<origin xyz="0 1e200 0"/>'), "'0 1e200 0', and no robot's is beyond 1e.09"),
             (one('<limit lower="low" upper="1"/>'), "<limit lower> needs 1 finite"),
             (one('<limit lower="2" upper="1"/>'), "lower=2, upper=1"),
             (one('<limit velocity="-1"/>'), "velocity=-1"),
