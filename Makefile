@@ -17,7 +17,7 @@ PACKAGES_test := .[test] ./policies[test]
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare bench test fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare conditions bench test fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -29,6 +29,10 @@ demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 compare: $(VENV)/.installed-compare ## Compare TP-GMM with ACT, Diffusion and a naive floor; out/compare
 	$(COMPARE) --demonstrations 5,10
 	$(COMPARE) --demonstrations 10 --policies tpgmm --conditions pushes,noise,pushes+noise
+
+conditions: $(VENV)/.installed-compare ## Try TP-GMM where things go wrong, beside an open loop; out/conditions
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --demonstrations 10 --policies tpgmm \
+	    --conditions all --out out/conditions
 
 bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_ARGS="--only step"; out/bench
 	$(BENCH) --out out/bench $(BENCH_ARGS)

@@ -66,3 +66,9 @@ RESULTS = [
     result("tpgmm", 10, 17, condition="pushes+noise"),
     result("act", 10, 18, curve=curve(0.03, 0.01), outcome=BUDGET),
 ]
+#: The same policy with other settings, where something goes wrong.
+DISTURBED = [
+    result("tpgmm", 10, 20, condition="stopped-3"),
+    result("tpgmm-open-loop", 10, 2, condition="stopped-3"),
+    result("tpgmm --policy.blend=0", 10, 3, condition="stopped-3"),
+]

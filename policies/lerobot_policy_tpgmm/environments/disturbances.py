@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -391,9 +391,10 @@ _KINDS: Mapping[str, Disturbance] = MappingProxyType(
         "irregular-ticks": IrregularTicks(),
     }
 )
-#: Those that a comparison runs through.
+_NUMBER = r"(\d+(?:\.\d+)?)"
+#: Those that a comparison runs through. At 3 s a stop keeps the hands from the grasp.
 CONDITIONS = (
-    *(NOMINAL, "stopped-1", "stopped-2", "stopped-3", "stopped-5", "stopped-10"),
+    *(NOMINAL, "stopped-1", "stopped-2", "stopped-3", "stopped-5", "stopped-10", "stopped-3@3"),
     *(name for name in _KINDS if name != "stopped"),
 )
 
@@ -407,7 +408,8 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         ``"nominal"``, or names joined by ``+``: ``stopped``, ``pushed-back``,
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
         ``pose-noise``, ``pose-lost``, ``pose-stale``, ``irregular-ticks``. A number behind a
-        name says how many seconds: ``stopped-3``, ``pushed-back-1.5``.
+        name says how many seconds, ``stopped-3``, and one behind ``@`` when it happens, if that
+        is not to be drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------
@@ -425,26 +427,29 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
         return tuple(condition)
     found: dict[str, Disturbance] = {}
     for text in () if condition == NOMINAL else condition.split("+"):
-        match = re.fullmatch(r"([a-z]+(?:-[a-z]+)*)(?:-(\d+(?:\.\d+)?))?", text)
-        kind, number = match.groups() if match else (text, None)
+        match = re.fullmatch(rf"([a-z]+(?:-[a-z]+)*)(?:-{_NUMBER})?(?:@{_NUMBER})?", text)
+        kind, *numbers = match.groups() if match else (text,)
         if kind not in _KINDS:
             where = "the conditions of the environment"
             raise UnknownNameError("disturbance", text, where, (NOMINAL, *_KINDS))
         if kind in found:
             raise DataError(f"{condition!r} names {kind} twice")
-        found[kind] = _KINDS[kind]
-        if number is not None:
-            found[kind] = _lasting(kind, float(number))
+        given = zip(("seconds", "moment"), numbers, strict=True)
+        found[kind] = _with(kind, {name: float(text) for name, text in given if text})
     return tuple(found[kind] for kind in _KINDS if kind in found)
 
 
-def _lasting(kind: str, seconds: float) -> Disturbance:
-    disturbance: Any = _KINDS[kind]
-    if "seconds" not in {field.name for field in dataclasses.fields(disturbance)}:
-        raise DataError(f"{kind} takes no seconds, got {kind}-{seconds:g}")
-    if not seconds > 0:
-        raise DataError(f"the seconds of {kind} are above 0, got {seconds:g}")
-    return dataclasses.replace(disturbance, seconds=math.copysign(seconds, disturbance.seconds))
+def _with(kind: str, numbers: Mapping[str, float]) -> Disturbance:
+    usual = _KINDS[kind]
+    for name, number in numbers.items():
+        if name not in vars(usual):
+            raise DataError(f"{kind} takes no {name}, got {number:g}")
+        if not number > 0:
+            raise DataError(f"the {name} of {kind} is above 0, got {number:g}")
+    signed = {
+        name: math.copysign(number, vars(usual)[name]) for name, number in numbers.items()
+    }
+    return dataclasses.replace(usual, **signed)
 
 
 def generators(

@@ -15,6 +15,7 @@ import lerobot_policy_tpgmm.environments  # noqa: F401  registers what gym.make 
 from lerobot_policy_tpgmm.environments.aloha.demonstrations import record_aloha
 from lerobot_policy_tpgmm.environments.aloha.robot import aloha_operators, aloha_robot
 from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS
+from lerobot_policy_tpgmm.environments.disturbances import CONDITIONS, NOMINAL
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import TASK, BottleShaking
@@ -49,6 +50,8 @@ class Benchmark(ABC):
     n_components: ClassVar[int]
     #: Disturbances of the evaluation and the options that make them.
     disturbances: ClassVar[dict[str, dict[str, Any]]] = {}
+    #: What its option ``condition`` is tried with; empty without that option.
+    conditions: ClassVar[tuple[str, ...]] = ()
     robot: Kinematics
 
     def __init__(
@@ -56,6 +59,11 @@ class Benchmark(ABC):
     ) -> None:
         self.rate = rate or self.default_rate
         self.options = {**self.fixed, **(options or {})}
+
+    @property
+    def all_conditions(self) -> tuple[str, ...]:
+        """What ``--conditions all`` means."""
+        return tuple(dict.fromkeys((NOMINAL, *self.conditions, *self.disturbances)))
 
     @abstractmethod
     def operators(self, orientation: bool) -> list[Operator]:
@@ -103,9 +111,12 @@ class BottleBenchmark(Benchmark):
         "lift_mm": ("lift [mm]", 0),
         "frequency_error": ("frequency error", 2),
         "amplitude_error": ("amplitude error", 2),
+        "peak_speed": ("peak speed [rad/s]", 1),
+        "peak_acceleration": ("peak acceleration [rad/s²]", 0),
     }
     criteria: ClassVar = LIMITS
     disturbances: ClassVar = {"pushes": {"pushes": True}, "noise": {"noise": 1.0}}
+    conditions: ClassVar = CONDITIONS
     #: Demonstrations are drawn together; the first may train, the last ones validate.
     POOL, RESERVED = 100, 10
 

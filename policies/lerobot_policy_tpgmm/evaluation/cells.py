@@ -10,13 +10,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
+from lerobot_policy_tpgmm.evaluation.variants import Variant
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["NOMINAL", "Cell", "Results", "write_json"]
-
-#: The condition without disturbances.
-NOMINAL = "nominal"
+__all__ = ["Cell", "Results", "write_json"]
 
 
 @dataclass(frozen=True, order=True)
@@ -28,7 +27,7 @@ class Cell:
     env : str
         Name of the benchmark.
     policy : str
-        What is trained.
+        What is trained, and with which settings it is used, as :class:`Variant` reads it.
     demonstrations : int
         How many of the episodes it sees, the first ones.
     seed : int
@@ -45,13 +44,22 @@ class Cell:
 
     @property
     def training(self) -> str:
-        """Name of the trained policy, which cells of all conditions share."""
-        return f"{self.env}-{self.policy}-n{self.demonstrations}-s{self.seed}"
+        """Name of the trained policy, which cells of all conditions and settings share."""
+        return self._named(self.variant.base)
+
+    @property
+    def variant(self) -> Variant:
+        """The trained policy and its settings."""
+        return Variant.parse(self.policy)
 
     @property
     def key(self) -> str:
         """Name of the cell."""
-        return f"{self.training}-{self.condition}"
+        policy = re.sub(r"[^\w.+=:-]+", "_", self.policy.replace(" --policy.", "+"))
+        return f"{self._named(policy)}-{self.condition}"
+
+    def _named(self, policy: str) -> str:
+        return f"{self.env}-{policy}-n{self.demonstrations}-s{self.seed}"
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -23,8 +23,11 @@ tpgmm compare --demonstrations 5,10 --workers 2 --out out/compare (the reduced g
 tpgmm compare --demonstrations 5,10,25,50 --seeds 0,1,2 --episodes 100 --budget 30
 --workers 8 --out out/full (the full grid)
 
-tpgmm compare --policies tpgmm --conditions pushes,noise,pushes+noise --episodes 100
---out out/disturbed
+tpgmm compare --demonstrations 10 --policies tpgmm --conditions all --out out/conditions
+(every condition, beside the open loop of 0.1.0, as 'make conditions')
+
+tpgmm compare --policies "tpgmm,tpgmm --policy.feedback=observation"
+--conditions pushes,stopped-3,moved+pose-noise --out out/disturbed
 
 tpgmm compare --env aloha_state --demonstrations 25 --out out/aloha
 """
@@ -40,8 +43,10 @@ def compare(
         str,
         typer.Option(
             metavar="NAME,...",
-            help="Among tpgmm, tpgmm-position-only, act, act-phase, diffusion, "
-            "diffusion-phase, nearest; or all.",
+            help="Among tpgmm, tpgmm-open-loop (by the clock, as in 0.1.0), "
+            "tpgmm-position-only, act, act-phase, diffusion, diffusion-phase, nearest; or all "
+            "but the second. A tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside "
+            "disturbances the open loop is always there.",
         ),
     ] = "all",
     demonstrations: Annotated[
@@ -52,8 +57,9 @@ def compare(
         str,
         typer.Option(
             metavar="NAME,...",
-            help="Of the evaluation: nominal, or disturbances of the environment (pushes, "
-            "noise, pushes+noise).",
+            help="Of the evaluation: nominal, or disturbances of the environment joined by +: "
+            "pushes, noise, and what --env.condition takes (stopped-3, pushed-back, moved, "
+            "pose-lost, ...); or all.",
         ),
     ] = "nominal",
     episodes: Annotated[
@@ -82,18 +88,25 @@ def compare(
     --policy.path), tables, figures and report.md. What is finished there is not run again, so a
     run that was stopped goes on, and a grid can grow.
     """
+    from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
     from lerobot_policy_tpgmm.evaluation.compare import compare as run
     from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
     from lerobot_policy_tpgmm.evaluation.settings import Settings
+    from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP
 
-    chosen = POLICIES if policies == "all" else policies.split(",")
+    settings = Settings(env, episodes=episodes, budget=60 * budget)
+    chosen = list(POLICIES) if policies == "all" else policies.split(",")
+    every = settings.benchmark().all_conditions
+    tried = list(every) if conditions == "all" else conditions.split(",")
+    if "tpgmm" in chosen and OPEN_LOOP not in chosen and tried != [NOMINAL]:
+        chosen.insert(chosen.index("tpgmm") + 1, OPEN_LOOP)
     result = run(
-        Settings(env, episodes=episodes, budget=60 * budget),
+        settings,
         out,
         chosen,
         _numbers(demonstrations, "--demonstrations"),
         _numbers(seeds, "--seeds"),
-        conditions.split(","),
+        tried,
         workers,
         typer.echo,
         shlex.join(["tpgmm", *sys.argv[1:]]),

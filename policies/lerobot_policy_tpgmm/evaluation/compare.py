@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, Cell, Results
+from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
+from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.jobs import POLICIES, record, run
 from lerobot_policy_tpgmm.evaluation.processes import run_jobs
 from lerobot_policy_tpgmm.evaluation.report.report import write_report
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP, Variant
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["Comparison", "compare"]
@@ -57,6 +59,9 @@ def compare(
     out : Path
         The folder: ``episodes/`` (two LeRobot data sets), ``policies/`` (pretrained
         directories), ``cells/`` (one JSON file each), tables, figures and ``report.md``.
+    policies : sequence of str
+        Names, or ``"tpgmm --policy.FIELD=VALUE ..."``: trained as ``"tpgmm"`` and used with
+        other settings.
     demonstrations : sequence of int
         Numbers of demonstrations.
     seeds : sequence of int
@@ -100,8 +105,9 @@ def _grid(
     conditions: Sequence[str],
 ) -> list[Cell]:
     for policy in policies:
-        if policy not in POLICIES:
-            raise UnknownNameError("policy", policy, "the comparison", POLICIES)
+        if Variant.parse(policy).base not in POLICIES:
+            known = (*POLICIES, OPEN_LOOP)
+            raise UnknownNameError("policy", policy, "the comparison", known)
     for condition in conditions:
         settings.disturbed(condition)
     if not policies or not seeds or not demonstrations or min(demonstrations) < 1:
@@ -135,6 +141,7 @@ def _run(
     say: Callable[[str], None],
 ) -> dict[Cell, str]:
     """Run the cells, those of one training one after the other; return what failed."""
+    pending = sorted(pending, key=lambda cell: cell.training)  # stable
     groups = [list(cells) for _, cells in groupby(pending, key=lambda cell: cell.training)]
     # the long ones first, so that no worker is idle at the end
     groups.sort(key=lambda cells: -_expected(cells, settings))
@@ -164,5 +171,5 @@ def _run(
 
 def _expected(cells: Sequence[Cell], settings: Settings) -> float:
     """Minutes, roughly, in proportion to one another."""
-    training = EXPECTED.get(cells[0].policy, settings.budget / 60)
+    training = EXPECTED.get(cells[0].variant.base, settings.budget / 60)
     return training + len(cells) * settings.episodes / 50

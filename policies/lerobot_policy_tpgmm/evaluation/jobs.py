@@ -59,8 +59,9 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
     if not (directory / RECORD).exists():
         _train(folder, settings, cells[0], directory)
     training = json.loads((directory / RECORD).read_text(encoding="utf-8"))
-    runner, results = Runner.load(directory), Results(folder / "cells")
+    results = Results(folder / "cells")
     for cell in cells:
+        runner = Runner.load(directory, cell.variant.arguments)
         options = settings.disturbed(cell.condition)
         config = make_env_config(settings.benchmark().env, fps=training["fps"], **options)
         began = time.perf_counter()
@@ -95,7 +96,7 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
     """Write the pretrained directory in one step."""
     began = time.process_time()
     train_it = {"nearest": _nearest} | dict.fromkeys(RECIPES, _baseline)
-    trained = train_it.get(cell.policy, _tpgmm)(folder / "episodes", settings, cell)
+    trained = train_it.get(cell.variant.base, _tpgmm)(folder / "episodes", settings, cell)
     seconds = time.process_time() - began
     with replacing(directory) as new:
         for part in (trained.policy, *trained.processors):
@@ -115,7 +116,7 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
 def _baseline(episodes: Path, settings: Settings, cell: Cell) -> Training:
     training = Episodes.read(episodes / "training").first(cell.demonstrations)
     validation = Episodes.read(episodes / "validation")
-    recipe = RECIPES[cell.policy]
+    recipe = RECIPES[cell.variant.base]
     if recipe.phase and not settings.benchmark().synchronous:
         training, validation = training.on_common_clock(validation)
     return train(recipe, training, validation, seed=cell.seed, budget=settings.budget)
@@ -142,7 +143,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         demonstrations = warping.fit_transform(demonstrations)
     model = TaskParameterizedGMM(
         settings.n_components or benchmark.n_components,
-        benchmark.operators(orientation=cell.policy == "tpgmm"),
+        benchmark.operators(orientation=cell.variant.base == "tpgmm"),
         benchmark.robot,
         random_state=cell.seed,
     )

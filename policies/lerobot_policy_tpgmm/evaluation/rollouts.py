@@ -39,9 +39,9 @@ class Runner:
     postprocessor: Any
 
     @classmethod
-    def load(cls, directory: Path) -> Runner:
-        """Read a pretrained directory as LeRobot does."""
-        config = PreTrainedConfig.from_pretrained(directory)
+    def load(cls, directory: Path, overrides: Sequence[str] = ()) -> Runner:
+        """Read a pretrained directory as LeRobot does, with ``--field=value`` on top."""
+        config = PreTrainedConfig.from_pretrained(directory, cli_overrides=list(overrides))
         kind = (
             NearestPolicy
             if isinstance(config, NearestConfig)

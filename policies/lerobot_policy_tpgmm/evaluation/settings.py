@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lerobot_policy_tpgmm.environments.disturbances import NOMINAL, parse_condition
 from lerobot_policy_tpgmm.evaluation.benchmarks import Benchmark, benchmark
-from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, write_json
+from lerobot_policy_tpgmm.evaluation.cells import write_json
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["Settings"]
@@ -62,12 +63,18 @@ class Settings:
     def disturbed(self, condition: str) -> dict[str, Any]:
         """The environment's options in a condition, disturbances joined by ``+``."""
         benchmark = self.benchmark()
-        disturbances, options = benchmark.disturbances, benchmark.options
+        options, others = benchmark.options, []
         for name in () if condition == NOMINAL else condition.split("+"):
-            if name not in disturbances:
-                where = f"the conditions of {self.env}"
-                raise UnknownNameError("disturbance", name, where, {NOMINAL, *disturbances})
-            options = {**options, **disturbances[name]}
+            if name in benchmark.disturbances:
+                options = {**options, **benchmark.disturbances[name]}
+            elif benchmark.conditions and _parses(name):
+                others.append(name)
+            else:
+                where, known = f"the conditions of {self.env}", benchmark.all_conditions
+                raise UnknownNameError("disturbance", name, where, known)
+        if others:
+            parse_condition("+".join(others))
+            options = {**options, "condition": "+".join(others)}
         return options
 
     def keep(self, path: Path) -> None:
@@ -96,3 +103,11 @@ class Settings:
                 f"{path.parent} holds results with other settings: {'; '.join(changes)}. Take "
                 "another folder, or the settings of before"
             )
+
+
+def _parses(name: str) -> bool:
+    try:
+        parse_condition(name)
+    except UnknownNameError:
+        return False
+    return True

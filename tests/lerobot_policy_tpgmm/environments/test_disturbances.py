@@ -14,6 +14,7 @@ from lerobot_policy_tpgmm.environments.disturbances import (
     Moved,
     NoisyPose,
     PoseLost,
+    StartedMidway,
     Stopped,
     displaced,
     generators,
@@ -41,6 +42,9 @@ def drawn(disturbance, seed):
         ("stopped-10", (Stopped(10.0),)),
         ("pushed-back", (Displaced(-2.0),)),
         ("pushed-back-1.5", (Displaced(-1.5),)),
+        ("pushed-back-1.5@6", (Displaced(-1.5, moment=6.0),)),
+        ("started-midway@6.5", (StartedMidway(6.5),)),
+        ("stopped-3@3", (Stopped(3.0, moment=3.0),)),
         ("pushed-ahead-3", (Displaced(3.0),)),
         ("moved-slowly", (Moved(seconds=1.0),)),
         ("pose-stale", (PoseLost(stale=True),)),
@@ -58,8 +62,9 @@ def test_a_condition_has_a_text(text, disturbances):
         ("rain", UnknownNameError, r"'rain' is not in the conditions .*'stopped'"),
         ("stopped-", UnknownNameError, "'stopped-'"),
         ("", UnknownNameError, "''"),
-        ("live-3", DataError, "live takes no seconds, got live-3"),
-        ("stopped-0", DataError, "above 0, got 0"),
+        ("live-3", DataError, "live takes no seconds, got 3"),
+        ("pose-noise@3", DataError, "pose-noise takes no moment, got 3"),
+        ("stopped-0", DataError, "the seconds of stopped is above 0, got 0"),
         ("stopped-2+stopped-3", DataError, "names stopped twice"),
     ],
 )
@@ -91,7 +96,7 @@ def test_moments_are_drawn_from_the_seed_whatever_else_happens(text):
     for name, moment in alone.items():
         if moment is not None:
             assert 0.5 <= moment <= COURSE.end
-            assert moments(text, 4)[name] != moment
+            assert (moments(text, 4)[name] != moment) == ("@" not in text)
 
 
 def test_the_same_moments_for_stops_of_all_lengths():

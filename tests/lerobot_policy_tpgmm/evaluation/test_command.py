@@ -1,6 +1,9 @@
 """``tpgmm compare`` as it is called."""
 
+import pytest
+
 from lerobot_policy_tpgmm.evaluation import compare as module
+from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark
 from lerobot_policy_tpgmm.evaluation.cells import Cell
 from lerobot_policy_tpgmm.evaluation.compare import Comparison
 from tests.support.command_line import output, refusal, run
@@ -19,6 +22,35 @@ def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
     result = run("compare", "--demonstrations", "101", *out)
     assert result.exit_code == 2
     assert "offers 100 demonstrations" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "policies", "conditions"),
+    [
+        (["--policies", "tpgmm,act"], ["tpgmm", "act"], ["nominal"]),
+        (
+            ["--policies", "tpgmm,act", "--conditions", "nominal,stopped-3"],
+            ["tpgmm", "tpgmm-open-loop", "act"],
+            ["nominal", "stopped-3"],
+        ),
+        (
+            ["--policies", "act", "--conditions", "all"],
+            ["act"],
+            list(BottleBenchmark.conditions),
+        ),
+    ],
+)
+def test_disturbed_policies_stand_beside_the_open_loop(
+    arguments, policies, conditions, tmp_path, monkeypatch
+):
+    called = []
+    monkeypatch.setattr(
+        module, "compare", lambda *given: called.extend(given) or Comparison(0, {})
+    )
+    assert run("compare", *arguments, "--out", tmp_path).exit_code == 0
+    assert called[2] == policies
+    assert called[5][: len(conditions)] == conditions
+    assert set(called[5]) - set(conditions) in (set(), {"pushes", "noise"})
 
 
 def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.compare import Comparison, compare
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP
 
 SETTINGS = Settings(
     options={"mode": "kinematic"},
@@ -89,6 +90,41 @@ def test_what_is_finished_is_not_run_again(folder, tmp_path):
     # nor is a policy trained again, whose evaluation was stopped
     assert (out / "policies" / TPGMM.training / "training.json").stat().st_mtime_ns == trained
     assert compared(out)[1][0] == "2 cells, 2 of them finished before"
+
+
+def test_conditions_are_tried_with_the_policy_that_is_there(folder, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(folder, out)
+    conditions = ["stopped-1", "moved+pose-stale"]
+    policies = ["tpgmm", OPEN_LOOP, "tpgmm --policy.follow_frames=true"]
+    said = []
+    few = replace(SETTINGS, episodes=1)
+    few.keep(out / "few.json")
+    (out / "few.json").replace(out / "settings.json")
+    comparison = compare(few, out, policies, [3], conditions=conditions, say=said.append)
+    assert comparison.finished == 6, said
+    trained = [path.name for path in (out / "policies").iterdir()]
+    assert sorted(trained) == [NEAREST.training, TPGMM.training]
+    results = Results(out / "cells")
+    stop = {
+        policy: results.read(replace(TPGMM, policy=policy, condition="stopped-1"))
+        for policy in policies
+    }
+    assert stop["tpgmm"]["settings"]["options"]["condition"] == "stopped-1"
+    for row in (result["episodes"][0] for result in stop.values()):
+        assert row["peak_speed"] > 0 and row["peak_acceleration"] > 0
+    moved = [
+        results.read(replace(TPGMM, policy=policy, condition=conditions[1]))["episodes"][0]
+        for policy in policies[1:]
+    ]
+    assert moved[1]["grasp_mm"] < 10 < 20 < moved[0]["grasp_mm"]
+    cells = pd.read_csv(out / "cells.csv")
+    assert {"success_low", "success_high", "peak_speed_median", "grasp_mm_p95"} <= set(cells)
+    assert len(cells) == 8
+    report = (out / "report.md").read_text()
+    for condition in conditions:
+        for policy in policies:
+            assert f"| {condition} | {policy} | " in report
 
 
 @pytest.mark.parametrize("policy", ["act", "diffusion-phase"])

@@ -23,7 +23,21 @@ def test_conditions_become_options_of_the_environment():
     assert settings.disturbed("nominal") == {"mode": "kinematic"}
     both = settings.disturbed("pushes+noise")
     assert both == {"mode": "kinematic", "pushes": True, "noise": 1.0}
-    with pytest.raises(UnknownNameError, match="'rain' is not in the conditions"):
+    stopped = settings.disturbed("stopped-3+noise+live")
+    assert stopped == {"mode": "kinematic", "noise": 1.0, "condition": "stopped-3+live"}
+    with pytest.raises(UnknownNameError, match=r"'rain' is not in the conditions .*stopped-3"):
         settings.disturbed("rain")
+    with pytest.raises(DataError, match="names stopped twice"):
+        settings.disturbed("stopped-3+stopped-4")
+    with pytest.raises(UnknownNameError, match="'live' is not in the conditions of aloha"):
+        Settings("aloha_state").disturbed("live")
     with pytest.raises(UnknownNameError, match="environment 'moon'"):
         Settings("moon").benchmark()
+
+
+def test_all_conditions_of_a_benchmark_can_be_made():
+    for settings in (Settings(), Settings("aloha_state")):
+        conditions = settings.benchmark().all_conditions
+        assert conditions[0] == "nominal" and len(set(conditions)) == len(conditions)
+        made = [settings.disturbed(condition) for condition in conditions]
+        assert all(made.count(options) == 1 for options in made)

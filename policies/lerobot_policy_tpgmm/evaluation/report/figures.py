@@ -19,6 +19,7 @@ __all__ = ["draw_curves", "draw_errors", "draw_success"]
 #: Colour and marker of each policy; the phase-informed variant of a baseline is filled.
 LOOKS = {
     "tpgmm": ("tab:red", "o", True),
+    "tpgmm-open-loop": ("tab:red", "o", False),
     "tpgmm-position-only": ("tab:orange", "s", True),
     "act": ("tab:blue", "^", False),
     "act-phase": ("tab:blue", "^", True),

@@ -10,7 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from lerobot_policy_tpgmm.evaluation.cells import NOMINAL, Cell
+from lerobot_policy_tpgmm.environments.disturbances import NOMINAL, parse_condition
+from lerobot_policy_tpgmm.evaluation.cells import Cell
 from lerobot_policy_tpgmm.evaluation.report.figures import (
     draw_curves,
     draw_errors,
@@ -23,6 +24,7 @@ from lerobot_policy_tpgmm.evaluation.report.tables import (
     write_table,
 )
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP, Variant
 from tpgmm_torch.atomic import replacing
 
 __all__ = ["write_report"]
@@ -31,6 +33,7 @@ __all__ = ["write_report"]
 DESCRIPTIONS = {
     "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
     "and the joints",
+    OPEN_LOOP: "the same, played by the clock with what is seen at the start, as in 0.1.0",
     "tpgmm-position-only": "the same without the orientation of the hands",
     "act": "LeRobot's Action Chunking Transformer on joints and object poses",
     "act-phase": "the same, informed of the time and learning from episodes on a common clock",
@@ -119,7 +122,7 @@ class _Sections:
         self.cells, self.episodes = cells, episodes
         self.nominal = episodes[episodes.condition == NOMINAL]
         self.benchmark = settings.benchmark()
-        self.policies = [name for name in DESCRIPTIONS if name in set(cells.policy)]
+        self.policies = sorted(set(cells.policy), key=_place)
         self.counts = sorted(set(cells.demonstrations))
         self.trainings = {
             (r["cell"]["policy"], r["cell"]["demonstrations"], r["cell"]["seed"]): r["training"]
@@ -128,10 +131,11 @@ class _Sections:
 
     def __iter__(self) -> Iterator[str]:
         yield from self._introduction()
-        yield from self._success()
         if len(self.nominal):
+            yield from self._success()
             yield from self._criteria()
             yield from self._errors()
+        yield from self._conditions()
         yield from self._baselines()
         yield from self._cost()
         yield "## What to keep in mind"
@@ -146,36 +150,62 @@ class _Sections:
             f"out, through LeRobot's own rollout, in the same {len(seeds)} situations that no "
             f"episode shows (seeds {seeds[0]} to {seeds[-1]})."
         )
-        yield "\n".join(f"- **{name}**: {DESCRIPTIONS[name]}" for name in self.policies)
+        yield "\n".join(f"- **{name}**: {_description(name)}" for name in self.policies)
 
     def _success(self) -> Iterator[str]:
         yield "## Success"
         yield "Successful episodes, and the 95 % interval of their share (Wilson)."
-        disturbed = set(self.cells.condition) - {NOMINAL}
-        for condition in (NOMINAL, *sorted(disturbed, key=lambda name: name.count("+"))):
-            part = self.episodes[self.episodes.condition == condition]
-            if part.empty:
-                continue
-            yield f"Condition: {self._described(condition)}."
-            # policies down, numbers of demonstrations across
-            yield _table(
-                ["policy", *(f"{count} demonstrations" for count in self.counts)],
-                [
-                    [policy, *(_rate(rows[rows.demonstrations == n]) for n in self.counts)]
-                    for policy, rows in self._by_policy(part)
-                ],
-            )
-            if part.policy.nunique() > 1:
-                name = f"success_{condition.replace('+', '_')}.png"
-                draw_success(part, self._picture(name))
-                yield f"![Success over demonstrations](figures/{name})"
+        # policies down, numbers of demonstrations across
+        yield _table(
+            ["policy", *(f"{count} demonstrations" for count in self.counts)],
+            [
+                [policy, *(_rate(rows[rows.demonstrations == n]) for n in self.counts)]
+                for policy, rows in self._by_policy(self.nominal)
+            ],
+        )
+        if self.nominal.policy.nunique() > 1:
+            draw_success(self.nominal, self._picture("success_nominal.png"))
+            yield "![Success over demonstrations](figures/success_nominal.png)"
+
+    def _conditions(self) -> Iterator[str]:
+        """Everything beside the nominal condition, in one table for each number."""
+        known = self.benchmark.all_conditions
+        found = set(self.cells.condition)
+        others = sorted(found - set(known), key=lambda name: (name.count("+"), name))
+        conditions = [name for name in (*known, *others) if name in found]
+        if conditions in ([], [NOMINAL]):
+            return
+        yield "## Conditions"
+        yield (
+            "Successful episodes with the 95 % interval of their share (Wilson), and median / "
+            "95th percentile of the figures over the episodes. Every condition has the same "
+            "situations; the moments of what goes wrong are drawn from the episode's seed."
+        )
+        yield "\n".join(f"- `{name}`: {self._described(name)}" for name in conditions)
+        figures = {k: v for k, v in self.benchmark.figures.items() if k in self.episodes}
+        headings = ["condition", "policy", "success", *(name for name, _ in figures.values())]
+        for count, part in self.episodes.groupby("demonstrations"):
+            yield f"From {count} demonstrations:"
+            table = []
+            for condition in conditions:
+                chosen = part[part.condition == condition]
+                for policy, rows in self._by_policy(chosen):
+                    spreads = [_spread(rows[k], digits) for k, (_, digits) in figures.items()]
+                    table.append([condition, policy, _rate(rows), *spreads])
+            yield _table(headings, table)
 
     def _described(self, condition: str) -> str:
+        """What goes wrong, in the words of those who make it go wrong."""
         if condition == NOMINAL:
-            return "nominal, without disturbances"
-        names = condition.split("+")
-        options = {k: v for name in names for k, v in self.benchmark.disturbances[name].items()}
-        return f"{' and '.join(names)} (`{json.dumps(options)}`)"
+            return "nothing goes wrong."
+        told = []
+        for name in condition.split("+"):
+            if name in self.benchmark.disturbances:
+                told.append(f"`{json.dumps(self.benchmark.disturbances[name])}`.")
+            else:
+                [disturbance] = parse_condition(name)
+                told.append(str(type(disturbance).__doc__).partition("\n")[0])
+        return " ".join(told)
 
     def _criteria(self) -> Iterator[str]:
         """Which part of the skill fails."""
@@ -380,6 +410,20 @@ class _Sections:
         folder = self.out / "figures"
         folder.mkdir(exist_ok=True)
         return folder / name
+
+
+def _place(policy: str) -> tuple[int, str]:
+    """The order of the report: variants behind what they vary."""
+    names = list(DESCRIPTIONS)
+    base = policy if policy in names else Variant.parse(policy).base
+    return names.index(base), "" if policy in names else policy
+
+
+def _description(policy: str) -> str:
+    if policy in DESCRIPTIONS:
+        return DESCRIPTIONS[policy]
+    variant = Variant.parse(policy)
+    return f"{variant.base} with {', '.join(f'`{item}`' for item in variant.overrides)}"
 
 
 def _rate(rows: pd.DataFrame) -> str:

@@ -6,7 +6,7 @@ import pytest
 from lerobot_policy_tpgmm.evaluation.cells import Cell
 from lerobot_policy_tpgmm.evaluation.report.report import write_report
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from tests.support.comparison import RESULTS, result
+from tests.support.comparison import DISTURBED, RESULTS, result
 
 SETTINGS = Settings(episodes=20, budget=120.0)
 
@@ -15,7 +15,7 @@ SETTINGS = Settings(episodes=20, budget=120.0)
 def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     failures = {Cell("bottle_shaking", "diffusion", 5, 0): "bad luck"}
-    write_report(folder, SETTINGS, RESULTS, failures, "tpgmm compare --out x")
+    write_report(folder, SETTINGS, RESULTS + DISTURBED, failures, "tpgmm compare --out x")
     text = (folder / "report.md").read_text()
     pictures = [line.partition("(")[2][:-1] for line in text.splitlines() if line[:2] == "!["]
     assert len(pictures) == 3
@@ -32,7 +32,14 @@ def report(tmp_path_factory):
         "| tpgmm | 20/20 = 100 % (84 to 100 %) | 20/20 = 100 % (84 to 100 %) |",
         "| act | 0/20 = 0 % (0 to 16 %) | 18/20 = 90 % (70 to 97 %) |",
         "| nearest | 0/20 = 0 % (0 to 16 %) | - |",
-        'Condition: pushes and noise (`{"pushes": true, "noise": 1.0}`).',
+        # conditions
+        '- `pushes+noise`: `{"pushes": true}`. `{"noise": 1.0}`.',
+        "- `stopped-3`: The drives stop, and hold the joints where they are: a protective",
+        "| nominal | tpgmm | 20/20 = 100 % (84 to 100 %) | 1.0 / 1.0 |",
+        "| stopped-3 | tpgmm-open-loop | 2/20 = 10 % (3 to 30 %) | inf / inf |",
+        "| pushes+noise | tpgmm | 17/20 = 85 % (64 to 95 %) | 1.0 / inf |",
+        "- **tpgmm --policy.blend=0**: tpgmm with `blend=0`",
+        "played by the clock with what is seen at the start, as in 0.1.0",
         # criteria, at ten demonstrations
         "| act | 90 % | 100 % | 100 % | 100 % | 50 % |",
         # errors
@@ -65,3 +72,14 @@ def test_a_report_names_the_cells_that_failed(tmp_path):
     failed = Cell("bottle_shaking", "tpgmm", 3, 0)
     path = write_report(tmp_path, SETTINGS, [], {failed: "bad luck"}, "")
     assert f"- `{failed.key}`: bad luck" in path.read_text()
+
+
+def test_variants_stand_behind_what_they_vary(report):
+    conditions = report.partition("## Conditions")[2].partition("## ")[0]
+    rows = [row.split(" | ")[:2] for row in conditions.splitlines() if row.startswith("| ")]
+    assert [" ".join(row).strip("| ") for row in rows if "---" not in row[0]][-4:] == [
+        "stopped-3 tpgmm",
+        "stopped-3 tpgmm --policy.blend=0",
+        "stopped-3 tpgmm-open-loop",
+        "pushes+noise tpgmm",
+    ]
