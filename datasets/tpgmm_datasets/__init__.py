@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
     from tpgmm_datasets.reader import iter_lerobot, load_lerobot
-    from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
     from tpgmm_datasets.units import Scale
     from tpgmm_datasets.writer import save_lerobot
 
@@ -28,8 +27,6 @@ __all__ = [
     "FramePose",
     "LinkPose",
     "Scale",
-    "demonstrations_from_frame",
-    "demonstrations_to_frame",
     "describe_lerobot",
     "iter_lerobot",
     "load_lerobot",
@@ -45,7 +42,6 @@ _HOMES = {
     "episode_batches": ("EpisodeBatches",),
     "errors": ("CHECKS", "DatasetError", "DatasetWarning"),
     "reader": ("iter_lerobot", "load_lerobot"),
-    "tables": ("demonstrations_from_frame", "demonstrations_to_frame"),
     "units": ("Scale",),
     "writer": ("save_lerobot",),
 }

@@ -41,9 +41,9 @@ SHOWN = {
     "tpgmm_torch.plotting": "figure",
     "tpgmm_torch.quaternions": "exp product",
     "tpgmm_torch.data.situation_files": "read_situations",
+    "tpgmm_torch.data.tables": "demonstrations_from_frame demonstrations_to_frame",
     "tpgmm_datasets": (
-        "FramePose LinkPose Scale demonstrations_from_frame demonstrations_to_frame "
-        "describe_lerobot load_lerobot resample save_lerobot trim"
+        "FramePose LinkPose Scale describe_lerobot load_lerobot resample save_lerobot trim"
     ),
     "tpgmm_datasets.bottle.experiment": "bottle_operators",
     "tpgmm_datasets.bottle.skill": "BottleShaking",

@@ -41,7 +41,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("units", "robots"),
         ("lerobot",),
         ("conversion",),
-        ("description", "reader", "tables", "writer"),
+        ("description", "reader", "writer"),
         ("episode_batches", "signals"),
         ("bottle",),
         ("commands",),

@@ -15,14 +15,13 @@ from tpgmm_datasets import (
     DatasetError,
     LinkPose,
     Scale,
-    demonstrations_from_frame,
-    demonstrations_to_frame,
     describe_lerobot,
     load_lerobot,
     save_lerobot,
 )
 from tpgmm_torch import Canonical, Demonstration, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.data.tables import demonstrations_from_frame, demonstrations_to_frame
 from tpgmm_torch.metrics import joint_rmse
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses

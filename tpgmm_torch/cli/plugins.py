@@ -21,8 +21,6 @@ FORMATS = "tpgmm.formats"
 READERS = "tpgmm.readers"
 #: A robot is a function that returns its URDF.
 ROBOTS = "tpgmm.robots"
-#: A table is a function that makes a pandas.DataFrame of demonstrations.
-TABLES = "tpgmm.tables"
 #: The format of ``TaskParameterizedGMM.save``, which is nobody's plugin.
 OWN = "tpgmm"
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tpgmm_torch.cli import options
-from tpgmm_torch.cli.plugins import TABLES, required
 
 if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Situation
@@ -53,9 +52,9 @@ def reproduce(
 ) -> None:
     """Reproduce a skill in new situations.
 
-    Writes joint references over time: a table with one row per time step (.parquet as
-    tpgmm_datasets.demonstrations_to_frame makes it, .csv with plain column names), or arrays
-    (.npz). Prints a line per situation.
+    Writes joint references over time and their covariance: a table with one row per time step
+    (.parquet, .csv), as tpgmm_torch.data.tables.trajectories_from_frame reads it back, or
+    arrays (.npz). Prints a line per situation.
     """
     from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.situation_files import read_situations
@@ -116,24 +115,21 @@ def _write(
     import numpy as np
 
     from tpgmm_torch.atomic import replacing
-    from tpgmm_torch.data.demonstrations import Demonstration
+    from tpgmm_torch.data.arrays import as_array
+    from tpgmm_torch.data.tables import trajectories_to_frame, write_table
 
-    table = required(TABLES, "pandas")(
-        [
-            Demonstration(t.time, t.joints, s.frames_at(t.time), t.joint_names)
-            for t, s in zip(trajectories, situations, strict=True)
+    if out.suffix != ".npz":
+        frames = [
+            s.frames_at(t.time.cpu()) for t, s in zip(trajectories, situations, strict=True)
         ]
-    )
+        write_table(trajectories_to_frame(trajectories, frames), out)
+        return
     with replacing(out) as new:
-        if out.suffix == ".parquet":
-            table.to_parquet(new)
-        elif out.suffix == ".csv":
-            table.set_axis(table.columns.get_level_values("name"), axis=1).to_csv(new)
-        else:
-            np.savez(
-                new,
-                episode=table.index.get_level_values("episode").to_numpy(),
-                time=table.index.get_level_values("time").to_numpy(),
-                joints=table["joint"].to_numpy(),
-                joint_names=np.array(trajectories[0].joint_names),
-            )
+        np.savez(
+            new,
+            episode=np.repeat(np.arange(len(trajectories)), list(map(len, trajectories))),
+            time=np.concatenate([as_array(one.time) for one in trajectories]),
+            joints=np.concatenate([as_array(one.joints) for one in trajectories]),
+            covariance=np.concatenate([as_array(one.covariance) for one in trajectories]),
+            joint_names=np.array(trajectories[0].joint_names),
+        )

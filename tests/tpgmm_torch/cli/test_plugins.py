@@ -5,7 +5,6 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from tests.support.command_line import refusal
-from tpgmm_datasets import demonstrations_to_frame
 from tpgmm_datasets.commands.recordings import Recordings
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.cli import plugins
@@ -34,7 +33,6 @@ def test_what_this_distribution_registers_is_there():
     assert {"dataset", "demo"} <= plugins.registered(plugins.COMMANDS).keys()
     assert plugins.required(plugins.READERS, "lerobot") is Recordings
     assert plugins.required(plugins.ROBOTS, "upper_body") is upper_body_urdf
-    assert plugins.required(plugins.TABLES, "pandas") is demonstrations_to_frame
 
 
 def test_an_installation_that_is_older_than_the_code_is_pointed_out(monkeypatch, tmp_path):

@@ -3,14 +3,17 @@
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
 from tests.support.command_line import output, refusal
-from tpgmm_datasets import demonstrations_from_frame
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.data.tables import (
+    demonstrations_from_frame,
+    read_table,
+    trajectories_from_frame,
+)
 
 
 def arrays(path):
@@ -33,17 +36,18 @@ def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp
         found = arrays(out)
         assert found["joint_names"].tolist() == names
         joints = found["joints"][found["episode"] == 1]
-    elif suffix == "csv":
-        table = pd.read_csv(out, index_col=["episode", "time"])
-        joints = table.loc[1][names].to_numpy()
+        covariance = found["covariance"][found["episode"] == 1]
     else:
-        found = demonstrations_from_frame(pd.read_parquet(out))
-        assert set(found[1].frames) == {"bottle"}
-        joints = found[1].joints.numpy()
+        table = read_table(out)
+        assert set(demonstrations_from_frame(table)[1].frames) == {"bottle"}
+        found = trajectories_from_frame(table)[1]
+        assert list(found.joint_names) == names
+        joints, covariance = found.joints.numpy(), found.covariance.numpy()
     arguments = ("--dataset", dataset, "--episodes", "2", "--out", tmp_path / "again.npz")
     output("reproduce", fitted[0], *arguments)
     again = arrays(tmp_path / "again.npz")
     np.testing.assert_allclose(joints, again["joints"], atol=1e-9)
+    np.testing.assert_allclose(covariance, again["covariance"], atol=1e-9)
     np.testing.assert_array_equal(again["time"], model.time_)
 
 

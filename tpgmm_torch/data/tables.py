@@ -1,0 +1,431 @@
+"""Demonstrations and trajectories as flat tables of pandas, and back; CSV and parquet.
+
+A row is a time step. The columns are ``episode``, ``time`` [s], the joints by name, the seven
+numbers of each frame (``bottle.x``, ``bottle.y``, ``bottle.z`` [m], ``bottle.qw`` to
+``bottle.qz``), the time of each event (``event.close`` [s], the same in all rows of an episode)
+and, of trajectories, the upper triangle of the joints' covariance (``covariance.elbow.wrist``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups
+from tpgmm_torch.data.trajectories import Trajectory
+from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = [
+    "demonstrations_from_frame",
+    "demonstrations_to_frame",
+    "read_table",
+    "trajectories_from_frame",
+    "trajectories_to_frame",
+    "write_table",
+]
+
+EVENT, COVARIANCE = "event.", "covariance."
+#: Where pandas keeps which columns are joints, among the attributes of a table.
+JOINTS = "joints"
+
+
+def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
+    """One row per time step of each demonstration.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        They may differ in events: what a demonstration does not have is NaN. Joints without
+        names are called by their number.
+
+    Returns
+    -------
+    pandas.DataFrame
+        With the columns of this module's description.
+
+    Raises
+    ------
+    DataError
+        If the demonstrations are not alike, or two columns would have one name.
+    DependencyError
+        If there is no pandas.
+
+    Examples
+    --------
+    >>> shown = Demonstration(
+    ...     [0.0, 0.5], [[0.0], [1.0]], {"cup": Frame([0.4, 0, 0])}, ["elbow"], {"close": 0.5}
+    ... )
+    >>> table = demonstrations_to_frame([shown])
+    >>> table[["episode", "time", "elbow", "cup.x", "event.close"]].values.tolist()
+    [[0.0, 0.0, 0.0, 0.4, 0.5], [0.0, 0.5, 1.0, 0.4, 0.5]]
+    """
+    checked = check_demonstrations(demonstrations)
+    parts = [
+        _columns(episode, one, one.frames)
+        | {f"{EVENT}{name}": np.full(len(one), at) for name, at in one.events.items()}
+        for episode, one in enumerate(checked)
+    ]
+    return _table(parts, checked[0])
+
+
+def trajectories_to_frame(
+    trajectories: Sequence[Trajectory], frames: Sequence[Mapping[str, Frame]] | None = None
+) -> pd.DataFrame:
+    """One row per time step of each trajectory, with the covariance of its joints.
+
+    Parameters
+    ----------
+    trajectories : sequence of Trajectory
+        Of one model.
+    frames : sequence of mapping of str to Frame, optional
+        The frames of the situation of each, constant or one per time step.
+
+    Returns
+    -------
+    pandas.DataFrame
+        With the columns of this module's description.
+
+    Raises
+    ------
+    DataError
+        If there are none, or not as many ``frames``, or two columns would have one name.
+    DependencyError
+        If there is no pandas.
+    """
+    if not trajectories:
+        raise DataError("expected at least one trajectory, got none")
+    situations: Sequence[Mapping[str, Frame]] = frames or [{}] * len(trajectories)
+    if len(situations) != len(trajectories):
+        raise DataError(
+            f"there are {len(trajectories)} trajectories, and frames of {len(situations)}"
+        )
+    parts = []
+    for episode, (one, poses) in enumerate(zip(trajectories, situations, strict=True)):
+        rows, columns = np.triu_indices(len(one.joint_names))
+        upper = as_array(one.covariance)[:, rows, columns]
+        names = covariance_names(one.joint_names)
+        parts.append(_columns(episode, one, poses) | dict(zip(names, upper.T, strict=True)))
+    return _table(parts, trajectories[0])
+
+
+def demonstrations_from_frame(
+    table: pd.DataFrame,
+    *,
+    joints: Sequence[str] | None = None,
+    time: str = "time",
+    episode: str = "episode",
+) -> list[Demonstration]:
+    """The demonstrations in a table.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Rows of an episode in order of time. A pose that is the same in all rows of an episode
+        becomes a constant frame; a column that is NaN throughout an episode is not in its
+        demonstration.
+    joints : sequence of str, optional
+        Columns of the joints [rad or m], where not all columns that are nothing else are meant,
+        or where they look like poses, as those of tracked hands do.
+    time : str, default="time"
+        Column of the time [s].
+    episode : str, default="episode"
+        Column that tells episodes apart, by numbers or names; without it there is one.
+
+    Returns
+    -------
+    list of Demonstration
+        In order of appearance.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If a column is missing, occurs twice or holds no numbers, a value is missing, or an
+        event has two times; and as :class:`Demonstration`. The message says in which episode.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> table = pd.DataFrame({"t": [0.0, 0.1], "elbow": [0.3, 0.4], "wrist": [0.0, 0.1]})
+    >>> demonstrations_from_frame(table, time="t")
+    [Demonstration(2 steps, 0.10 s, 2 joints, frames=[], events={})]
+    """
+
+    def make(part: pd.DataFrame, names: list[str]) -> Demonstration:
+        events = {
+            name.removeprefix(EVENT): _only(part, name)
+            for name in part.columns
+            if name.startswith(EVENT)
+        }
+        numbered = names == [str(i) for i in range(len(names))]
+        return Demonstration(
+            torch.from_numpy(_numbers(part, [time])[:, 0]),
+            torch.from_numpy(_numbers(part, names)),
+            _poses(part, {time, episode, *names}),
+            None if numbered else tuple(names),
+            events,
+        )
+
+    return _each(table, make, joints, time, episode)
+
+
+def trajectories_from_frame(
+    table: pd.DataFrame,
+    *,
+    joints: Sequence[str] | None = None,
+    time: str = "time",
+    episode: str = "episode",
+) -> list[Trajectory]:
+    """The trajectories in a table as :func:`trajectories_to_frame` makes it.
+
+    Parameters
+    ----------
+    table, joints, time, episode
+        As of :func:`demonstrations_from_frame`. The joints are those that have a covariance.
+
+    Returns
+    -------
+    list of Trajectory
+        In order of appearance, without candidates.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        As :func:`demonstrations_from_frame`, and if a covariance is missing.
+    """
+
+    def make(part: pd.DataFrame, names: list[str]) -> Trajectory:
+        n = len(names)
+        rows, columns = np.triu_indices(n)
+        covariance = np.empty((len(part), n, n))
+        covariance[:, rows, columns] = _numbers(part, covariance_names(names))
+        covariance[:, columns, rows] = covariance[:, rows, columns]
+        # checked as that of a demonstration is
+        motion = Demonstration(
+            torch.from_numpy(_numbers(part, [time])[:, 0]),
+            torch.from_numpy(_numbers(part, names)),
+        )
+        return Trajectory(
+            motion.time, motion.joints, torch.from_numpy(covariance), (), tuple(names)
+        )
+
+    return _each(table, make, joints, time, episode)
+
+
+def write_table(table: pd.DataFrame, path: str | Path) -> None:
+    """Write a table, replacing what is there in one step.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Of any of these functions.
+    path : str or Path
+        Ends in .csv, which has all digits, or .parquet.
+
+    Raises
+    ------
+    DataError
+        If it ends otherwise.
+    """
+    path = _known(Path(path))
+    with replacing(path) as new:
+        if path.suffix == ".csv":
+            table.to_csv(new, index=False)
+        else:
+            table.to_parquet(new, index=False)
+
+
+def read_table(path: str | Path) -> pd.DataFrame:
+    """Read a table, every digit of it.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .csv whose first line has the names of the columns, or a .parquet.
+
+    Raises
+    ------
+    DataError
+        If there is no such file, or it is none of these.
+    DependencyError
+        If there is no pandas, or no pyarrow for parquet.
+    """
+    path, pandas = _known(Path(path)), _pandas()
+    try:
+        if path.suffix == ".csv":
+            # by default pandas is quicker, and wrong in the last digit
+            return pandas.read_csv(path, float_precision="round_trip")
+        return pandas.read_parquet(path)
+    except FileNotFoundError:
+        raise DataError(f"there is no file {path}") from None
+    except ImportError as error:
+        raise DependencyError(
+            f"{path} needs pyarrow: pip install 'tpgmm-torch[data]'"
+        ) from error
+    except (OSError, ValueError) as error:  # also those of the parsers
+        raise DataError(f"{path} is no table: {error}") from error
+
+
+def covariance_names(joint_names: Sequence[str]) -> list[str]:
+    """Columns of the covariance's upper triangle, row by row."""
+    pairs = zip(*np.triu_indices(len(joint_names)), strict=True)
+    return [f"{COVARIANCE}{joint_names[i]}.{joint_names[j]}" for i, j in pairs]
+
+
+def _pandas() -> Any:
+    try:
+        import pandas
+    except ImportError as error:
+        raise DependencyError("tables need pandas: pip install 'tpgmm-torch[data]'") from error
+    return pandas
+
+
+def _known(path: Path) -> Path:
+    if path.suffix not in (".csv", ".parquet"):
+        raise DataError(f"a table's file ends in .csv or .parquet, got {str(path)!r}")
+    return path
+
+
+def _columns(
+    episode: int, motion: Demonstration | Trajectory, frames: Mapping[str, Frame]
+) -> dict[str, Array]:
+    """Episode, time, joints and frames."""
+    rows, joints = len(motion), as_array(motion.joints)
+    names = _joint_names(motion)
+    columns = [("episode", np.full(rows, episode)), ("time", as_array(motion.time))]
+    columns += zip(names, joints.T, strict=True)
+    for name, frame in frames.items():
+        pose = as_array(torch.cat((frame.position, frame.orientation), -1))
+        pose = np.broadcast_to(pose, (rows, len(POSE_PARTS)))
+        columns += [(f"{name}.{part}", pose[:, i]) for i, part in enumerate(POSE_PARTS)]
+    if len({name for name, _ in columns}) < len(columns):
+        raise DataError(
+            f"joints {list(names)} and frames {sorted(frames)} have a column in common, or one "
+            "is called 'time' or 'episode': rename it"
+        )
+    return dict(columns)
+
+
+def _table(
+    parts: Sequence[Mapping[str, Array]], motion: Demonstration | Trajectory
+) -> pd.DataFrame:
+    pandas = _pandas()
+    table = pandas.concat([pandas.DataFrame(part) for part in parts], ignore_index=True)
+    # parquet keeps it: joints may have names like those of poses
+    table.attrs[JOINTS] = _joint_names(motion)
+    return table
+
+
+def _joint_names(motion: Demonstration | Trajectory) -> list[str]:
+    return list(motion.joint_names or map(str, range(motion.joints.shape[-1])))
+
+
+def _each[Motion](
+    table: pd.DataFrame,
+    make: Callable[[pd.DataFrame, list[str]], Motion],
+    joints: Sequence[str] | None,
+    time: str,
+    episode: str,
+) -> list[Motion]:
+    """What is made of each episode; errors say which."""
+    table = table.rename(columns=str)
+    twice = table.columns[table.columns.duplicated()]
+    if len(twice):
+        raise DataError(f"the table has columns of one name: {sorted(set(twice))}")
+    for name in (time, *(joints or ())):
+        if name not in table.columns:
+            raise UnknownNameError("column", name, "the table", table.columns)
+    if not len(table):
+        raise DataError("the table has no rows")
+    names = list(joints) if joints is not None else _joints(table, {time, episode})
+    if episode in table.columns:
+        if table[episode].isna().any():
+            raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
+        parts = list(table.groupby(episode, sort=False))
+    else:
+        parts = [(0, table)]
+    made = []
+    for label, part in parts:
+        try:
+            made.append(make(part.dropna(axis="columns", how="all"), names))
+        except (DataError, UnknownNameError) as error:
+            raise DataError(f"episode {label} of the table: {error}") from error
+    return made
+
+
+def _joints(table: pd.DataFrame, others: set[str]) -> list[str]:
+    """Columns that are joints.
+
+    What the table says, else those with a covariance, else all that are nothing else.
+    """
+    columns = _others(table, others)
+    if JOINTS in table.attrs and set(table.attrs[JOINTS]) <= set(columns):
+        return list(table.attrs[JOINTS])
+    known = [name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns]
+    if known:
+        return known
+    in_poses = {columns[i] for group in pose_groups(columns).values() for i in group}
+    names = [name for name in columns if name not in in_poses]
+    if not names:
+        raise DataError(
+            f"the table has no joints: {columns} are poses of frames or something else. If "
+            "some are joints, say so: joints=[...]"
+        )
+    return names
+
+
+def _others(table: pd.DataFrame, known: set[str]) -> list[str]:
+    """Columns that are joints or poses."""
+    return [
+        name
+        for name in table.columns
+        if name not in known and not name.startswith((EVENT, COVARIANCE))
+    ]
+
+
+def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
+    """The frames, constant where nothing changes."""
+    columns = _others(part, others)
+    frames: dict[str, Frame] = {}
+    for name, group in pose_groups(columns).items():
+        pose = _numbers(part, [columns[i] for i in group])
+        pose = pose[0] if bool((pose == pose[0]).all()) else pose
+        frames[name] = Frame.from_pose(pose, order="wxyz")
+    return frames
+
+
+def _only(part: pd.DataFrame, name: str) -> float:
+    """The one value that an event's column repeats."""
+    values = _numbers(part, [name])
+    if bool((values != values[0]).any()):
+        raise DataError(f"column {name!r} is one time [s], but it changes")
+    return float(values[0, 0])
+
+
+def _numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
+    """Columns as numbers, none of them missing."""
+    columns = []
+    for name in names:
+        if name not in part.columns:
+            raise UnknownNameError("column", name, "the table", part.columns)
+        values = part[name]
+        if values.dtype.kind not in "biuf":
+            raise DataError(
+                f"column {name!r} holds no numbers, its first value is {values.iloc[0]!r}: "
+                "leave it out of the table, or out of joints=[...]"
+            )
+        if values.isna().any():
+            row = values.index[values.isna()][0]
+            raise DataError(f"column {name!r} lacks a value in row {row}")
+        columns.append(values.to_numpy(dtype=np.float64))
+    return np.stack(columns, axis=1)
