@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from tpgmm_torch.impedance.linear_quadratic import LinearDynamics, TrackingPlan
     from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+    from tpgmm_torch.motion.follower import Follower
+    from tpgmm_torch.motion.motion_bounds import MotionBounds
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,
@@ -50,12 +52,14 @@ __all__ = [
     "Demonstration",
     "Estimate",
     "EvenClock",
+    "Follower",
     "Frame",
     "Hold",
     "Impedance",
     "Kinematics",
     "LinearDynamics",
     "Linearization",
+    "MotionBounds",
     "Operator",
     "Poses",
     "RelativeOrientation",
@@ -86,6 +90,8 @@ _HOMES = {
     "data.holds": ("Hold",),
     "robots.kinematics": ("Kinematics", "RobotState"),
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
+    "motion.follower": ("Follower",),
+    "motion.motion_bounds": ("MotionBounds",),
     "operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",

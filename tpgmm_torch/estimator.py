@@ -32,6 +32,8 @@ from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
 from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
@@ -142,6 +144,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Frames that a situation must have.
     time_ : Tensor of shape (T,)
         Time grid of a typical demonstration, the default of ``predict`` [s].
+    acceleration_, jerk_ : Tensor of shape (n_joints,) or None
+        Peaks of the demonstrations [rad/s^2], [rad/s^3]; None where they are not known, as in
+        models that were saved by earlier versions.
     n_iter_ : int
     converged_ : bool
     lower_bound_ : float
@@ -192,6 +197,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "device": [str],
         "verbose": ["verbose"],
     }
+
+    acceleration_: Tensor | None
+    jerk_: Tensor | None
 
     #: What compiles; None until :meth:`compile` is called.
     _backend: str | None = None
@@ -302,18 +310,22 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             gathered = rows_in_memory(
                 known, operators, kinematics, responsibilities=self.responsibilities
             )
-            return self._learn(gathered, operators, kinematics, checkpoint)
+            self._learn(gathered, operators, kinematics, checkpoint)
+            peaks = demonstrated_peaks(known, kinematics.joint_names)
+            return self._set_peaks(*peaks)
         walk = checked_batches([demonstrations] if batches is None else batches)
         head = next(walk, None)
         check_shares(head, processes)
         assert head is not None
         kinematics = self._kinematics_for(head, operators)
+        seen = DemonstratedPeaks(kinematics.joint_names)
         with RowFile() as file:
             gathered = gather_rows(
-                chain([head], walk), operators, kinematics, file, processes,
+                seen.watch(chain([head], walk)), operators, kinematics, file, processes,
                 responsibilities=self.responsibilities,
             )  # fmt: skip
-            return self._learn(gathered, operators, kinematics, checkpoint)
+            self._learn(gathered, operators, kinematics, checkpoint)
+        return self._set_peaks(*seen.result(processes))
 
     def predict(
         self, X: Situation | Sequence[Situation], *, candidates: bool = True
@@ -652,6 +664,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_, self.time_ = frame_names(operators, kinematics), time
+        self.acceleration_ = self.jerk_ = None
         self.weights_, self.means_ = mixture.weights_, mixture.means_
         self.covariances_ = mixture.covariances_
         # a mixture of given parameters comes from no EM
@@ -741,6 +754,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             "converged": bool(self.converged_),
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
         }
+        if self.acceleration_ is not None and self.jerk_ is not None:
+            config["peaks"] = [self.acceleration_.tolist(), self.jerk_.tolist()]
         tensors = {"weights": self.weights_, "time": self.time_}
         for j, (mean, covariance) in enumerate(
             zip(self.means_, self.covariances_, strict=True)
@@ -799,11 +814,42 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
             known = config["lower_bound"] is not None
             model.lower_bound_ = config["lower_bound"] if known else math.nan
+            if "peaks" in config:
+                acceleration, jerk = (as_tensor(x, "peaks") for x in config["peaks"])
+                model._set_peaks(acceleration, jerk)
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, ModelFileError):
                 raise
             raise ModelFileError(f"{path} does not fit together: {error}") from error
         return model
+
+    def motion_bounds(self, **given: Any) -> MotionBounds:
+        """Bounds on speed, acceleration and jerk of the model's robot.
+
+        Parameters
+        ----------
+        **given : float, array-like of shape (n_joints,) or mapping of str to float
+            The user's, see :meth:`MotionBounds.of`. What neither the robot nor the user
+            bounds follows from the demonstrations.
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError, NotFittedError
+            If bounds contradict each other, or there is no model.
+        """
+        self._check_fitted()
+        peaks = None
+        if self.acceleration_ is not None and self.jerk_ is not None:
+            peaks = self.acceleration_, self.jerk_
+        return MotionBounds.of(self.kinematics_, peaks, **given)
+
+    def _set_peaks(self, acceleration: Tensor, jerk: Tensor) -> Self:
+        like = self.kinematics_.lower
+        for peaks in (acceleration, jerk):
+            if peaks.shape != like.shape or not bool((peaks >= 0).all()):
+                raise DataError(f"peaks of {len(like)} joints are no negative numbers: {peaks}")
+        self.acceleration_, self.jerk_ = acceleration.to(like), jerk.to(like)
+        return self
 
     def _learn(
         self,

@@ -15,6 +15,7 @@ __all__ = [
     "DegenerateComponentWarning",
     "DependencyError",
     "DistributedError",
+    "MissingLimitsWarning",
     "ModelFileError",
     "NotFittedError",
     "ShapeError",
@@ -86,3 +87,7 @@ class ConvergenceWarning(SklearnConvergenceWarning):
 
 class DegenerateComponentWarning(UserWarning):
     """A mixture component lost its data and was placed anew."""
+
+
+class MissingLimitsWarning(UserWarning):
+    """A robot is described without limits that its motions could keep within."""

@@ -19,7 +19,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["LENGTHS", "TOUCH", "WAVE", "arm", "chain", "demonstrations", "model", "situation"]
 

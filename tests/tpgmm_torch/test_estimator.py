@@ -25,6 +25,8 @@ from tests.support.skills import (
     JOINT_NAMES,
     LAST,
     apart,
+    bottle,
+    bottle_demonstrations,
     bottle_model,
     canonical,
     few_bottles,
@@ -62,6 +64,7 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.local_data import local_data
 
@@ -936,3 +939,21 @@ def test_samples_are_those_of_their_random_state_and_as_smooth_as_the_model():
     assert float(a[0].joints.diff(dim=0).abs().max()) < 0.2
     quaternions = a[0].joints.unflatten(-1, (2, 7))[..., 3:]
     torch.testing.assert_close(quaternions.norm(dim=-1), torch.ones(30, 2, dtype=torch.float64))
+
+
+def test_bounds_of_a_motion_follow_what_was_demonstrated():
+    model = bottle()
+    acceleration, jerk = demonstrated_peaks(bottle_demonstrations(), upper_body().joint_names)
+    assert torch.equal(model.acceleration_, acceleration) and torch.equal(model.jerk_, jerk)
+    bounds = model.motion_bounds(velocity=2.0)
+    assert torch.equal(bounds.acceleration, torch.clamp(3 * acceleration, min=8.0))
+    with pytest.raises(NotFittedError):
+        TaskParameterizedGMM().motion_bounds()
+
+
+def test_batches_tell_the_same_peaks():
+    shown = waves(4)
+    whole = canonical().fit(shown)
+    parts = canonical().fit([shown[:1], shown[1:]])
+    assert torch.equal(whole.acceleration_, parts.acceleration_)
+    assert torch.equal(whole.jerk_, parts.jerk_) and bool((whole.jerk_ > 0).all())

@@ -105,6 +105,16 @@ def test_a_robot_comes_back_with_its_model(tmp_path):
     assert TaskParameterizedGMM.load(str(tmp_path)).robot == small_bottle().robot
 
 
+def test_what_was_demonstrated_is_kept_and_models_that_do_not_know_it_load(saved, monkeypatch):
+    loaded = TaskParameterizedGMM.load(saved)
+    assert torch.equal(loaded.acceleration_, hands().acceleration_)
+    assert torch.equal(loaded.jerk_, hands().jerk_) and float(loaded.jerk_.max()) > 0
+    sealed(saved, monkeypatch, peaks=...)
+    older = TaskParameterizedGMM.load(saved)
+    assert older.acceleration_ is None and older.jerk_ is None
+    assert older.motion_bounds().acceleration.tolist() == [torch.inf] * 14
+
+
 def test_a_loaded_model_can_be_fitted_and_saved_again(saved, tmp_path):
     loaded = TaskParameterizedGMM.load(saved)
     assert_same(loaded.fit(handlings()), hands(), handlings()[:1])
@@ -328,6 +338,9 @@ def sealed(saved: Path, monkeypatch, **changes) -> None:
 @pytest.mark.parametrize(
     "changes",
     [
+        {"peaks": 7},
+        {"peaks": [[1.0], [1.0]]},
+        {"peaks": [[-1.0] * 14, [1.0] * 14]},
         {"operators": ...},
         {"operators": 7},
         {"operators": [7]},

@@ -9,9 +9,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.regression.regression import Estimate, Regression
 
 __all__ = ["Controller"]

@@ -1,7 +1,19 @@
-"""References that keep within limits, by what the Gaussian says of the other joints."""
+"""References that keep within limits, by what the Gaussian says of the other joints.
+
+The most likely joints within bounds are those of
+
+    minimise 1/2 (q - m)^T C^-1 (q - m)   such that   lower <= q <= upper,
+
+a convex problem. Where the joints A stand at their bounds ``b``, the conditional Gaussian
+``q = m + C_:A y`` with ``y = C_AA^-1 (b - m_A)`` solves it, and ``y`` is the gradient of the
+objective in A: the set A is the right one if no joint is beyond a bound, no joint at an upper
+bound has ``y > 0`` and none at a lower one ``y < 0``.
+"""
 
 from __future__ import annotations
 
+import daqp
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -9,20 +21,25 @@ from tpgmm_torch import gaussians
 
 __all__ = ["within"]
 
+#: How often all wrong joints are exchanged without a gain before one at a time is.
+PATIENCE = 5
+#: So many exchanges are enough but for covariances that rounding spoiled.
+MOST = 100
+
 
 def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """The mean, given that joints beyond a bound stand at it.
+    """The most likely joints within bounds: exact, for each robot of a batch.
 
     The other joints take over as the Gaussian says: clipping alone would move the hands away
-    from where they are wanted. A joint that is driven over a bound by that joins the ones that
-    stand, until none is left.
+    from where they are wanted.
 
     Parameters
     ----------
     mean : Tensor of shape (..., n_joints)
     covariance : Tensor of shape (..., n_joints, n_joints)
     lower, upper : Tensor of shape (..., n_joints)
-        The lowest and the highest joints allowed.
+        The lowest and the highest joints allowed; where they contradict each other, the joint
+        stands at the upper one.
 
     Returns
     -------
@@ -33,27 +50,105 @@ def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Te
     ------
     DataError
         If a covariance that is asked is singular.
+
+    References
+    ----------
+    Júdice, Pires: A block principal pivoting algorithm for large-scale strictly monotone linear
+    complementarity problems, Computers & Operations Research 21 (1994): what a batch runs.
+    Arnström, Bemporad, Axehill: A dual active-set solver for embedded quadratic programming
+    using recursive LDL^T updates, IEEE Transactions on Automatic Control 67 (2022): what one
+    robot runs.
     """
     kept = torch.clamp(mean, lower, upper)
     if torch.equal(kept, mean):
         return mean
-    lower, upper = lower.expand_as(mean), upper.expand_as(mean)
+    lower, upper = torch.minimum(lower, upper).expand_as(mean), upper.expand_as(mean)
     some = (kept != mean).any(-1)  # of a batch, only these robots
     means, lowers, uppers = mean[some], lower[some], upper[some]
-    precision = torch.cholesky_inverse(
-        gaussians.cholesky(covariance.expand(*mean.shape, -1)[some], "the product")
-    )
-    joints, standing = means, torch.zeros_like(means, dtype=torch.bool)
-    # bounds that contradict each other, of a robot that stands outside, end the loop too
-    while bool((beyond := ~standing & ((joints < lowers) | (joints > uppers))).any()):
-        standing = standing | beyond
-        limit = torch.clamp(joints, lowers, uppers)
-        # a joint that stands is known this many times better than the product knows it
-        weight = torch.where(standing, 1e10 * precision.diagonal(dim1=-2, dim2=-1), 0.0)
-        pull = (weight * (limit - means))[..., None]
-        factor = gaussians.cholesky(precision + torch.diag_embed(weight), "the product")
-        free = means + torch.cholesky_solve(pull, factor)[..., 0]
-        joints = torch.where(standing, limit, free)
+    covariances = covariance.expand(*mean.shape, -1)[some]
+    with torch.no_grad():
+        problem = means, covariances, lowers, uppers
+        alone = len(means) == 1 and mean.device.type == "cpu"
+        sides = _sides_of_one(*problem) if alone else None
+        sides = _sides(*problem) if sides is None else sides
+    joints, _ = _standing(means, covariances, lowers, uppers, sides)
     whole = mean.clone()
-    whole[some] = joints
+    whole[some] = torch.clamp(joints, lowers, uppers)  # but for rounding
     return whole
+
+
+def _standing(
+    mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor, sides: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The joints given those that stand, 1 at upper and -1 at lower bounds, and gradients."""
+    stands = sides != 0
+    bound = torch.where(sides > 0, upper, torch.where(stands, lower, mean))
+    identity = torch.eye(mean.shape[-1], dtype=torch.bool, device=mean.device)
+    both = stands.unsqueeze(-1) & stands.unsqueeze(-2)
+    block = torch.where(both, covariance, identity.to(mean))
+    factor = gaussians.cholesky(block, "the product")
+    gradient = torch.cholesky_solve((bound - mean).unsqueeze(-1), factor)
+    joints = mean + (covariance @ gradient).squeeze(-1)
+    return torch.where(stands, bound, joints), gradient.squeeze(-1)
+
+
+def _sides(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Which joints stand at which bound, by block principal pivoting.
+
+    All joints that are wrong change their state at once, as long as they become fewer; if they
+    do not for a while, one at a time does, which ends for every positive definite covariance.
+    """
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    tolerance = torch.finfo(mean.dtype).eps ** 0.6
+    index = torch.arange(1, mean.shape[-1] + 1, device=mean.device)
+    sides = torch.sign(mean - torch.clamp(mean, lower, upper))
+    sides = torch.where(lower == upper, 1.0, sides)
+    fewest = torch.full_like(mean[:, :1], torch.inf)
+    patience = torch.full_like(fewest, PATIENCE)
+    left = torch.arange(len(mean), device=mean.device)  # robots that are not done
+    for _ in range(MOST):
+        here = mean[left], covariance[left], lower[left], upper[left], sides[left]
+        joints, gradient = _standing(*here)
+        _, _, low, high, side = here
+        pull = side * gradient * deviation[left]  # positive: it would rather leave its bound
+        leaves = (pull > tolerance * pull.abs().amax(-1, keepdim=True)) & (low < high)
+        slack = tolerance * deviation[left]
+        beyond = (joints > high + slack).to(mean) - (joints < low - slack).to(mean)
+        wrong = leaves | ((side == 0) & (beyond != 0))
+        count = wrong.sum(-1, keepdim=True)
+        fewer = count < fewest[left]
+        fewest[left] = torch.where(fewer, count.to(fewest), fewest[left])
+        patience[left] = torch.where(fewer, PATIENCE, patience[left] - 1)
+        last = (index * wrong).amax(-1, keepdim=True) == index
+        wrong = wrong & (last | (patience[left] >= 0))
+        sides[left] = torch.where(wrong, torch.where(side == 0, beyond, 0.0), side)
+        left = left[count[:, 0] > 0]
+        if not len(left):
+            break
+    for row in left:  # by far the most need three exchanges
+        other = _sides_of_one(*(x[row : row + 1] for x in (mean, covariance, lower, upper)))
+        sides[row] = sides[row] if other is None else other[0]
+    return sides
+
+
+def _sides_of_one(
+    mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor
+) -> Tensor | None:
+    """The same for one robot, by a solver that needs a tenth of the time.
+
+    None if it finds no solution, or one that rounding spoiled.
+    """
+    m, c, low, high = (x[0].double().cpu().numpy() for x in (mean, covariance, lower, upper))
+    deviation = np.sqrt(np.diag(c))
+    try:
+        precision = np.linalg.inv(c / np.outer(deviation, deviation))
+    except np.linalg.LinAlgError:
+        return None
+    low, high = (low - m) / deviation, (high - m) / deviation
+    zero, none = np.zeros_like(m), np.zeros((0, len(m)))
+    solution, _, flag, info = daqp.solve(precision, zero, none, high, low, primal_tol=1e-11)
+    fits = (solution <= high + 1e-9) & (solution >= low - 1e-9)
+    if flag != 1 or not fits.all():
+        return None
+    # its multipliers are positive at upper bounds
+    return torch.from_numpy(np.sign(info["lam"]))[None].to(mean)

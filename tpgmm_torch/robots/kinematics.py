@@ -255,6 +255,10 @@ class Kinematics(abc.ABC):
     lower, upper, velocity : Tensor of shape (n_joints,)
         Limits of position and speed, infinite where unknown. Their dtype and device are
         those of the robot.
+    acceleration, jerk : Tensor of shape (n_joints,), optional
+        More limits of the same kind.
+    without_limits : tuple of str, default=()
+        Joints of which limits should be known and are not.
     quaternion_starts : tuple of int, default=()
         Where unit quaternions start in the joint vector; robots have none.
     lengths : tuple of int, default=()
@@ -282,6 +286,9 @@ class Kinematics(abc.ABC):
     lower: Tensor
     upper: Tensor
     velocity: Tensor
+    acceleration: Tensor | None = None
+    jerk: Tensor | None = None
+    without_limits: tuple[str, ...] = ()
     quaternion_starts: tuple[int, ...] = ()
     lengths: tuple[int, ...] = ()
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
@@ -137,8 +137,10 @@ class Robot(Kinematics):
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
-            limits = _limits(model, self.joint_names).to(**options)
-            self.lower, self.upper, self.velocity = limits
+            limits, self.without_limits = _limits(model, self.joint_names)
+            self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
+                **options
+            )
             self.forward_kinematics = TreeKinematics(tree, self.n_joints, **options)
 
     def state(self, joints: Any) -> RobotState:
@@ -303,9 +305,46 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
     return config["base"], [places[link] for link in config["links"]]
 
 
-def _limits(model: UrdfModel, names: Sequence[str]) -> Tensor:
-    """Rows lower, upper, velocity; infinite for coordinates without kinematics."""
-    free = (-math.inf, math.inf, math.inf)
-    joints = [model.joint.get(name) for name in names]
-    rows = [free if j is None else (j.lower, j.upper, j.velocity) for j in joints]
-    return torch.tensor(rows, dtype=torch.float64, device="cpu").reshape(-1, 3).T
+def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
+    """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
+
+    What mimics a joint moves with it, so that its limits are the joint's too. Limits that
+    leave the joint a single point, as where a sign was forgotten, are none. Coordinates without
+    kinematics have no limits, and lack none.
+    """
+    rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
+    for name in rows.keys() & model.joint.keys():
+        joint = model.joint[name]
+        rows[name] = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk]
+    without = {
+        name
+        for name in rows.keys() & model.joint.keys()
+        if math.isinf(rows[name][2])
+        or (model.joint[name].type != "continuous" and math.isinf(rows[name][1]))
+    }
+    for joint in model.joints:
+        if not joint.movable or joint.mimic is None:
+            continue
+        try:
+            leader = model.leader(joint.name)
+        except TPGMMError:  # told where it matters: to a link that depends on it
+            continue
+        if leader.joint not in rows or leader.multiplier == 0:
+            continue
+        row, factor = rows[leader.joint], leader.multiplier
+        ends = sorted((end - leader.offset) / factor for end in (joint.lower, joint.upper))
+        low, high = max(row[0], ends[0]), min(row[1], ends[1])
+        if low > high + 1e-9:
+            raise DataError(
+                f"the limits of joint {joint.name!r}, {joint.lower:g} to {joint.upper:g}, "
+                f"leave no room to {leader.joint!r}, which it mimics as {factor:g} * "
+                f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
+            )
+        if high - low < 1e-9 < row[1] - row[0]:
+            without.add(leader.joint)
+        else:
+            row[:2] = low, high
+        rates = joint.velocity, joint.acceleration, joint.jerk
+        row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
+    limits = torch.tensor(list(rows.values()), dtype=torch.float64, device="cpu")
+    return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)

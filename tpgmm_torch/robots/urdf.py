@@ -50,8 +50,9 @@ class UrdfJoint:
         Pose of the joint in its parent link.
     axis : ndarray of shape (3,)
         Unit vector in the frame of the joint.
-    lower, upper, velocity : float
-        Limits [rad or m, per second]; infinite where the description has none.
+    lower, upper, velocity, acceleration, jerk : float
+        Limits [rad or m, per s, s^2, s^3]; infinite where the description has none. That of
+        the deceleration is one of the acceleration too.
     mimic : Mimic or None
         What it follows.
     """
@@ -65,6 +66,8 @@ class UrdfJoint:
     lower: float = -math.inf
     upper: float = math.inf
     velocity: float = math.inf
+    acceleration: float = math.inf
+    jerk: float = math.inf
     mimic: Mimic | None = None
 
     @property
@@ -228,10 +231,9 @@ def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
     if largest == 0:
         raise DataError(f"joint {name!r} has the axis 0 0 0: it needs a direction")
     axis = axis / largest  # a direction alone: the square of a length may overflow
-    lower, upper, velocity = _limits(element, name, kind)
-    mimic = _mimic(element, name)
     axis = axis / np.linalg.norm(axis)
-    return UrdfJoint(name, kind, parent, child, origin, axis, lower, upper, velocity, mimic)
+    limits, mimic = _limits(element, name, kind), _mimic(element, name)
+    return UrdfJoint(name, kind, parent, child, origin, axis, *limits, mimic)
 
 
 def _end(element: ElementTree.Element, name: str, side: str) -> str:
@@ -293,7 +295,10 @@ def placement(xyz: Array, rpy: Array) -> Array:
     return matrix
 
 
-def _limits(element: ElementTree.Element, name: str, kind: str) -> tuple[float, float, float]:
+def _limits(
+    element: ElementTree.Element, name: str, kind: str
+) -> tuple[float, float, float, float, float]:
+    """Lower, upper, velocity, acceleration, jerk."""
     limit = element.find("limit")
     lower, upper = -math.inf, math.inf
     # a <limit> that gives only effort and velocity says nothing about the range
@@ -301,15 +306,20 @@ def _limits(element: ElementTree.Element, name: str, kind: str) -> tuple[float, 
     if ranged and kind != "continuous":
         [lower] = _numbers(element, name, "limit", "lower", (0.0,)).tolist()
         [upper] = _numbers(element, name, "limit", "upper", (0.0,)).tolist()
-    velocity = math.inf
-    if limit is not None and "velocity" in limit.attrib:
-        [velocity] = _numbers(element, name, "limit", "velocity", (0.0,)).tolist()
-    if lower > upper or velocity < 0:
+    rates = dict.fromkeys(("velocity", "acceleration", "deceleration", "jerk"), math.inf)
+    for rate in rates:
+        if limit is not None and rate in limit.attrib:
+            [rates[rate]] = _numbers(element, name, "limit", rate, (0.0,)).tolist()
+    if lower > upper or min(rates.values()) < 0:
         raise DataError(
             f"joint {name!r} has the limits lower={lower:g}, upper={upper:g}, "
-            f"velocity={velocity:g}: lower must not exceed upper, velocity not be negative"
+            + ", ".join(
+                f"{rate}={value:g}" for rate, value in rates.items() if value < math.inf
+            )
+            + ": lower must not exceed upper, the others not be negative"
         )
-    return lower, upper, velocity
+    acceleration = min(rates["acceleration"], rates.pop("deceleration"))
+    return lower, upper, rates["velocity"], acceleration, rates["jerk"]
 
 
 def _mimic(element: ElementTree.Element, name: str) -> Mimic | None:

@@ -27,7 +27,7 @@ from tpgmm_torch import (
     Trajectory,
     quaternions,
 )
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["TASK", "BottleShaking", "upper_body"]
 

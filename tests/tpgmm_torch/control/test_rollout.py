@@ -10,8 +10,8 @@ from torch import Tensor
 from tests.support.mixtures import CASES, Case, Problem, assert_close
 from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
 from tpgmm_torch.control.rollout import rollout
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.regression.regression import Regression
 
 NAMES = ["the paper's", "poses in two frames"]

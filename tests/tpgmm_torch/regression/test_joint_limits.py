@@ -1,9 +1,136 @@
-"""Joints at a bound stand, and the others take over as the Gaussian says."""
+"""The most likely joints within bounds: exact, by two methods that are tested on each other."""
 
 import pytest
 import torch
 
 from tests.support.mixtures import CASES, Problem, assert_close, times
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression import joint_limits
+from tpgmm_torch.regression.joint_limits import within
+
+
+def problems(count, n, seed=0, spread=1e-4):
+    """Gaussians of random directions, whose variances differ by that factor, and bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    options = {"dtype": torch.float64, "generator": generator}
+    turn = torch.linalg.qr(torch.randn(count, n, n, **options))[0]
+    variance = torch.rand(count, n, **options) * torch.logspace(0, -1, n).double()
+    variance = variance.clamp(min=spread)
+    covariance = (turn * variance.unsqueeze(-2)) @ turn.mT
+    mean = torch.randn(count, n, **options)
+    return mean, covariance, -torch.rand(count, n, **options), torch.rand(count, n, **options)
+
+
+def assert_optimal(joints, mean, covariance, lower, upper):
+    """The conditions of Karush, Kuhn and Tucker, in units of standard deviations."""
+    deviation = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    gradient = torch.linalg.solve(covariance, joints - mean) * deviation
+    tolerance = 1e-7 * gradient.abs().amax(-1, keepdim=True).clamp(min=1)
+    assert bool(((joints >= lower) & (joints <= upper)).all())
+    assert bool((gradient <= tolerance)[joints > lower].all())
+    assert bool((gradient >= -tolerance)[joints < upper].all())
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 17])
+def test_a_batch_and_each_robot_of_it_find_the_minimum(n):
+    mean, covariance, lower, upper = problems(40, n)
+    together = within(mean, covariance, lower, upper)
+    assert_optimal(together, mean, covariance, lower, upper)
+    for one, *problem in zip(together, mean, covariance, lower, upper, strict=True):
+        assert_close(within(*problem), one, 1e-9)
+
+
+@pytest.mark.parametrize("without", ["_sides", "_sides_of_one"])
+def test_each_method_finds_it_alone(without, monkeypatch):
+    """The solver of one robot, and block pivoting, which needs no other."""
+    mean, covariance, lower, upper = (x[:1] for x in problems(1, 17, seed=5))
+    both = within(mean, covariance, lower, upper)
+
+    def refuse(*_):
+        assert without == "_sides_of_one", "the solver of one robot failed"
+
+    monkeypatch.setattr(joint_limits, without, refuse)
+    alone = within(mean, covariance, lower, upper)
+    assert_close(alone, both, 1e-9)
+    assert_optimal(alone, mean, covariance, lower, upper)
+
+
+def test_pivoting_that_does_not_end_asks_the_other_method(monkeypatch):
+    monkeypatch.setattr(joint_limits, "MOST", 1)
+    problem = problems(20, 12, seed=2)
+    assert_optimal(within(*problem), *problem)
+
+
+def test_exchanging_all_wrong_joints_may_circle_and_one_at_a_time_ends(monkeypatch):
+    monkeypatch.setattr(joint_limits, "_sides_of_one", lambda *_: None)
+    # one of 300 that circles
+    problem = tuple(x[25:26] for x in problems(300, 3, seed=8))
+    assert_optimal(within(*problem), *problem)
+    monkeypatch.setattr(joint_limits, "PATIENCE", 10**9)
+    with pytest.raises(AssertionError):
+        assert_optimal(within(*problem), *problem)
+
+
+def test_joints_without_room_stand():
+    mean, covariance, lower, upper = problems(20, 6, seed=3)
+    lower[:, 0] = upper[:, 0]
+    lower[10:, 3], upper[:, 5] = -torch.inf, torch.inf
+    joints = within(mean, covariance, lower, upper)
+    assert torch.equal(joints[:, 0], upper[:, 0])
+    free = torch.ones(6, dtype=torch.bool)
+    free[0] = False
+    # the others as the conditional Gaussian says, within their own bounds
+    gain = covariance[:, free][:, :, ~free] / covariance[:, ~free][:, :, ~free]
+    rest = mean[:, free] + (gain @ (upper - mean)[:, :1, None])[..., 0]
+    left = covariance[:, free][:, :, free] - gain @ covariance[:, ~free][:, :, free]
+    assert_close(joints[:, free], within(rest, left, lower[:, free], upper[:, free]), 1e-8)
+    for row in (0, 15):
+        alone = within(mean[row], covariance[row], lower[row], upper[row])
+        assert_close(alone, joints[row], 1e-9)
+
+
+def test_contradicting_bounds_hold_the_upper_one():
+    mean, covariance, lower, upper = problems(2, 5, seed=4)
+    lower[:, 2] = upper[:, 2] + 1
+    joints = within(mean, covariance, lower, upper)
+    assert torch.equal(joints[:, 2], upper[:, 2])
+    assert_close(within(mean[1], covariance[1], lower[1], upper[1]), joints[1], 1e-9)
+
+
+def test_inside_nothing_is_asked():
+    mean, covariance, _, _ = problems(3, 4)
+    assert within(mean, covariance * torch.nan, mean, mean + 1) is mean
+
+
+def test_the_robots_inside_keep_their_numbers():
+    mean, covariance, lower, upper = problems(4, 5, seed=6)
+    lower[1], upper[1] = mean[1] - 1e-9, mean[1] + 1e-9
+    assert torch.equal(within(mean, covariance, lower, upper)[1], mean[1])
+
+
+def test_a_singular_covariance_is_refused():
+    mean = torch.ones(2, 3, dtype=torch.float64)
+    with pytest.raises(DataError, match="the product is not positive definite"):
+        within(mean, torch.zeros(2, 3, 3).double(), -mean, 0.5 * mean)
+
+
+def test_the_minimum_is_differentiable():
+    mean, covariance, lower, upper = problems(3, 4, seed=7)
+    assert bool((within(mean, covariance, lower, upper) != mean).any(-1).all())
+
+    def bounded(mean, factor):
+        return within(mean, factor @ factor.mT, lower, upper)
+
+    factor = torch.linalg.cholesky(covariance)
+    assert torch.autograd.gradcheck(bounded, (mean.requires_grad_(), factor.requires_grad_()))
+
+
+def test_single_precision_finds_it_too():
+    mean, covariance, lower, upper = problems(20, 6, spread=1e-2)
+    exact = within(mean, covariance, lower, upper)
+    rough = within(*(x.float() for x in (mean, covariance, lower, upper)))
+    assert rough.dtype == torch.float32
+    assert_close(rough.double(), exact, 1e-3)
 
 
 def test_inside_its_bounds_a_step_is_what_it_was():
@@ -15,22 +142,10 @@ def test_inside_its_bounds_a_step_is_what_it_was():
 
 
 @pytest.mark.parametrize("width", [0.01, 0.1])
-def test_joints_at_a_bound_stand_and_the_others_take_over(width):
+def test_of_a_step_the_other_joints_take_over(width):
     problem = Problem.of(CASES["the paper's"], 3, 2)
     now = times(2), problem.state, problem.frames
     plain = problem.regression().step(*now)
     lower, upper = problem.state.joints - width, problem.state.joints + width
     bounded = problem.regression().step(*now, bounds=(lower, upper)).joints
-    assert bool(((bounded >= lower) & (bounded <= upper)).all())
-    for index in range(2):
-        mean, covariance = plain.joints[index], plain.covariance[index]
-        low, high = lower[index], upper[index]
-        joints, stands = mean.clone(), torch.zeros(17, dtype=torch.bool)
-        while bool((beyond := ((joints < low) | (joints > high)) & ~stands).any()):
-            joints = torch.where(beyond, joints.clamp(low, high), joints)
-            stands |= beyond
-            inverse = torch.linalg.inv(covariance[stands][:, stands])
-            gain = covariance[~stands][:, stands] @ inverse
-            joints[~stands] = mean[~stands] + gain @ (joints[stands] - mean[stands])
-        assert int(stands.sum()) > 0
-        assert_close(bounded[index], joints, 1e-6)
+    assert_optimal(bounded, plain.joints, plain.covariance, lower, upper)

@@ -254,8 +254,36 @@ class TestSettings:
     def test_limits_are_those_of_the_description(self) -> None:
         robot = zoo()
         assert robot.lower.tolist() == [-0.1, -math.inf, -1, 0, -1]
-        assert robot.upper.tolist() == [0.5, math.inf, 2, 0.1, 1]
-        assert robot.velocity.tolist() == [0.2, math.inf, 3, 1, 1]
+        # the elbow leads wag_too, 0.5 * elbow + 0.2, which goes to 1 at 1 rad/s
+        assert robot.upper.tolist() == [0.5, math.inf, 1.6, 0.1, 1]
+        assert robot.velocity.tolist() == [0.2, math.inf, 2, 1, 1]
+        assert robot.acceleration.tolist() == robot.jerk.tolist() == [math.inf] * 5
+        assert robot.without_limits == ("swivel",)  # endless, but not endlessly fast
+
+    def test_what_mimics_a_joint_limits_it(self) -> None:
+        limit = '<limit lower="0" upper="0.1" effort="1" velocity="1"/>'
+        richer = limit.replace('velocity="1"', 'velocity="1" acceleration="8" jerk="90"')
+        # grip_too = 0.01 - grip, within 0 and 0.1
+        text = ZOO.replace('<limit lower="-1" upper="1" effort="1" velocity="1"/>', richer, 1)
+        robot = Robot.from_urdf(text, ("flange",))
+        assert (robot.lower[3], robot.upper[3]) == (0, pytest.approx(0.01))
+        assert robot.acceleration.tolist()[3:] == [8, math.inf]
+        assert robot.jerk.tolist()[3:] == [90, math.inf]
+        assert robot.to(torch.float32).acceleration.dtype == torch.float32
+
+    def test_what_mimics_a_joint_and_leaves_it_no_room_is_refused(self) -> None:
+        text = ZOO.replace('offset="0.01"', 'offset="3"')
+        with pytest.raises(DataError, match=r"'grip_too', -1 to 1, leave no room to 'grip'"):
+            Robot.from_urdf(text, ("flange",))
+        # it limits no robot whose joint vector leaves the leader out
+        assert Robot.from_urdf(text, ("flange",), joints=["elbow"]).n_joints == 1
+
+    def test_a_forgotten_sign_is_told_and_does_not_hold_the_joint(self) -> None:
+        limit = '<limit lower="0" upper="0.1" effort="1" velocity="1"/>'
+        text = ZOO.replace('<limit lower="-1" upper="1" effort="1" velocity="1"/>', limit, 1)
+        robot = Robot.from_urdf(text.replace('offset="0.01"', ""), ("flange",))
+        assert (robot.lower[3], robot.upper[3]) == (0, 0.1)
+        assert robot.without_limits == ("swivel", "grip")
 
     def test_a_floating_base_is_no_obstacle_beyond_the_base(self) -> None:
         text = ZOO.replace("</robot>", "") + (

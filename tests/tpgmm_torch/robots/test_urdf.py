@@ -46,6 +46,12 @@ class TestReading:
         (j,) = read_urdf(one('<limit upper="2" effort="1" velocity="3"/>')).joints
         assert (j.lower, j.upper, j.velocity) == (0, 2, 3)
 
+    def test_limits_of_later_versions_are_read(self) -> None:
+        (j,) = read_urdf(one('<limit acceleration="5" deceleration="4" jerk="60"/>')).joints
+        assert (j.velocity, j.acceleration, j.jerk) == (math.inf, 4, 60)
+        (j,) = read_urdf(one('<limit velocity="1" acceleration="5"/>')).joints
+        assert (j.velocity, j.acceleration, j.jerk) == (1, 5, math.inf)
+
     def test_continuous_joints_have_no_range(self) -> None:
         (j,) = read_urdf(one('<limit lower="-1" upper="1" velocity="3"/>', "continuous")).joints
         assert (j.lower, j.upper, j.velocity) == (-math.inf, math.inf, 3)
@@ -135,6 +141,8 @@ class TestRefusing:
             (one('<limit lower="low" upper="1"/>'), "<limit lower> needs 1 finite"),
             (one('<limit lower="2" upper="1"/>'), "lower=2, upper=1"),
             (one('<limit velocity="-1"/>'), "velocity=-1"),
+            (one('<limit acceleration="-2"/>'), "upper=inf, acceleration=-2: lower"),
+            (one('<limit jerk="x"/>'), "<limit jerk> needs 1 finite"),
             (one("<mimic/>"), "<mimic> does not name a joint"),
             (one('<mimic joint="j" offset="x"/>'), "<mimic offset>"),
             (

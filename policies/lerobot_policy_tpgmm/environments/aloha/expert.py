@@ -19,9 +19,9 @@ from torch import Tensor
 
 from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS, SIDES, aloha_robot
 from tpgmm_torch import Frame, Robot, quaternions
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["AlohaExpert", "WayPoint"]
 

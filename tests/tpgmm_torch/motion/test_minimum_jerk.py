@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tests.support.mixtures import assert_close
-from tpgmm_torch.control.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 
 def test_minimum_jerk_goes_from_zero_to_one():

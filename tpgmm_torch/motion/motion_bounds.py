@@ -1,0 +1,268 @@
+"""Bounds on a motion: position, speed, acceleration and jerk of each joint.
+
+Limits of position and speed are the robot's; accelerations are seldom written down. What was
+demonstrated can be done, so its peaks, with a margin, bound what is not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.arrays import Array, as_array, as_tensor
+from tpgmm_torch.exceptions import (
+    DataError,
+    MissingLimitsWarning,
+    ShapeError,
+    UnknownNameError,
+)
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["MotionBounds"]
+
+#: Accelerations and jerks may be this many times those that were demonstrated.
+MARGIN = 3.0
+#: Seconds in which every joint may reach its speed limit: those that demonstrations moved
+#: little, and those of which none tell.
+SLOW, UNTOLD = 0.25, 0.1
+#: Seconds in which every joint may reach its greatest acceleration.
+ONSET = 0.025
+#: What rounding may add to a bound, as a share of it.
+ROUNDING = 1e-9
+#: Seconds or metres that are longer than any motion.
+LONG = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class LimitArrays:
+    """The same as arrays, and what every tick asks of them.
+
+    Parameters
+    ----------
+    lower, upper, velocity, acceleration, jerk : ndarray of shape (n_joints,)
+        The bounds, with room for rounding in the acceleration and the jerk.
+    half_over_jerk : ndarray of shape (n_joints,)
+        ``1 / 2J``: an acceleration a that is given up as fast as can be adds ``a^2 / 2J`` to
+        the speed.
+    stopping_time, stopping_distance : ndarray of shape (n_joints,)
+        A motion that reaches the speed v at most is stopped within
+        ``v * stopping_time + stopping_distance``.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    half_over_jerk: Array
+    stopping_time: Array
+    stopping_distance: Array
+
+    @cached_property
+    def rows(self) -> Array:
+        """Acceleration, jerk, velocity, upper and minus lower, (5, n_joints)."""
+        return np.stack([self.acceleration, self.jerk, self.velocity, self.upper, -self.lower])
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBounds:
+    """What every tick of a motion keeps within; made by :meth:`of`.
+
+    Parameters
+    ----------
+    lower, upper : Tensor of shape (n_joints,)
+        Positions [rad or m]; infinite where there is no limit, as in the others.
+    velocity, acceleration, jerk : Tensor of shape (n_joints,)
+        Greatest absolute values [rad/s, rad/s^2, rad/s^3, or m].
+
+    Raises
+    ------
+    ShapeError, DataError
+        If they differ in shape, contradict each other, or leave no room to move.
+
+    Examples
+    --------
+    >>> from tpgmm_torch.robots.joint_space import JointSpace
+    >>> bounds = MotionBounds.of(JointSpace(["a", "b"]), velocity=2.0, acceleration={"b": 8.0})
+    >>> bounds.acceleration.tolist()
+    [20.0, 8.0]
+    """
+
+    lower: Tensor
+    upper: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    jerk: Tensor
+
+    def __post_init__(self) -> None:
+        named = {field.name: getattr(self, field.name) for field in fields(self)}
+        for name, value in named.items():
+            if value.shape != self.lower.shape or value.ndim != 1:
+                raise ShapeError(
+                    f"bounds are one number for each joint: {name} has shape "
+                    f"{tuple(value.shape)}, lower has {tuple(self.lower.shape)}"
+                )
+        _refuse(~(self.lower <= self.upper), "lower must not exceed upper", self)
+        for name in ("velocity", "acceleration", "jerk"):
+            _refuse(~(named[name] > 0), f"{name} must be greater than 0", self)
+
+    @classmethod
+    def of(
+        cls,
+        kinematics: Kinematics,
+        demonstrated: tuple[Tensor, Tensor] | None = None,
+        **given: Any,
+    ) -> Self:
+        """Bounds of a robot, of what was demonstrated, and of the user.
+
+        Accelerations and jerks that neither the user nor the description of the robot gives
+        are three times those demonstrated, and let every joint reach its speed limit in
+        0.25 s; without demonstrations, in 0.1 s. Every joint may reach its greatest
+        acceleration in 0.025 s.
+
+        Parameters
+        ----------
+        kinematics : Kinematics
+        demonstrated : tuple of two Tensor of shape (n_joints,), optional
+            Peaks of acceleration and jerk, of
+            :func:`~tpgmm_torch.motion.demonstrated_peaks.demonstrated_peaks`.
+        **given : float, array-like of shape (n_joints,) or mapping of str to float
+            ``lower``, ``upper``, ``velocity``, ``acceleration``, ``jerk``: for all joints, for
+            each, or for some by name. They may be tighter than the robot's own, not wider.
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError
+            If they are no numbers for these joints, or contradict the robot or each other.
+
+        Warns
+        -----
+        MissingLimitsWarning
+            If the description of the robot lacks limits of position or speed that are not
+            given either.
+        """
+        names = kinematics.joint_names
+        known = {field.name for field in fields(cls)}
+        for name in given:
+            if name not in known:
+                raise UnknownNameError("bound", name, "the bounds of a motion", known)
+        endless = torch.full_like(kinematics.lower, torch.inf, dtype=torch.float64)
+        values = {name: getattr(kinematics, name) for name in sorted(known)}
+        own = {n: (endless if v is None else v).double() for n, v in values.items()}
+        bound = {
+            name: _tightened(name, value, given.get(name), names) for name, value in own.items()
+        }
+        named = [
+            bound[key].isfinite() for key in ("lower", "upper", "velocity") if key in given
+        ]
+        told = torch.stack(named).all(0) if named else endless.isfinite()
+        missing = [
+            name
+            for name, known in zip(names, told, strict=True)
+            if name in kinematics.without_limits and not known
+        ]
+        if missing:
+            warnings.warn(
+                "the description of the robot has no limits of position or speed, or none that "
+                f"fit together, of the joints {missing}: complete the URDF, or give lower, "
+                "upper and velocity",
+                MissingLimitsWarning,
+                stacklevel=2,
+            )
+        acceleration = bound["velocity"] / (UNTOLD if demonstrated is None else SLOW)
+        jerk = torch.zeros_like(acceleration)
+        if demonstrated is not None:
+            peaks, jerks = (
+                as_tensor(x, "demonstrated peaks").to(endless) for x in demonstrated
+            )
+            for found in (peaks, jerks):
+                if found.shape != endless.shape:
+                    raise ShapeError(
+                        f"demonstrated peaks have shape ({len(names)},), got "
+                        f"{tuple(found.shape)}"
+                    )
+            # of a joint without limit of speed, what was demonstrated is all that is known
+            unknown = torch.isinf(acceleration) & (peaks > 0)
+            slow = torch.where(unknown, 0.0, acceleration)
+            acceleration, jerk = torch.maximum(slow, MARGIN * peaks), MARGIN * jerks
+        told = torch.isfinite(bound["acceleration"])
+        bound["acceleration"] = torch.where(told, bound["acceleration"], acceleration)
+        jerk = torch.maximum(jerk, bound["acceleration"] / ONSET)
+        told = torch.isfinite(bound["jerk"])
+        bound["jerk"] = torch.where(told, bound["jerk"], jerk)
+        return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
+
+    @cached_property
+    def arrays(self) -> LimitArrays:
+        """The same as arrays of numpy, and constants for a quick look."""
+        values = (getattr(self, field.name) for field in fields(self))
+        lower, upper, velocity, acceleration, jerk = map(as_array, values)
+        with np.errstate(invalid="ignore", over="ignore"):
+            ramp = np.where(np.isinf(jerk), 0.0, acceleration / jerk)
+            brake = np.where(np.isinf(acceleration), 0.0, velocity / (2 * acceleration))
+            distance = acceleration * ramp * ramp / 3
+            stopping = 1.5 * ramp + brake
+        # nothing is in the way of a joint without limits of position; infinite times a speed
+        # of 0 would be no number
+        bounded = np.isfinite(lower) | np.isfinite(upper)
+        stopping, distance = (
+            np.where(bounded, np.nan_to_num(x, nan=LONG, posinf=LONG), 0.0)
+            for x in (stopping, distance)
+        )
+        room = 1 + ROUNDING
+        return LimitArrays(
+            lower, upper, velocity, acceleration * room, jerk * room, 0.5 / jerk, stopping,
+            distance,
+        )  # fmt: skip
+
+
+def _tightened(name: str, own: Tensor, given: Any, joints: tuple[str, ...]) -> Tensor:
+    """The robot's own bound and the user's."""
+    if given is None:
+        return own
+    if isinstance(given, Mapping):
+        for joint in given:
+            if joint not in joints:
+                raise UnknownNameError("joint", joint, "the robot", joints)
+        values = own.clone()
+        for joint, value in given.items():
+            values[joints.index(joint)] = as_tensor(value, f"{name} of {joint!r}")
+    else:
+        values = as_tensor(given, name).to(own)
+        if values.shape not in ((), own.shape):
+            raise ShapeError(
+                f"{name} is one number or one for each of the {len(joints)} joints, got shape "
+                f"{tuple(values.shape)}"
+            )
+        values = values.expand_as(own)
+    wider = values < own if name == "lower" else values > own
+    if bool(wider.any()):
+        listed = [
+            f"{joint} {values[i]:g} (robot: {own[i]:g})"
+            for i, joint in enumerate(joints)
+            if wider[i]
+        ]
+        raise DataError(
+            f"{name} is wider than the robot's own limit: {', '.join(listed)}; give a tighter "
+            "one, or correct the description of the robot"
+        )
+    return values
+
+
+def _refuse(wrong: Tensor, rule: str, bounds: MotionBounds) -> None:
+    if bool(wrong.any()):
+        index = int(torch.nonzero(wrong)[0])
+        values = ", ".join(
+            f"{field.name}={getattr(bounds, field.name)[index]:g}" for field in fields(bounds)
+        )
+        raise DataError(
+            f"bounds contradict each other, {rule}: joint {index} ({int(wrong.sum())} of "
+            f"{len(wrong)}) has {values}"
+        )
