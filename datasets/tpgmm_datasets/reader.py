@@ -12,10 +12,11 @@ from typing import Any
 from tpgmm_datasets.conversion.assembly import Assembly, EventSource, FrameSource, frame_sources
 from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError, summed_up
+from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
-from tpgmm_datasets.lerobot.layout import Episode, Layout, open_layout
-from tpgmm_datasets.units import Units
+from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
+from tpgmm_datasets.units import Unit, Units
 from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
@@ -70,6 +71,7 @@ def open_recording(
     joints: str | None = None,
     joint_names: Mapping[str, str] | Sequence[str] | None = None,
     units: Units = "auto",
+    calibration: Calibration | None = None,
     frames: Mapping[str, FrameSource] | None = None,
     events: Mapping[str, EventSource] | None = None,
     episodes: slice | Sequence[int] | str | None = None,
@@ -81,7 +83,9 @@ def open_recording(
 
     Parameters
     ----------
-    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
+    path, robot, joints, joint_names, units, calibration, frames, events, episodes
+        As for :func:`load_lerobot`.
+    rate, trim, relax
         As for :func:`load_lerobot`.
 
     Raises
@@ -94,7 +98,9 @@ def open_recording(
     for problem in layout.problems:
         policy(problem)
     policy.warn()
-    feature = layout.feature(joints or joint_feature(layout))
+    feature = layout.feature(joint_feature(layout, joints))
+    if calibration is not None:
+        units = _calibrated(feature, calibration, joint_names, units)
     assembly = Assembly(
         layout,
         JointColumns.choose(feature, joint_names, units, robot),
@@ -105,6 +111,29 @@ def open_recording(
         trim,
     )
     return Recording(tuple(select_episodes(layout, episodes)), assembly, policy.names)
+
+
+def _calibrated(
+    feature: Feature,
+    calibration: Calibration,
+    joint_names: Mapping[str, str] | Sequence[str] | None,
+    units: Units,
+) -> Units:
+    """Units by name: those that are given, else those of the calibration."""
+    if not isinstance(units, Mapping) and units != "auto":
+        raise DatasetError(
+            f"units={units!r} is for all values, and so is a calibration: give one of them, or "
+            "units by name"
+        )
+    listed = joint_names if isinstance(joint_names, Sequence) else None
+    names = feature.names or (None if listed is None else tuple(listed))
+    if names is None:
+        raise DatasetError(
+            "the metadata do not name the values: a calibration needs joint_names=[...]",
+            column=feature.key,
+        )
+    by_name: dict[str, Unit] = {**calibrated_units(calibration, names)}
+    return by_name | dict(units) if isinstance(units, Mapping) else by_name
 
 
 def select_episodes(
@@ -179,8 +208,9 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         of the set that are none of its joints are left out. Without a robot all values are
         taken.
     joints : str, optional
-        The feature that holds the joints; the default is the first of
-        ``observation.state``, ``state``, ``action`` and their variants.
+        The feature that holds the joints, or ``"measured"`` (``observation.state``, ``state``
+        and their variants) or ``"commanded"`` (``action``). The default is what was measured,
+        else what was commanded. Measured joints lag behind commanded ones.
     joint_names : mapping or sequence of str, optional
         Names instead of the data set's: all of them in order, or name in the set to name of
         the robot's joint for those that differ.
@@ -188,6 +218,11 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is) or a
         :class:`Scale`, for all values or by name. ``"auto"`` believes the metadata, else
         assumes radians and refuses what cannot be radians.
+    calibration : str, Path or mapping of str to these, optional
+        LeRobot's calibration file of the robot, for values from -100 to 100 (grippers: 0 to
+        100): they become radians from the middle of each motor's range. Of several arms,
+        files by prefix of the names, ``{"left_": ..., "right_": ...}``. ``units`` given by
+        name come first.
     frames : mapping of str to str, FramePose, LinkPose or Frame, optional
         Where the pose of each frame is: in a feature (its name alone stands for x y z and a
         quaternion w x y z, constant from the first row on; if the feature names the poses
@@ -240,7 +275,9 @@ def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
 
     Parameters
     ----------
-    path, robot, joints, joint_names, units, frames, events, episodes, rate, trim, relax
+    path, robot, joints, joint_names, units, calibration, frames, events, episodes
+        As for :func:`load_lerobot`.
+    rate, trim, relax
         As for :func:`load_lerobot`.
 
     Yields

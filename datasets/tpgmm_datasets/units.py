@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,8 @@ class Scale:
         Radians (or metres) per stored unit.
     offset : float, default=0
         Radians (or metres) where the stored value is zero.
+    stored : tuple of float, optional
+        The least and the largest stored value; those beyond are refused.
 
     Examples
     --------
@@ -46,6 +48,7 @@ class Scale:
 
     factor: float
     offset: float = 0.0
+    stored: tuple[float, float] | None = field(default=None, repr=False, compare=False)
 
     @classmethod
     def between(cls, stored: tuple[float, float], actual: tuple[float, float]) -> Scale:
@@ -85,7 +88,8 @@ class Scale:
         middle = (range_min + range_max) / 2 if zero is None else zero
         angle = cls.ticks(per_turn, middle)
         ends = [tick * angle.factor + angle.offset for tick in (range_min, range_max)]
-        return cls.between(stored, (ends[0], ends[1]))
+        scale = cls.between(stored, (ends[0], ends[1]))
+        return cls(scale.factor, scale.offset, (min(stored), max(stored)))
 
 
 #: Units that can be named; "raw" says that the values are to be taken as they are.
@@ -107,6 +111,8 @@ Units = Unit | Mapping[str, Unit]
 #: No joint is turned further than this [rad], and hardly any recording in degrees or
 #: normalised units stays below.
 LARGEST_ANGLE = 4 * math.pi
+#: Values that are normalised end at 100 up to this.
+ROUNDING = 0.5
 
 
 def guess_unit(lowest: float, highest: float) -> str:
@@ -162,6 +168,16 @@ def convert(
     scales = [as_scale(unit, column) for unit in units]
     if "auto" in units:
         _check_angles(values, names, units, column, where)
+    for i, (name, scale) in enumerate(zip(names, scales, strict=True)):
+        low, high = scale.stored or (-math.inf, math.inf)
+        if values[:, i].min() < low - ROUNDING or values[:, i].max() > high + ROUNDING:
+            raise DatasetError(
+                f"{name!r} goes from {values[:, i].min():.4g} to {values[:, i].max():.4g}, but "
+                f"is to be normalised to {low:g} ... {high:g}: was it recorded in degrees "
+                "(use_degrees)? Then units='deg', without a calibration",
+                column=column,
+                **where,
+            )
     converted: Array = values.astype(np.float64)
     if any(scale != NAMED["raw"] for scale in scales):
         converted = converted * [s.factor for s in scales] + [s.offset for s in scales]

@@ -55,14 +55,16 @@ Units = Annotated[
     list[str] | None,
     of_data(
         "Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them, "
-        "repeatable. Default: as the set declares.",
+        "repeatable. FILE.json is LeRobot's calibration, with PREFIX= of one arm. Default: as "
+        "the set declares.",
         metavar="[JOINT=]UNIT",
     ),
 ]
 Joints = Annotated[
     str | None,
     of_data(
-        "The feature that holds the joints; default observation.state or the like.",
+        "The feature that holds the joints, or 'measured' or 'commanded'; default "
+        "observation.state or the like.",
         metavar="FEATURE",
     ),
 ]

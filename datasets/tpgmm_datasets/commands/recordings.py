@@ -60,7 +60,7 @@ class Recordings(plugins.Recordings):
             "robot": robot,
             "frames": parse_frames(frames or ()),
             "episodes": parse_episodes(episodes),
-            "units": parse_units(units or ()),
+            **parse_units(units or ()),
             "joints": joints,
             "rate": rate,
         }
@@ -126,18 +126,23 @@ def parse_episodes(text: str | None) -> slice | list[int] | str | None:
     return text
 
 
-def parse_units(texts: Sequence[str]) -> Any:
-    """What ``load_lerobot`` takes as ``units``: one for all, or any number of ``JOINT=UNIT``.
+def parse_units(texts: Sequence[str]) -> dict[str, Any]:
+    """What ``load_lerobot`` takes as ``units`` and ``calibration``.
 
-    A DataError is raised if both are given, or several for all.
+    The texts are one unit for all, or any number of ``JOINT=UNIT``; and ``FILE.json`` or
+    ``PREFIX=FILE.json`` for LeRobot's calibration. A DataError says so of any other.
     """
     from tpgmm_torch.exceptions import DataError
 
-    pairs = [text.rpartition("=") for text in texts]
-    if not pairs:
-        return "auto"
-    if len(pairs) == 1 and not pairs[0][1]:
-        return pairs[0][2]
-    if not all(name and unit for name, _, unit in pairs):
+    pairs = [(name, unit) for name, _, unit in (text.rpartition("=") for text in texts)]
+    calibration = {name: unit for name, unit in pairs if unit.endswith(".json")}
+    named = {name: unit for name, unit in pairs if not unit.endswith(".json")}
+    wrong = [text for text in texts if text.startswith("=") or text.endswith("=")]
+    if wrong or len(calibration) + len(named) < len(pairs):
         raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
-    return {name: unit for name, _, unit in pairs}
+    units: Any = named or "auto"
+    if "" in named:
+        units = named[""]
+        if len(named) > 1:
+            raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
+    return {"units": units, "calibration": calibration or None}

@@ -18,14 +18,9 @@ __all__ = ["JointColumns", "joint_feature"]
 Names = Mapping[str, str] | Sequence[str]
 
 #: Where the joints are, in order of preference.
-JOINT_FEATURES = (
-    "observation.state",
-    "observation.states",
-    "state",
-    "observation.qpos",
-    "action",
-    "actions",
-)
+MEASURED = ("observation.state", "observation.states", "state", "observation.qpos")
+COMMANDED = ("action", "actions")
+JOINT_FEATURES = (*MEASURED, *COMMANDED)
 
 
 @dataclass(frozen=True)
@@ -66,19 +61,30 @@ class JointColumns:
         return convert(stored, called, self.units, self.feature.key, **where)
 
 
-def joint_feature(layout: Layout) -> str:
-    """The feature that most likely holds the joints.
+def joint_feature(layout: Layout, joints: str | None = None) -> str:
+    """The feature that holds the joints.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of the data set.
+    joints : str, optional
+        Its name; ``"measured"`` or ``"commanded"`` for the usual one of states or of actions.
+        The default is the first that there is of both.
 
     Raises
     ------
     DatasetError
         If there is no usual one.
     """
-    for key in JOINT_FEATURES:
+    usual = {"measured": MEASURED, "commanded": COMMANDED, None: JOINT_FEATURES}
+    if joints in layout.features or joints not in usual:
+        return str(joints)
+    for key in usual[joints]:
         if key in layout.features and not layout.features[key].is_camera:
             return key
     raise DatasetError(
-        f"none of {list(JOINT_FEATURES)} is a column; say which holds the joints, joints=..., "
+        f"none of {list(usual[joints])} is a column; say which holds the joints, joints=..., "
         f"of {sorted(layout.features)}",
         file="meta/info.json",
     )

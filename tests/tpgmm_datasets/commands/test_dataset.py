@@ -1,6 +1,7 @@
 """``tpgmm dataset``: data sets looked at, generated and converted."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,8 @@ from tests.support.command_line import output, refusal, run
 from tests.support.lerobot_sets import (
     FPS,
     assert_equal,
+    change_info,
+    in_data,
     joints_of,
     to_v21,
     undeclared,
@@ -125,6 +128,42 @@ def test_layout_v21_becomes_v30_and_each_episode_keeps_its_task(arm, tmp_path):
     assert_same(load_lerobot(tmp_path / "new"), written, 1e-6)
     joints = joints_of(load_lerobot(tmp_path / "new", episodes="shake"))
     assert_equal(joints, joints_of(load_lerobot(tmp_path / "new"))[1:2])
+
+
+def recorded(root):
+    """The set with actions that are not the next joints; these, in degrees."""
+    ahead = np.random.default_rng(0).normal(size=(36, 3))
+    in_data("action", lambda values: np.degrees(ahead))(root)
+    in_data("observation.state", np.degrees)(root)
+    for name in ("action", "observation.state"):
+        change_info(root, lambda i, name=name: i["features"][name].pop("info"))
+    return ahead
+
+
+@pytest.mark.parametrize("rate", [FPS, FPS // 2])
+def test_recorded_actions_are_kept(tmp_path, rate):
+    root = tmp_path / "set"
+    written, ahead = write(root), recorded(root)
+    output("dataset", "convert", root, tmp_path / "new", *("--units", "deg", "--rate", rate))
+    found = load_lerobot(tmp_path / "new", joints="commanded")
+    start = 0
+    for item, demonstration in zip(found, written, strict=True):
+        actions = replace(demonstration, joints=ahead[start : start + len(demonstration)])
+        expected = resample(actions, rate).joints
+        assert item.joints.numpy() == pytest.approx(expected.numpy(), abs=1e-5)
+        start += len(demonstration)
+
+
+def test_actions_of_other_joints_are_not_kept_and_it_is_said(tmp_path):
+    root = tmp_path / "set"
+    written = write(root)
+    change_info(root, lambda i: i["features"]["action"].update(names=list("xyz"), info=None))
+    in_data("action", lambda values: -values)(root)
+    result = run("dataset", "convert", root, tmp_path / "new")
+    assert result.exit_code == 0
+    assert "the recorded actions are not kept: " in result.stderr
+    [first, *_] = load_lerobot(tmp_path / "new", joints="commanded")
+    assert first.joints[:-1].numpy() == pytest.approx(written[0].joints[1:].numpy(), abs=1e-6)
 
 
 def test_degrees_become_radians_if_told_and_are_refused_if_not(tmp_path):

@@ -13,9 +13,15 @@ def test_episodes_units_and_frames_are_read_from_text():
     assert parse_episodes("0,3,5") == [0, 3, 5]
     assert parse_episodes("4") == [4]
     assert parse_episodes("shake the bottle") == "shake the bottle"
-    assert parse_units([]) == "auto"
-    assert parse_units(["deg"]) == "deg"
-    assert parse_units(["arm=deg", "gripper=raw"]) == {"arm": "deg", "gripper": "raw"}
+    assert parse_units([]) == {"units": "auto", "calibration": None}
+    assert parse_units(["deg"])["units"] == "deg"
+    assert parse_units(["arm=deg", "gripper=raw"])["units"] == {"arm": "deg", "gripper": "raw"}
+    assert parse_units(["arm.json", "gripper=raw"]) == {
+        "units": {"gripper": "raw"},
+        "calibration": {"": "arm.json"},
+    }
+    two = ["left_=l.json", "right_=r.json"]
+    assert parse_units(two)["calibration"] == {"left_": "l.json", "right_": "r.json"}
     frames = parse_frames(["a", "b=poses", "c=poses[7:14]", "d=hand@close"])
     assert frames["a"].feature == "observation.environment_state"
     assert (frames["b"].feature, frames["b"].columns) == ("poses", None)

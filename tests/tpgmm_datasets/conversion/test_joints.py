@@ -38,6 +38,8 @@ def test_the_joint_feature_is_found_or_chosen(root):
     expected = joints_of(load_lerobot(root))
     action = joints_of(load_lerobot(root, joints="action"))
     assert_equal([a[:-1] for a in action], [e[1:] for e in expected])
+    assert_equal(joints_of(load_lerobot(root, joints="commanded")), action)
+    assert_equal(joints_of(load_lerobot(root, joints="measured")), expected)
     rename = {"observation.state": "state"}
     change_table(
         root, DATA, lambda t: t.rename_columns([rename.get(n, n) for n in t.column_names])
