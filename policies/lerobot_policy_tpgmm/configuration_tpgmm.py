@@ -29,6 +29,7 @@ HYPERPARAMETERS = (
 CHOICES = {
     "feedback": ("reference", "observation"),
     "alignment": ("dtw", "barycenter", "linear", "none"),
+    "learn_from": ("measured", "commanded"),
     "loss": ("likelihood", "imitation"),
 }
 
@@ -97,7 +98,8 @@ class TPGMMConfig(StatePolicyConfig):
         joints alone.
     links, joints, coordinates : list of str, optional
         For a robot given by its path, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links of
-        ``"upper_body"`` are its hands if none are named.
+        ``"upper_body"`` are its hands if none are named. Joints may be patterns, and one text
+        with commas: ``"left_*,waist_yaw"``.
     n_steps : int, default=0
         T, the length of the time grid that was learned; 0 before a fit.
     state_names, action_names, environment_names : list of str, optional
@@ -134,6 +136,9 @@ class TPGMMConfig(StatePolicyConfig):
     alignment_features : list of str, optional
         What ``"dtw"`` and ``"barycenter"`` compare, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`; ``["directions"]`` suits rhythms.
+    learn_from : {"measured", "commanded"}, default="measured"
+        Whether the joints of a demonstration are its states or its actions. Measured joints
+        lag behind commanded ones, by which a skill learned from them misses.
     loss : {"likelihood", "imitation"}, default="likelihood"
         What training by gradient minimises once the mixture is fitted.
     optimizer_lr : float, default=1e-4
@@ -169,7 +174,7 @@ class TPGMMConfig(StatePolicyConfig):
     operators: list[dict[str, Any] | str] | None = None
     robot: dict[str, Any] | str | None = None
     links: list[str] = field(default_factory=list)
-    joints: list[str] | None = None
+    joints: list[str] | str | None = None
     coordinates: list[str] = field(default_factory=list)
     n_steps: int = 0
 
@@ -189,6 +194,7 @@ class TPGMMConfig(StatePolicyConfig):
 
     alignment: str = "dtw"
     alignment_features: list[str] | None = None
+    learn_from: str = "measured"
     loss: str = "likelihood"
     optimizer_lr: float = 1e-4
     push_to_hub: bool = False
@@ -211,6 +217,11 @@ class TPGMMConfig(StatePolicyConfig):
             raise DataError(
                 "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
                 f"got {self.normalization_mapping}"
+            )
+        if (self.learn_from, self.loss) == ("commanded", "imitation"):
+            raise DataError(
+                "the imitation error is that of actions that follow measured joints: "
+                "--policy.learn_from=commanded goes with --policy.loss=likelihood"
             )
         self.estimator(None, ()).check_parameters()
 
@@ -235,7 +246,10 @@ class TPGMMConfig(StatePolicyConfig):
         urdf, links = self.robot, self.links
         if urdf == "upper_body":
             urdf, links = upper_body_urdf(), links or list(HANDS)
-        return Robot.from_urdf(urdf, links, joints=self.joints, coordinates=self.coordinates)
+        joints = self.joints
+        if isinstance(joints, str):
+            joints = [name.strip() for name in joints.split(",")]
+        return Robot.from_urdf(urdf, links, joints=joints, coordinates=self.coordinates)
 
     def decoded_operators(self) -> list[Operator] | None:
         """The operators that ``operators`` describes; None if it says nothing."""

@@ -22,8 +22,10 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 __all__ = ["FrameFeatures", "JointFeatures"]
 
 REMEDY = (
-    "Is this policy for another robot or data set? If the names alone differ, give those that "
-    "the policy shall see, in order: --policy.state_names='[...]' --policy.action_names='[...]'"
+    "Does the robot have joints that the data have not? --policy.joints='left_*,right_*' names "
+    "those that move. Is this policy for another robot or data set? If the names alone differ, "
+    "give those that the policy shall see, in order: "
+    "--policy.state_names='[...]' --policy.action_names='[...]'"
 )
 POSE = 7
 
@@ -106,6 +108,10 @@ class JointFeatures(nn.Module):
         """Actions (..., n_action), float32, from joint vectors (..., n_joints)."""
         ordered = joints[..., self.order]
         return ((ordered - self.back[:, 1]) / self.back[:, 0]).to(torch.float32)
+
+    def commanded(self, action: Tensor) -> Tensor:
+        """Joint vectors (..., n_joints) in the model's order and units, from actions."""
+        return self.targets(action)[..., self.order.argsort()]
 
     def targets(self, action: Tensor) -> Tensor:
         """What actions (..., n_action) ask of the joints ``order``, in the model's units."""

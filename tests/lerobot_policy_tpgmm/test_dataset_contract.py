@@ -1,5 +1,6 @@
 """What a data set tells: a policy that is to be trained, and ``tpgmm fit``."""
 
+import draccus
 import numpy as np
 import pytest
 import torch
@@ -91,3 +92,16 @@ def test_a_robot_of_a_file_becomes_a_description(tmp_path):
     adopt(made, dataset(20, **environment(POSE)))
     (tmp_path / "robot.urdf").unlink()
     assert made.kinematics() == Robot.from_urdf(upper_body_urdf(), ["l_hand"])
+
+
+@pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])
+def test_joints_are_chosen_by_patterns(joints):
+    made = draccus.parse(
+        TPGMMConfig,
+        args=["--robot=upper_body", f"--joints={joints}", "--device=cpu", "--links=[l_hand]"],
+    )
+    every = Robot.from_urdf(upper_body_urdf(), []).joint_names
+    chosen = [*(name for name in every if name.startswith("l_")), "waist_yaw"]
+    assert list(made.kinematics().joint_names) == chosen
+    again = draccus.decode(TPGMMConfig, draccus.encode(made))
+    assert again.joints == made.joints

@@ -28,6 +28,7 @@ def test_joints_are_found_by_name_in_any_order_and_spelling():
     action = made.action(joints)
     assert action.tolist() == [[2.0, 3.0, 1.0]] and action.dtype == torch.float32
     assert made.targets(action).tolist() == [[2.0, 3.0, 1.0]]
+    assert made.commanded(action).tolist() == joints.tolist()
 
 
 def test_units_are_converted_both_ways():
@@ -44,6 +45,7 @@ def test_units_are_converted_both_ways():
     ("options", "message"),
     [
         ({"state": ("a", "b")}, "observation.state.*'c' is none of the values.*state_names="),
+        ({"state": ("a", "b")}, r"--policy\.joints='left_\*,right_\*'"),
         ({"action": ("a", "b")}, "action.*'c' is none.*another robot or data set"),
         ({"action": ("a", "b", "c", "gripper")}, r"\['gripper'\], which are no joints"),
         ({"state": ("a", "b", "c", "c_joint")}, None),

@@ -15,7 +15,7 @@ from tpgmm_torch.exceptions import DataError
 __all__ = ["EpochRecorder", "episode_ranges", "located"]
 
 #: What is kept of a frame.
-COLUMNS = (OBS_STATE, OBS_ENV_STATE)
+COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
 
 #: How far a timestamp may be from its place, in frames.
 OFF_GRID = 0.1

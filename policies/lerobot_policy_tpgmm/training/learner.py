@@ -9,6 +9,7 @@ all parameters of the mixture.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -39,6 +40,9 @@ from tpgmm_torch.training.mixture_settings import regularization
 __all__ = ["Learner"]
 
 log = logging.getLogger(__name__)
+
+#: Of the loss: if it falls by less in an epoch, the log says that it is enough.
+LITTLE = 0.01
 
 
 class Learner:
@@ -86,6 +90,9 @@ class Learner:
         self._first: dict[int, dict[str, Tensor]] = {}
         self.clock: Clock | None = None
         self.regularization: list[Tensor] | None = None
+        self._steps = 0
+        self._losses: list[float] = []  # of the present epoch, while it is of interest
+        self._before: float | None = None  # their mean in the one before
 
     def loss(self, batch: Mapping[str, Any], training: bool) -> Tensor:
         """The loss of a batch.
@@ -112,8 +119,12 @@ class Learner:
         recorder = self._recorder
         if training:
             check_one_process()
+            self._steps += 1
         if training and recorder is not None:
             repeated = recorder.record(batch)
+            if self._steps == 1:
+                present = str(recorder)
+                log.info("collecting: the loss is 0 until every frame has come; %s", present)
             if not (repeated and recorder.complete):
                 # no gradient, not a zero one: an optimizer's momentum must not move anything
                 return torch.zeros((), requires_grad=True)
@@ -123,7 +134,10 @@ class Learner:
                 f"there is nothing to evaluate before the first epoch is over: {recorder}. "
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
-        return self._gradient_loss(batch, training)
+        loss = self._gradient_loss(batch, training)
+        if training:
+            self._watch(loss.item(), len(batch["index"]))
+        return loss
 
     def end_epoch(self) -> None:
         """Fit, if all frames are there; a loop that evaluates or saves may stop right then."""
@@ -154,34 +168,64 @@ class Learner:
         demonstrations = [self._demonstration(episodes[number]) for number in numbers]
         kinematics = self._kinematics.to(device="cpu")
         aligner = alignment(config.alignment, kinematics, config.alignment_features)
-        aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
         steps = sum(map(len, demonstrations))
-        message = f"{steps} frames of {len(numbers)} episodes collected"
+        log.info("%d frames of %d episodes collected", steps, len(numbers))
+        if aligner is not None:
+            log.info("aligning them: --policy.alignment=%s", config.alignment)
+        aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
         if not mixture.fitted:
+            log.info("EM: fitting %d components", config.n_components)
             model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
             config.n_steps = len(mixture.time)
-            # on the scale of the loss, which counts time once per operator, as EM does
-            expected = model.regression().expected
-            rows = torch.cat(local_data(aligned, model.operators_, model.kinematics_, expected))
-            message += (
-                f"; {config.n_components} components fitted to them by {model.n_iter_} steps "
-                f"of EM: log-likelihood {model.mixture_.score(rows.numpy()):.3f} per step"
+            log.info(
+                "%d components fitted by %d steps of EM: the policy is trained",
+                config.n_components,
+                model.n_iter_,
             )
-        log.info(message)
         self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
-        self.regularization = self._regularization(aligned, kinematics)
+        rows = torch.cat(local_data(aligned, self._operators, kinematics))
+        self.regularization = self._regularization(rows, kinematics)
         self._learned, self._recorder = set(numbers), None
+        with torch.no_grad():
+            widths = [mean.shape[1] for mean in mixture.means]
+            points = list(rows.to(mixture.time).split(widths, dim=1))
+            likelihood = likelihood_loss(mixture, points, self.regularization)
+        unit = "imitation error [mrad^2]" if config.loss == "imitation" else "same"
+        log.info(
+            "negative log-likelihood per frame: %.3f; further steps go on by gradient, and "
+            "their loss is the %s",
+            likelihood.item(),
+            unit,
+        )
 
-    def _regularization(
-        self, demonstrations: Sequence[Demonstration], kinematics: Kinematics
-    ) -> list[Tensor]:
-        """What EM adds to the diagonals of the covariances of these demonstrations."""
+    def _watch(self, loss: float, count: int) -> None:
+        """Say once that the loss of an epoch is hardly lower than that of the one before."""
+        learned = sum(len(self._ranges[number]) for number in self._learned)
+        if not self._learned or (self._before is not None and math.isinf(self._before)):
+            return
+        self._losses.append(loss)
+        if len(self._losses) * count < learned:
+            return
+        mean, before = sum(self._losses) / len(self._losses), self._before
+        self._before, self._losses = mean, []
+        if before is not None and before - mean < LITTLE * abs(before):
+            self._before = -math.inf
+            log.warning(
+                "the loss went from %.3f to %.3f in the last epoch of %d steps: more steps are "
+                "of little use, --steps=%d is enough",
+                before,
+                mean,
+                math.ceil(learned / count),
+                self._steps,
+            )
+
+    def _regularization(self, rows: Tensor, kinematics: Kinematics) -> list[Tensor]:
+        """What EM adds to the diagonals of the covariances of these local data."""
         config = self._config
-        rows = local_data(demonstrations, self._operators, kinematics)
-        moments = ColumnMoments.of(torch.cat(rows).numpy())
+        moments = ColumnMoments.of(rows.numpy())
         shares = regularization(
             moments,
             self._operators,
@@ -197,7 +241,7 @@ class Learner:
 
     def _demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:
         rows = {key: column.to(self._mixture.time.device) for key, column in columns.items()}
-        joints = self._joints.joints(rows[OBS_STATE]).cpu()
+        joints = self._shown(rows).cpu()
         follow = self._config.follow_frames
         frames = self._frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
         return Demonstration(
@@ -206,6 +250,12 @@ class Learner:
             {name: (f if follow else f[0]).to("cpu") for name, f in frames.items()},
             self._kinematics.joint_names,
         )
+
+    def _shown(self, rows: Mapping[str, Tensor]) -> Tensor:
+        """The joint vectors (B, n_joints) that a demonstration is made of."""
+        if self._config.learn_from == "commanded":
+            return self._joints.commanded(rows[ACTION])
+        return self._joints.joints(rows[OBS_STATE])
 
     def _aligned_clock(self, aligner: Alignment | None, numbers: Sequence[int]) -> Clock:
         """Paths of the learned episodes, on the time grid of the mixture."""
@@ -251,7 +301,7 @@ class Learner:
 
     def _samples(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> Samples:
         like = self._mixture.time
-        joints = self._joints.joints(batch[OBS_STATE]).to(like)
+        joints = self._shown(batch).to(like)
         poses = self._frames.frames(self._situations(batch, numbers, steps))
         # a policy that was fitted before, and is only evaluated, has collected none
         clock = self._aligned_clock(None, ()) if self.clock is None else self.clock

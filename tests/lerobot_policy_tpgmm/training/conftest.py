@@ -2,13 +2,23 @@
 
 import pytest
 
-from tests.support.training import dataset, handlings_set, waves_set
+from tests.support.training import FPS, dataset, handlings_set, slow_waves, waves_set
+from tpgmm_datasets import save_lerobot
 
 
 @pytest.fixture(scope="session")
 def waves(tmp_path_factory):
     """Joints alone."""
     return dataset(waves_set(tmp_path_factory.mktemp("waves") / "set"))
+
+
+@pytest.fixture(scope="session")
+def commanded(tmp_path_factory):
+    """Joints alone, behind what was commanded."""
+    path, shown = tmp_path_factory.mktemp("commanded") / "set", slow_waves()
+    actions = [1.1 * one.joints + 0.02 for one in shown]
+    save_lerobot(shown, path, fps=FPS, task="wave", actions=actions)
+    return dataset(path)
 
 
 @pytest.fixture(scope="session")

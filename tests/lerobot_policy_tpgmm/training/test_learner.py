@@ -1,5 +1,9 @@
 """What a policy learns from the batches of a training loop: the demonstrations, by EM."""
 
+import logging
+import re
+
+import numpy as np
 import pytest
 import torch
 
@@ -7,6 +11,7 @@ from tests.support.skills import HANDLING, HANDS, same
 from tests.support.training import (
     FPS,
     HANDLINGS,
+    NAMES,
     WAVES,
     dataset,
     epoch,
@@ -18,6 +23,7 @@ from tpgmm_datasets import load_lerobot
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.robots.joint_space import JointSpace
 
 # What is learned
 
@@ -50,6 +56,50 @@ def test_frames_and_quaternions_are_learned(handlings):
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(demonstrations[:1]) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-6)
+
+
+def test_commanded_joints_are_learned_by_name(commanded):
+    options = {**WAVES, "alignment": "linear"}
+    for joints in ("measured", "commanded"):
+        demonstrations = load_lerobot(commanded.root, joints=joints, robot=JointSpace(NAMES))
+        aligned = LinearTimeNormalization().fit_transform(demonstrations)
+        policy = trained(commanded, learn_from=joints, **options)
+        same(policy.to_estimator(), TaskParameterizedGMM(**WAVES).fit(aligned), 1e-9)
+        loss, _ = policy.train().forward(epoch(commanded, 32)[0])
+        assert loss < 0  # what was learned is likely
+    with pytest.raises(DataError, match=r"--policy\.learn_from=commanded goes with"):
+        fresh(commanded, learn_from="commanded", loss="imitation", **WAVES)
+
+
+# What is said
+
+
+def said(caplog, data, n_epochs, **options):
+    with caplog.at_level(logging.INFO, "lerobot_policy_tpgmm"):
+        policy = fresh(data, alignment="none", **WAVES, **options)
+        losses = []
+        for _ in range(n_epochs):
+            for batch in epoch(data, 41):
+                losses.append(policy.forward(batch)[0].item())
+    return losses, [record.getMessage() for record in caplog.records]
+
+
+def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplog, waves):
+    losses, lines = said(caplog, waves, 2)
+    frames = len(waves)
+    assert lines[0].startswith("collecting: the loss is 0 until every frame has come; 41 of")
+    assert lines[1] == f"{frames} frames of 4 episodes collected"
+    assert lines[2] == "EM: fitting 5 components"
+    assert re.match(r"5 components fitted by \d+ steps of EM: the policy is trained", lines[3])
+    [printed] = re.findall(r"^negative log-likelihood per frame: (-?[\d.]+); ", lines[4])
+    # the same figure as the loss of all frames
+    assert frames % 41 == 0 and np.mean(losses[3:]) == pytest.approx(float(printed), abs=2e-3)
+
+
+def test_the_log_says_once_when_more_steps_are_of_little_use(caplog, waves):
+    _, lines = said(caplog, waves, 5)
+    [line] = [line for line in lines if "of little use" in line]
+    assert re.search(r"last epoch of 3 steps: .* --steps=9 is enough", line)
 
 
 def test_a_policy_can_be_of_float32(waves):
