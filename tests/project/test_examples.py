@@ -51,6 +51,9 @@ CLAIMS = {
             and min(v["errors"]["room"] + v["errors"]["tray"]) > 75
             and v["errors"]["room and tray"][4] > 0.9 * v["errors"]["room and tray"][3]
             and bool((np.diff(v["bic"])[:3] < 0).all())
+            and max(v["misses"]["room and tray"][2:] + v["misses"]["tray"][2:]) < 4
+            and v["misses"]["room and tray"][1] > 15
+            and v["errors"]["tray"][4] > 90
         ),
     ),
     "plot_07_lerobot_dataset.py": (1, lambda v: 0.5 < v["error"] / v["typical"] < 2),

@@ -532,6 +532,71 @@ def test_frames_that_move_need_the_model_s_grid():
     refused(lambda: hands().predict([moving]), ShapeError, "'cup'", "(7,)", "(30,)")
 
 
+def test_a_demonstration_s_own_time_is_not_taken_along():
+    [shown] = handlings(1, moves=True)
+    half = len(shown) // 2
+    cut = Demonstration(
+        shown.time[:half] * 1.7,
+        shown.joints[:half],
+        {"cup": shown.frames["cup"][:half]},
+        shown.joint_names,
+    )
+    [found], [same] = hands().predict(cut), hands().predict(Situation.of(cut))
+    assert torch.equal(found.time, hands().time_)
+    assert torch.equal(found.joints, same.joints)
+    # the cup moves when it did, and stands still where no more is known
+    cup = cut.frames["cup"].resampled(cut.time, hands().time_)
+    [expected] = hands().predict(Situation(cut.joints[0], {"cup": cup}, hands().time_))
+    torch.testing.assert_close(found.joints, expected.joints, rtol=0, atol=1e-12)
+
+
+def test_what_lies_beyond_the_skill_is_held():
+    longer = torch.cat((hands().time_, LAST + torch.tensor([0.1, 1.0, 10.0]).double()))
+    [shown] = handlings(1)
+    [own], [found] = hands().predict(shown), hands().predict(Situation.of(shown, longer))
+    assert torch.equal(found.time, longer)
+    torch.testing.assert_close(found.joints[:30], own.joints, rtol=0, atol=1e-12)
+    assert torch.equal(found.joints[30:], found.joints[29:30].expand(3, -1))
+    shares = found.candidates[0].share
+    torch.testing.assert_close(shares[31:], shares[30:31].expand(2, -1))
+
+
+def test_joints_of_a_situation_go_by_name():
+    [shown] = handlings(1)
+    named = dict(zip(HANDS.joint_names, shown.joints[0].tolist(), strict=True))
+    shuffled = dict(sorted(named.items())) | {"wheel": 3.0}
+    [expected] = hands().predict(shown)
+    [found] = hands().predict(Situation(shuffled, shown.frames))
+    assert torch.equal(found.joints, expected.joints)
+    shuffled.pop("left.qw")
+    refused(
+        lambda: hands().predict(Situation(shuffled, shown.frames)),
+        UnknownNameError, "joint 'left.qw'", "the situation", "'left.qx'",
+    )  # fmt: skip
+
+
+def test_a_model_of_known_parameters_takes_arrays():
+    model, [shown] = hands(), handlings(1)
+    known = TaskParameterizedGMM.from_parameters(
+        model.weights_.numpy(),
+        [mean.tolist() for mean in model.means_],
+        [covariance.numpy() for covariance in model.covariances_],
+        model.time_.numpy(),
+        operators=model.operators_,
+        robot=HANDS,
+        blend=0.0,
+    )
+    assert torch.equal(known.predict(shown)[0].joints, model.predict(shown)[0].joints)
+    assert known.score([shown]) == model.score([shown])
+    assert (known.n_iter_, known.n_components) == (0, 6)
+    refused(
+        lambda: TaskParameterizedGMM.from_parameters(
+            [np.nan], [np.zeros((1, 2))], [np.eye(2)[None]], [0.0], robot=JointSpace(["a"])
+        ),
+        DataError, "weights", "NaN",
+    )  # fmt: skip
+
+
 def test_start_postures_of_other_robots_are_refused():
     cup = {"cup": Frame([0, 0, 0])}
     refused(
