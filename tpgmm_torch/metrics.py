@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from sklearn.pipeline import Pipeline
 from torch import Tensor
 
 from tpgmm_torch import quaternions
@@ -226,8 +227,9 @@ class PoseScorer:
         y : ignored
             Here for scikit-learn.
         """
-        demonstrations = check_demonstrations(X)
-        robot = self.robot if self.robot is not None else estimator.kinematics_
+        model, demonstrations = _held_out(estimator, X)
+        trajectories = _reproductions(model, demonstrations)
+        robot = model.kinematics_ if self.robot is None else self.robot
         links = robot.links if self.link is None else (self.link,)
         if not links:
             raise DataError(
@@ -243,7 +245,6 @@ class PoseScorer:
                     f"there are {len(instants)} instants for {len(demonstrations)} "
                     "demonstrations: for folds, name an event of the demonstrations"
                 )
-        trajectories = _reproductions(estimator, demonstrations)
         errors = [
             getattr(pose_errors(found, shown, robot, link, at), self.quantity).mean()
             for found, shown, at in zip(trajectories, demonstrations, instants, strict=True)
@@ -261,7 +262,8 @@ def make_scorer(
     """A scorer of what a skill is for: where a link is when it matters.
 
     For ``scoring=`` of :func:`tpgmm_torch.model_selection.cross_validate`, ``cross_val_score``
-    and ``GridSearchCV``. Held-out demonstrations are reproduced on their own clock.
+    and ``GridSearchCV``. Held-out demonstrations are reproduced on their own clock; those of a
+    pipeline of alignment and model are aligned first, by what the alignment learned.
 
     Parameters
     ----------
@@ -296,10 +298,21 @@ def make_scorer(
     return PoseScorer(link, event, quantity, robot)
 
 
-def _reproductions(estimator: Any, demonstrations: Sequence[Demonstration]) -> list[Trajectory]:
+def _held_out(
+    estimator: Any, X: Sequence[Demonstration]
+) -> tuple[Any, Sequence[Demonstration]]:
+    """The model and the demonstrations, brought onto its clock by the steps before it."""
+    demonstrations = check_demonstrations(X)
+    if not isinstance(estimator, Pipeline):
+        return estimator, demonstrations
+    before, model = estimator[:-1], estimator[-1]
+    return model, before.transform(demonstrations) if len(before) else demonstrations
+
+
+def _reproductions(model: Any, demonstrations: Sequence[Demonstration]) -> list[Trajectory]:
     """What a model does in the situations of demonstrations, at their time steps."""
     situations = [Situation.of(one, one.time) for one in demonstrations]
-    return estimator.predict(situations, candidates=False)
+    return model.predict(situations, candidates=False)
 
 
 def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
@@ -318,8 +331,8 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
     y : ignored
         Here for scikit-learn.
     """
-    demonstrations = check_demonstrations(X)
-    errors = map(joint_rmse, _reproductions(estimator, demonstrations), demonstrations)
+    model, demonstrations = _held_out(estimator, X)
+    errors = map(joint_rmse, _reproductions(model, demonstrations), demonstrations)
     return -float(np.mean(list(errors)))
 
 

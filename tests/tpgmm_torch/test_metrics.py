@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV, KFold
+from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
+from sklearn.pipeline import make_pipeline
 
 from tests.support.skills import (
     HANDS,
@@ -22,6 +23,7 @@ from tests.support.skills import (
 )
 from tests.support.worlds import LEFT, OnPoses, upper_body
 from tpgmm_torch import Demonstration, Situation, Trajectory
+from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.metrics import (
     joint_rmse,
@@ -220,6 +222,28 @@ def test_a_pose_scorer_serves_scikit_learn():
         [search.cv_results_[f"split{i}_test_score"][1] for i in (0, 1)],
         rtol=1e-6,
     )
+
+
+def test_scorers_of_a_pipeline_align_what_is_held_out():
+    """The same skill at other speeds: apart on their own clocks, alike on the common one."""
+    shown = [
+        replace(one, time=one.time * speed, events={"close": 1.2 * speed})
+        for one, speed in zip(handlings(4), (1.0, 1.5, 0.8, 1.2), strict=True)
+    ]
+    *train, _ = shown
+    pipeline = make_pipeline(LinearTimeNormalization(robot=HANDS), hands_model()).fit(train)
+    for scorer, worst in ((make_scorer("right", "close"), 5.0), (reproduction_scorer, 0.01)):
+        aligned, apart = scorer(pipeline, shown[3:]), scorer(pipeline[-1], shown[3:])
+        assert apart < 3 * aligned < 0
+        assert aligned > -worst
+    alone = make_pipeline(hands_model()).fit(handlings(3))
+    scorer = make_scorer("right")
+    assert scorer(alone, handlings(4)[3:]) == scorer(alone[-1], handlings(4)[3:])
+    folds = cross_val_score(
+        make_pipeline(LinearTimeNormalization(robot=HANDS), hands_model()),
+        shown, cv=KFold(2), scoring=make_scorer("right", "close"), error_score="raise",
+    )  # fmt: skip
+    assert folds.min() > -50
 
 
 def test_what_a_scorer_cannot_serve_is_refused():
