@@ -364,17 +364,12 @@ def _each[Motion](
 
 
 def _joints(table: pd.DataFrame, others: set[str]) -> list[str]:
-    """Columns that are joints.
-
-    What the table says, else those with a covariance, else all that are nothing else.
-    """
+    """Columns that are joints: those known to be, and those that are nothing else."""
     columns = _others(table, others)
-    if JOINTS in table.attrs and set(table.attrs[JOINTS]) <= set(columns):
-        return list(table.attrs[JOINTS])
-    known = [name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns]
-    if known:
-        return known
-    in_poses = {columns[i] for group in pose_groups(columns).values() for i in group}
+    known = {name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns}
+    known |= set(table.attrs.get(JOINTS, ()))
+    rest = [name for name in columns if name not in known]
+    in_poses = {rest[i] for group in pose_groups(rest).values() for i in group}
     names = [name for name in columns if name not in in_poses]
     if not names:
         raise DataError(

@@ -120,6 +120,8 @@ def test_joints_that_look_like_poses_are_named():
     made = handlings(2)
     table = demonstrations_to_frame(made)
     assert_same(demonstrations_from_frame(table)[1], made[1])
+    wider = demonstrations_from_frame(table.assign(gripper=0.5))[0]
+    assert wider.joint_names == (*HANDS.joint_names, "gripper")
     table.attrs.clear()  # as CSV does
     with pytest.raises(DataError, match=r"no joints.*joints=\[\.\.\.\]"):
         demonstrations_from_frame(table)
