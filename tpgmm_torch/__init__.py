@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.tracked_poses import Poses
+    from tpgmm_torch.training.hold_detection import find_holds
 
     __version__: str
 
@@ -75,6 +76,7 @@ __all__ = [
     "TrackingPlan",
     "Trajectory",
     "WaitingClock",
+    "find_holds",
 ]
 
 _HOMES = {
@@ -107,6 +109,7 @@ _HOMES = {
     "regression.regression": ("Estimate",),
     "robots.robot": ("Robot",),
     "data.trajectories": ("Candidate", "Trajectory"),
+    "training.hold_detection": ("find_holds",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

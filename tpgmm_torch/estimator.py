@@ -25,6 +25,7 @@ from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
@@ -35,13 +36,14 @@ from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
@@ -122,6 +124,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         References stay within the robot's limits of position and, in ``predict``, of speed:
         where the fused Gaussian goes beyond one, the joint stands there and the others take
         over as the Gaussian says.
+    holds : "auto", sequence of Hold or None, default="auto"
+        From when to when a link holds an object. "auto" finds it in demonstrations whose
+        frames were recorded over time
+        (:func:`~tpgmm_torch.training.hold_detection.find_holds`); what was recorded once, or
+        never moves, is never held. While an object is held, its frame as a place is where it
+        was last free, for learning and for reproducing alike.
     random_state : int, RandomState instance or None, default=None
     warm_start : bool, default=False
         Start EM from the previous solution.
@@ -140,6 +148,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Local covariances Sigma_i^(j).
     operators_ : tuple of Operator
     kinematics_ : Kinematics
+    holds_ : tuple of Hold
+        In the time of the skill.
     frame_names_ : tuple of str
         Frames that a situation must have.
     time_ : Tensor of shape (T,)
@@ -191,6 +201,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "negligible": [Interval(Real, 0, 1, closed="left")],
         "blend": [Interval(Real, 0, None, closed="left")],
         "keep_limits": ["boolean"],
+        "holds": [StrOptions({"auto"}), "array-like", tuple, None],
         "random_state": ["random_state"],
         "warm_start": ["boolean"],
         "dtype": [StrOptions({"float64", "float32"})],
@@ -224,6 +235,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         negligible: float = 1e-9,
         blend: float = 1.0,
         keep_limits: bool = True,
+        holds: str | Sequence[Hold] | None = "auto",
         random_state: int | np.random.RandomState | None = None,
         warm_start: bool = False,
         dtype: str = "float64",
@@ -247,6 +259,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.negligible = negligible
         self.blend = blend
         self.keep_limits = keep_limits
+        self.holds = holds
         self.random_state = random_state
         self.warm_start = warm_start
         self.dtype = dtype
@@ -307,10 +320,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
             kinematics = self._kinematics_for(known, operators)
+            holds = holds_for(self.holds, known, operators, kinematics)
             gathered = rows_in_memory(
-                known, operators, kinematics, responsibilities=self.responsibilities
+                known,
+                operators,
+                kinematics,
+                responsibilities=self.responsibilities,
+                holds=holds,
             )
-            self._learn(gathered, operators, kinematics, checkpoint)
+            self._learn(gathered, operators, kinematics, checkpoint, holds)
             peaks = demonstrated_peaks(known, kinematics.joint_names)
             return self._set_peaks(*peaks)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -318,13 +336,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         check_shares(head, processes)
         assert head is not None
         kinematics = self._kinematics_for(head, operators)
+        # the first batch of all says it for those that have not been read yet
+        holds = processes.gather(holds_for(self.holds, head, operators, kinematics))[0]
         seen = DemonstratedPeaks(kinematics.joint_names)
         with RowFile() as file:
             gathered = gather_rows(
                 seen.watch(chain([head], walk)), operators, kinematics, file, processes,
-                responsibilities=self.responsibilities,
+                responsibilities=self.responsibilities, holds=holds,
             )  # fmt: skip
-            self._learn(gathered, operators, kinematics, checkpoint)
+            self._learn(gathered, operators, kinematics, checkpoint, holds)
         return self._set_peaks(*seen.result(processes))
 
     def predict(
@@ -359,7 +379,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
         return rollout(
-            self.regression(), situations, self.time_, self.blend, self.keep_limits, candidates
+            self.regression(),
+            situations,
+            self.time_,
+            self.blend,
+            self.keep_limits,
+            candidates,
+            self.holds_,
         )
 
     def step(
@@ -487,6 +513,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             end=float(self.time_[-1]),
             blend=self.blend,
             keep_limits=self.keep_limits,
+            holds=self.holds_,
         )
 
     def sample(
@@ -645,6 +672,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators: tuple[Operator, ...],
         kinematics: Kinematics,
         time: Tensor,
+        holds: Sequence[Hold] = (),
     ) -> Self:
         """Become the fitted model of a mixture of local data.
 
@@ -657,14 +685,29 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             What they act on.
         time : Tensor of shape (T,)
             The time grid of a typical demonstration [s].
+        holds : sequence of Hold, default=()
+            Of objects by links, as :attr:`holds_`.
 
         Returns
         -------
         self
+
+        Raises
+        ------
+        DataError
+            If operators refer to objects that may be carried, and ``fusion="covariance"``.
         """
+        carried = carried_objects(operators, kinematics)
+        if carried and self.fusion == "covariance":
+            raise DataError(
+                f"operators refer to {list(carried)} as things that the robot may carry. Of "
+                "joints that do not move these they say nothing, which fusion='covariance' "
+                "would take for a wish to stand still: use fusion='information'"
+            )
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_, self.time_ = frame_names(operators, kinematics), time
         self.acceleration_ = self.jerk_ = None
+        self.holds_ = tuple(holds)
         self.weights_, self.means_ = mixture.weights_, mixture.means_
         self.covariances_ = mixture.covariances_
         # a mixture of given parameters comes from no EM
@@ -696,7 +739,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             What the operators act on; a
             :class:`~tpgmm_torch.robots.joint_space.JointSpace` where they need no links.
         **settings
-            Further parameters of the constructor.
+            Further parameters of the constructor; there is nothing that ``holds="auto"``
+            could be found in.
 
         Returns
         -------
@@ -724,7 +768,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         # it checked them; what it keeps went through their factors, and was rounded
         mixture.weights_ = weights
         mixture.means_, mixture.covariances_ = list(means), list(covariances)
-        return model.set_mixture(mixture, checked, robot.to(time.dtype, model.device), time)
+        given = model.holds if not isinstance(model.holds, str) else None
+        holds = check_holds(given or (), frame_names(checked, robot), robot.links)
+        kinematics = robot.to(time.dtype, model.device)
+        return model.set_mixture(mixture, checked, kinematics, time, holds)
 
     def save(self, path: str | Path) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
@@ -745,11 +792,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         }
         if not isinstance(parameters["random_state"], int):
             parameters["random_state"] = None
+        if not isinstance(parameters["holds"], str | None):
+            parameters["holds"] = [hold.to_list() for hold in parameters["holds"]]
         config = {
             "parameters": parameters,
             "operators": [encode(operator) for operator in self.operators_],
             "kinematics": encode(self.kinematics_),
             "frames": list(self.frame_names_),
+            "holds": [hold.to_list() for hold in self.holds_],
             "n_iter": self.n_iter_,
             "converged": bool(self.converged_),
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
@@ -796,6 +846,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 )
             settings = config["parameters"]
             settings["device"] = device or settings["device"]
+            holds = settings.pop("holds", "auto")  # models of before know none
+            given = holds if isinstance(holds, str | None) else list(map(Hold.from_list, holds))
             here = _moved(tensors, settings["device"], path)
             means, covariances = (
                 [here[f"{kind}.{j}"] for j in range(len(operators))]
@@ -808,8 +860,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 here["time"],
                 operators=operators,
                 robot=kinematics,
+                holds=list(map(Hold.from_list, config.get("holds", []))),
                 **settings,
             )
+            model.holds = given
             model.robot = None if isinstance(kinematics, JointSpace) else kinematics
             model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
             known = config["lower_bound"] is not None
@@ -857,6 +911,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators: tuple[Operator, ...],
         kinematics: Kinematics,
         checkpoint: Checkpoint | None,
+        holds: Sequence[Hold],
     ) -> Self:
         """Fit the mixture to rows, and take over what it learned."""
         moments = column_moments(learning.rows, learning.processes)
@@ -867,7 +922,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             checkpoint=checkpoint,
             processes=learning.processes,
         )
-        return self.set_mixture(mixture, operators, kinematics, learning.time)
+        return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
 
     def _kinematics_for(
         self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
@@ -906,7 +961,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         for operator in self.operators_:
             operator.check(self.kinematics_, demonstrations[0].frames)
         expected = self.regression().expected
-        rows = local_data(demonstrations, self.operators_, self.kinematics_, expected)
+        rows = local_data(
+            demonstrations, self.operators_, self.kinematics_, expected, self.holds_
+        )
         return [row.cpu().numpy() for row in rows]
 
     def _check_fitted(self) -> None:

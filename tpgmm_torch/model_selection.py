@@ -24,6 +24,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import fit_subsets
+from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.training_rows import rows_in_memory, share_one_grid, typical_time
 
@@ -130,6 +131,7 @@ def fit_folds(
     kinematics = kinematics_for(
         demonstrations, operators, estimator.robot, estimator.dtype, estimator.device
     )
+    holds = {holds_for(estimator.holds, own, operators, kinematics) for own in shown if own}
     twice = any(len(set(fold)) < len(fold) for fold in chosen)
     # some folds would have one responsibility per instant, others not
     mixed = (
@@ -137,10 +139,15 @@ def fit_folds(
         and not share_one_grid(demonstrations)
         and any(map(share_one_grid, shown))
     )
-    if twice or mixed or not chosen:
+    if twice or mixed or len(holds) != 1:
         return [model.fit(own) for model, own in zip(models, shown, strict=True)]
+    [held] = holds
     learning = rows_in_memory(
-        demonstrations, operators, kinematics, responsibilities=estimator.responsibilities
+        demonstrations,
+        operators,
+        kinematics,
+        responsibilities=estimator.responsibilities,
+        holds=held,
     )
     size, [rows] = learning.group_size, learning.rows
     belongs = np.zeros((len(chosen), len(demonstrations)), dtype=bool)
@@ -157,7 +164,8 @@ def fit_folds(
     ]
     fit_subsets(mixtures, rows, members, size, moments)
     for model, mixture, own in zip(models, mixtures, shown, strict=True):
-        model.set_mixture(mixture, operators, kinematics, typical_time(own).to(learning.time))
+        time = typical_time(own).to(learning.time)
+        model.set_mixture(mixture, operators, kinematics, time, held)
     return models
 
 

@@ -143,7 +143,7 @@ def plot_local(
         return model.regression().expected(operator, time)
 
     motions = [motion for motion, _ in shown]
-    rows = local_data(motions, [chosen], model.kinematics_, expected)
+    rows = local_data(motions, [chosen], model.kinematics_, expected, model.holds_)
     for row, (_, style) in zip(rows, shown, strict=True):
         axes.plot(as_array(row[:, 0]), as_array(row[:, 1 + column]), **style)
     plot_components(axes, model, operator, column)

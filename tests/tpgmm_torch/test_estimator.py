@@ -18,6 +18,8 @@ from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
 from tests.support import oracles, skills
+from tests.support.carrying import HELD, PLACES, at_first, carries, carrying_model, operators
+from tests.support.carrying import scenes as carrying_scenes
 from tests.support.mixtures import both_hands
 from tests.support.skills import (
     HANDLING,
@@ -47,6 +49,7 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
+    Hold,
     RelativePosition,
     Robot,
     Situation,
@@ -65,6 +68,7 @@ from tpgmm_torch.exceptions import (
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
+from tpgmm_torch.persistence import MODEL
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.local_data import local_data
 
@@ -380,7 +384,10 @@ def test_unknown_frames_are_named():
 def test_unknown_links_are_named():
     model = hands_model(operators=[pose("middle", "cup")])
     refused(
-        lambda: model.fit(handlings()), UnknownNameError, "link 'middle'", "['left', 'right']"
+        lambda: model.fit(handlings()),
+        UnknownNameError,
+        "link 'middle'",
+        "['cup', 'left', 'right']",
     )
     refused(
         lambda: Robot.from_urdf(upper_body_urdf(), links=("third_hand",)),
@@ -448,6 +455,7 @@ BAD = {
     "negligible": [-1e-9, 1.0],
     "blend": [-0.1],
     "keep_limits": ["yes", 2],
+    "holds": ["often", 3],
     "random_state": ["seed", -1],
     "warm_start": ["no"],
     "dtype": ["float16", torch.float32],
@@ -650,6 +658,7 @@ SETTINGS = {
     "negligible": 1e-8,
     "blend": 0.5,
     "keep_limits": False,
+    "holds": None,
     "random_state": 1,
     "warm_start": True,
     "dtype": "float32",
@@ -1022,3 +1031,82 @@ def test_batches_tell_the_same_peaks():
     parts = canonical().fit([shown[:1], shown[1:]])
     assert torch.equal(whole.acceleration_, parts.acceleration_)
     assert torch.equal(whole.jerk_, parts.jerk_) and bool((whole.jerk_ > 0).all())
+
+
+# Objects that the robot holds
+
+
+def test_objects_that_are_held_are_found_and_learned_as_where_they_were_last_free():
+    found, none = carrying_model(PLACES), carrying_model(PLACES, holds=None)
+    [hold] = found.holds_
+    assert (hold.frame, hold.link, none.holds_) == ("bottle", "l_hand", ())
+    same(clone(found).set_params(holds=[hold]).fit(carries()), found)
+    # never let go, it is where it was at first
+    forever = clone(found).set_params(holds=[replace(hold, end=np.inf)]).fit(carries())
+    once = [at_first(d) for d in carries()]
+    nominal = clone(found).fit(once)
+    assert nominal.holds_ == ()
+    same(forever, nominal, 1e-9)
+    expected = pytest.approx(nominal.score(once), abs=1e-6)
+    assert forever.score(list(carries())) == expected
+
+
+def test_objects_never_held_change_nothing_bit_for_bit():
+    for model in (hands_model(), hands_model(holds=None), hands_model(holds=[])):
+        same(model.fit(handlings(moves=True)), hands_model().fit(handlings(moves=True)))
+        assert model.holds_ == ()
+
+
+def test_holds_are_kept_and_models_of_before_have_none(tmp_path):
+    model = carrying_model()
+    model.save(tmp_path / "model")
+    loaded = TaskParameterizedGMM.load(tmp_path / "model")
+    assert loaded.holds_ == model.holds_ and loaded.holds == "auto"
+    assert loaded.holds_[0].share == 1.0
+    situation = carrying_scenes(1, seed=4)[0].situation
+    expected, actual = model.predict([situation])[0], loaded.predict([situation])[0]
+    assert torch.equal(actual.joints, expected.joints)
+    given = copy.copy(model).set_params(holds=[HELD])
+    given.save(tmp_path / "given")
+    assert TaskParameterizedGMM.load(tmp_path / "given").holds == [HELD]
+    config, tensors = MODEL.read(tmp_path / "model")
+    settings = {name: value for name, value in config["parameters"].items() if name != "holds"}
+    own = ("format", "version", "tensors", "tensors_sha256", "digest", "holds")
+    old = {name: value for name, value in config.items() if name not in own}
+    MODEL.write(tmp_path / "old", old | {"parameters": settings}, tensors)
+    before = TaskParameterizedGMM.load(tmp_path / "old")
+    assert before.holds_ == () and before.holds == "auto"
+
+
+def test_batches_are_held_like_the_first():
+    whole = carrying_model()
+    batches = [carries()[:5], carries()[5:]]
+    same(clone(whole).fit(iter(batches)), whole, 1e-6)
+    assert clone(whole).fit(iter(batches)).holds_[0].link == "l_hand"
+
+
+@pytest.mark.parametrize(
+    ("holds", "error", "parts"),
+    [
+        ([Hold("cup", "l_hand")], UnknownNameError, ("frame 'cup'", "['bottle', 'tray']")),
+        ([Hold("tray", "tail")], UnknownNameError, ("link 'tail'", "['l_hand', 'r_hand']")),
+        (["bottle@l_hand"], DataError, ("Hold.parse",)),
+    ],
+)
+def test_holds_that_cannot_be_are_refused(holds, error, parts):
+    model = clone(carrying_model()).set_params(holds=holds)
+    refused(lambda: model.fit(carries()), error, *parts)
+
+
+def test_things_need_the_information_form():
+    model = clone(carrying_model()).set_params(fusion="covariance")
+    refused(lambda: model.fit(carries()), DataError, "['bottle']", "fusion='information'")
+    refused(
+        lambda: (
+            clone(carrying_model())
+            .set_params(operators=operators(["pose:cup@tray"]))
+            .fit(carries())
+        ),
+        UnknownNameError,
+        "link 'cup' is not in the robot or the frames",
+    )

@@ -77,11 +77,13 @@ class CompiledRegression(Regression):
     def tick(
         self,
         time: Tensor,
-        joints: Tensor,
+        joints: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """One tick from the joints q_{t-1}; see :meth:`Regression.tick`."""
+        if isinstance(joints, RobotState):
+            return super().tick(time, joints, frames, bounds)
         names, like = self._served_frames, self.kinematics.lower
         poses = [frames[name] for name in names if name in frames]
         learning = torch.is_grad_enabled() and joints.requires_grad

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
+from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["Controller"]
 
@@ -38,6 +41,8 @@ class Controller:
         How long the difference at the start fades [s].
     keep_limits : bool
         Whether references respect the robot's limits of position and speed.
+    holds : sequence of Hold, default=()
+        From when to when links hold objects.
 
     Attributes
     ----------
@@ -45,6 +50,8 @@ class Controller:
         Of the last step [s]; the beginning before the first one.
     reference : Tensor of shape (..., n_joints)
         The last reference; the start posture before the first step.
+    holding : Holding
+        What the robots hold, and where objects were last free.
     estimate : Estimate or None
         What the last reference was made from: it is without the fading difference.
 
@@ -64,13 +71,16 @@ class Controller:
         end: float,
         blend: float = 0.0,
         keep_limits: bool = True,
+        holds: Sequence[Hold] = (),
     ) -> None:
         self.time, self._begin, self._end = begin, begin, end
         self.reference = regression.kinematics.joint_tensor(joints)
         self.estimate: Estimate | None = None
         self._regression, self._blend, self._keep_limits = regression, blend, keep_limits
         self._like = regression.kinematics.lower
-        self._frames = self._converted(frames or {})
+        self.holding = Holding.start(
+            regression.kinematics, regression.operators, holds, self._converted(frames or {})
+        )
         self._gap = torch.zeros_like(self.reference)
 
     @property
@@ -83,6 +93,7 @@ class Controller:
         dt: float,
         joints: Tensor | None = None,
         frames: Mapping[str, Frame] | None = None,
+        told: Mapping[str, str | None] | None = None,
     ) -> Estimate:
         """Find the next ``reference``.
 
@@ -95,6 +106,9 @@ class Controller:
             are those of the references anyhow.
         frames : mapping of str to Frame, optional
             Poses of the objects from now on.
+        told : mapping of str to str or None, optional
+            Which link holds an object from now on, None if it is free from now on: in place
+            of the holds that the skill began with.
 
         Returns
         -------
@@ -112,8 +126,6 @@ class Controller:
                 f"the skill began with joints of shape {tuple(last.shape)}, now there are "
                 f"{tuple(joints.shape)}: begin it anew for other robots"
             )
-        if frames is not None:
-            self._frames = self._converted(frames)
         time = self.time if self.estimate is None else self.time + dt
         if self.estimate is not None and time > self._end + 1e-6 * dt:  # but for rounding
             self.time = self._end
@@ -122,7 +134,12 @@ class Controller:
         gap = self._fading(time)
         bounds = self._bounds(dt, gap) if self._keep_limits else None
         now, joints = self._like.new_tensor(time), last if joints is None else joints
-        estimate = self._regression.tick(now, joints, self._frames, bounds)
+        seen = None if frames is None else self._converted(frames)
+        self.holding = self.holding.advance(time, joints, seen, told)
+        at: Tensor | RobotState = joints
+        if self.holding.carries:
+            at = self.holding.state(self._regression.kinematics.state(joints))
+        estimate = self._regression.tick(now, at, self.holding.frames, bounds)
         if self.estimate is None:
             self._gap = last - estimate.joints
             gap = self._fading(time)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
 from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.regression.regression import PART, Estimate, Regression
 
@@ -22,6 +25,7 @@ def rollout(
     blend: float,
     keep_limits: bool,
     candidates: bool,
+    holds: Sequence[Hold] = (),
 ) -> list[Trajectory]:
     """Closed kinematic loop: each reference is the state q_{t-1} of the next step.
 
@@ -39,6 +43,8 @@ def rollout(
         Whether references respect the robot's limits of position and speed.
     candidates : bool
         Whether to keep each operator's own estimate.
+    holds : sequence of Hold, default=()
+        From when to when links hold objects.
 
     Returns
     -------
@@ -48,7 +54,9 @@ def rollout(
     trajectories: dict[int, Trajectory] = {}
     for members in _groups(situations):
         batch = [situations[index] for index in members]
-        together = _run_together(regression, batch, skill_time, blend, keep_limits, candidates)
+        together = _run_together(
+            regression, batch, skill_time, blend, keep_limits, candidates, holds
+        )
         trajectories.update(zip(members, together, strict=True))
     return [trajectories[index] for index in range(len(situations))]
 
@@ -70,6 +78,7 @@ def _run_together(
     blend: float,
     keep_limits: bool,
     candidates: bool,
+    holds: Sequence[Hold],
 ) -> list[Trajectory]:
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
@@ -92,9 +101,11 @@ def _run_together(
         end=grid[-1],
         blend=blend,
         keep_limits=keep_limits,
+        holds=holds,
     )
     references: list[torch.Tensor] = []
     estimates: list[Estimate] = []
+    holdings: list[Holding] = []
     inferring = torch.is_inference_mode_enabled()
     for k, now in enumerate(grid):
         if k == 1:  # what the first step does not record, none does; to ask so takes a third
@@ -102,12 +113,14 @@ def _run_together(
         if k and now == grid[k - 1]:
             estimates.append(estimates[-1])
             references.append(references[-1])
+            holdings.append(holdings[-1])
             continue
         with torch.inference_mode(inferring):
             here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
             dt = now - controller.time
             estimates.append(controller.step(dt, frames=here if moving else None))
             references.append(controller.reference)
+            holdings.append(controller.holding)
     whole = Estimate(
         torch.stack([estimate.joints for estimate in estimates]).view(len(grid), *start.shape),
         torch.stack([estimate.covariance for estimate in estimates]).view(
@@ -119,7 +132,7 @@ def _run_together(
     own: list[Candidate] = []
     if candidates:
         states = torch.cat((start[None], joints[:-1]))
-        own = _candidates(regression, held, states, frames, whole)
+        own = _candidates(regression, held, states, frames, holdings, whole)
     return [
         Trajectory(
             time,
@@ -140,6 +153,7 @@ def _candidates(
     time: torch.Tensor,
     joints: torch.Tensor,
     frames: Mapping[str, Frame],
+    holdings: Sequence[Holding],
     whole: Estimate,
 ) -> list[Candidate]:
     """Each operator's own estimates (T, B, ...), many instants at once: none needs another."""
@@ -148,19 +162,43 @@ def _candidates(
     if activation.ndim == 2:  # the same for all robots
         activation = activation.unsqueeze(1)
     parts = []
-    for k in range(0, len(time), size):
-        now = slice(k, k + size)
+    for now in _stretches(holdings, size):
         estimate = Estimate(whole.joints[now], whole.covariance[now], activation[now])
-        state = regression.kinematics.state(joints[now])
+        holding = _together(holdings[now], _at(frames, now), joints.shape[1:2])
+        state = holding.state(regression.kinematics.state(joints[now]))
         at = time[now].unsqueeze(-1)
-        parts.append(regression.candidates(at, state, _at(frames, now), estimate))
+        parts.append(regression.candidates(at, state, holding.frames, estimate))
     return [
         Candidate(*(torch.cat(field) for field in zip(*map(_fields, over_time), strict=True)))
         for over_time in zip(*parts, strict=True)
     ]
 
 
-def _at(frames: Mapping[str, Frame], now: int | slice) -> dict[str, Frame]:
+def _stretches(holdings: Sequence[Holding], size: int) -> Iterator[slice]:
+    """Up to ``size`` instants each, in which the robots hold the same things."""
+    start = 0
+    for k in range(1, len(holdings) + 1):
+        whole = k == len(holdings) or k - start == size
+        if whole or holdings[k].held is not holdings[start].held:
+            yield slice(start, k)
+            start = k
+
+
+def _together(
+    holdings: Sequence[Holding], frames: Mapping[str, Frame], batch: Sequence[int]
+) -> Holding:
+    """Several instants (T, B) at which the robots hold the same things."""
+    places = dict(frames)
+    for name in holdings[0].held:
+        each = [holding.frames[name].expand(batch) for holding in holdings]
+        places[name] = Frame._from(
+            torch.stack([pose.position for pose in each]),
+            torch.stack([pose.orientation for pose in each]),
+        )
+    return replace(holdings[0], frames=places)
+
+
+def _at(frames: Mapping[str, Frame], now: slice) -> dict[str, Frame]:
     """Frames of shape (B,) or, if they move, (T, B) at some instants."""
     return {name: f[now] if len(f.batch_shape) == 2 else f for name, f in frames.items()}
 

@@ -296,6 +296,18 @@ class Frame:
         """``R x + p``: points (..., 3) of this frame, seen from the base frame."""
         return quaternions.rotate(self.orientation, point) + self.position
 
+    def compose(self, inner: Frame) -> Frame:
+        """The pose, in the base frame, of what has the pose ``inner`` in this frame."""
+        turned = quaternions.product(self.orientation, inner.orientation)
+        return self._from(self.transform(inner.position), turned)
+
+    def seen_from(self, other: Frame) -> Frame:
+        """The pose in another frame: ``other.compose(pose.seen_from(other))`` is the pose."""
+        turn = quaternions.conjugate(other.orientation)
+        return self._from(
+            other.inverse_transform(self.position), quaternions.product(turn, self.orientation)
+        )
+
     @classmethod
     def _from(cls, position: Tensor, orientation: Tensor) -> Frame:
         """Wrap tensors that were checked before."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any, Self
@@ -106,6 +106,18 @@ class Hold:
         begin, end = ("" if math.isinf(at) else repr(at) for at in (self.begin, self.end))
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
 
+    def to_list(self) -> list[Any]:
+        """Frame, link, begin, end, share: for JSON, which has no infinity but None."""
+        begin, end = (None if math.isinf(at) else at for at in (self.begin, self.end))
+        return [self.frame, self.link, begin, end, self.share]
+
+    @classmethod
+    def from_list(cls, values: Sequence[Any]) -> Self:
+        """The inverse of :meth:`to_list`."""
+        frame, link, begin, end, share = values
+        begin, end = (-math.inf if begin is None else begin), (math.inf if end is None else end)
+        return cls(frame, link, begin, end, share)
+
     @property
     def _names(self) -> str:
         return f"{self.frame}@{self.link}"
@@ -145,7 +157,7 @@ def check_holds(
         if hold.link not in links:
             raise UnknownNameError("link", hold.link, f"the robot (hold {hold})", links)
     checked = tuple(sorted(checked, key=lambda hold: (hold.begin, hold.end)))
-    of_frame: Mapping[str, list[Hold]] = {hold.frame: [] for hold in checked}
+    of_frame: dict[str, list[Hold]] = {hold.frame: [] for hold in checked}
     for hold in checked:
         of_frame[hold.frame].append(hold)
     for several in of_frame.values():

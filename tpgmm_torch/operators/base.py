@@ -12,7 +12,9 @@ from torch import Tensor
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Linearization", "Operator", "Reference", "carried_objects", "frame_names"]
@@ -109,9 +111,8 @@ class Reference:
             If it is neither.
         """
         if name in (state.links if held else state.robot_links):
-            pose = Frame._from(state.position(name), state.orientation(name))
             jacobians = state.linear_jacobian(name), state.angular_jacobian(name)
-            return cls(pose, *jacobians, state.carrier(name))
+            return cls(state.pose(name), *jacobians, state.carrier(name))
         if name not in frames:
             known = [*frames, *state.links]
             raise UnknownNameError("frame", name, "the situation or the robot's links", known)
@@ -198,11 +199,27 @@ class Operator(ABC):
         inverse = gaussians.pseudo_inverse(at.jacobian)
         return (inverse @ at.displacement[..., None])[..., 0] + state.joints
 
-    def local(self, demonstration: Demonstration, kinematics: Kinematics) -> Tensor:
-        """The local data set X^(j) of a demonstration, (T, D), its quaternions continuous."""
+    def local(
+        self,
+        demonstration: Demonstration,
+        kinematics: Kinematics,
+        holds: Sequence[Hold] = (),
+    ) -> Tensor:
+        """The local data set X^(j) of a demonstration, (T, D), its quaternions continuous.
+
+        Parameters
+        ----------
+        demonstration : Demonstration
+        kinematics : Kinematics
+        holds : sequence of Hold, default=()
+            Objects that were held: as places they are where they were last free.
+        """
         demonstration = demonstration.reordered(kinematics.joint_names)
         state = kinematics.state(demonstration.joints)
         frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
+        if holds:
+            time = demonstration.time.to(state.joints)
+            state, frames = held_objects(state, time, frames, holds)
         local = self.coordinates(state, frames)
         if tuple(local.shape) != (len(demonstration), self.dimension(kinematics)):
             raise ShapeError(

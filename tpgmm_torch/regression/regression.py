@@ -148,15 +148,17 @@ class Regression:
     def tick(
         self,
         time: Tensor,
-        joints: Tensor,
+        joints: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """:meth:`step` from joint vectors: kinematics included, without candidates.
 
         Many robots run part by part, of those that are at about the same time: few components
-        count for them.
+        count for them. Robots that carry something are given by their states.
         """
+        if isinstance(joints, RobotState):
+            return self._bounded(self._estimate(time, joints, frames), bounds)
         poses = {name: frames[name] for name in self._frame_names if name in frames}
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))

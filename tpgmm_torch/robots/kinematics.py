@@ -88,6 +88,10 @@ class RobotState:
         """``eps_{t-1}`` of a link, unit quaternion of shape (..., 4)."""
         return self.orientations[..., self._index(link), :]
 
+    def pose(self, link: str) -> Frame:
+        """Position and orientation of a link."""
+        return Frame._from(self.position(link), self.orientation(link))
+
     def linear_jacobian(self, link: str) -> Tensor:
         """``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
         return self.jacobians[..., self._index(link), :3, :]
@@ -160,19 +164,17 @@ class RobotState:
         """
         if name in self.robot_links:
             raise DataError(f"{name!r} is a link of the robot: give the object another name")
-        position, orientation = (
-            x.to(self.positions) for x in (pose.position, pose.orientation)
-        )
+        pose = pose.to(self.positions)
         jacobian = torch.zeros_like(self.jacobians[..., 0, :, :])
         carrier: int | Tensor = -1
         if link is not None:
-            arm = quaternions.rotate(self.orientation(link), position)
-            position = self.position(link) + arm
-            orientation = quaternions.product(self.orientation(link), orientation)
+            pose = self.pose(link).compose(pose)
+            arm = pose.position - self.position(link)
             angular = self.angular_jacobian(link).expand(*arm.shape[:-1], -1, -1)
             swing = torch.linalg.cross(angular, arm[..., None], dim=-2)
             jacobian = torch.cat((self.linear_jacobian(link) + swing, angular), dim=-2)
             carrier = self.carrier(link)
+        position, orientation = pose.position, pose.orientation
         index = torch.as_tensor(carrier, device=position.device)
         if where is not None:
             if name not in self.links:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -24,6 +25,7 @@ def local_data(
     operators: Sequence[Operator],
     kinematics: Kinematics,
     expected: Sides | None = None,
+    holds: Sequence[Hold] = (),
 ) -> list[Tensor]:
     """Time and local coordinates of every operator, side by side.
 
@@ -37,6 +39,8 @@ def local_data(
         ``time``; quaternions are brought to its side. By default to that of the first
         demonstration, compared at equal phase, and coordinates that vary by rounding alone
         are made constant.
+    holds : sequence of Hold, default=()
+        Objects that the robot held: as places they are where they were last free.
 
     Returns
     -------
@@ -58,11 +62,11 @@ def local_data(
                 f"{n}: {kinematics.joint_names}"
             )
         if sides is None:
-            sides = like(demonstration, operators, kinematics)
+            sides = like(demonstration, operators, kinematics, holds)
         time = demonstration.time.to(kinematics.lower)
         blocks: list[Tensor] = []
         for j, operator in enumerate(operators):
-            local = operator.local(demonstration, kinematics)
+            local = operator.local(demonstration, kinematics, holds)
             for start in operator.quaternion_starts(kinematics):
                 local = _same_side(local, sides(j, time), slice(start, start + 4))
             blocks += [time[:, None], local]
@@ -77,7 +81,10 @@ def local_data(
 
 
 def like(
-    demonstration: Demonstration, operators: Sequence[Operator], kinematics: Kinematics
+    demonstration: Demonstration,
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    holds: Sequence[Hold] = (),
 ) -> Sides:
     """What to expect of others, if they are like this one: its coordinates at equal phase.
 
@@ -86,13 +93,14 @@ def like(
     demonstration : Demonstration
     operators : sequence of Operator
     kinematics : Kinematics
+    holds : sequence of Hold, default=()
 
     Returns
     -------
     callable
         For ``expected`` of :func:`local_data`.
     """
-    return at_equal_phase([o.local(demonstration, kinematics) for o in operators])
+    return at_equal_phase([o.local(demonstration, kinematics, holds) for o in operators])
 
 
 def at_equal_phase(templates: Sequence[Tensor]) -> Sides:
@@ -128,13 +136,14 @@ def constant_columns(smallest: Tensor, largest: Tensor, widths: Sequence[int]) -
     -------
     Tensor of bool, of shape (sum widths,)
     """
-    eps = torch.finfo(smallest.dtype).eps
+    # recorded poses went through more than our own rounding
+    rounding = max(100 * torch.finfo(smallest.dtype).eps, 1e-10)
     masks = []
     for low, high in zip(
         smallest.split(list(widths)), largest.split(list(widths)), strict=True
     ):
         size = torch.maximum(low.abs(), high.abs())[1:].max()
-        masks.append(high - low <= 100 * eps * size)
+        masks.append(high - low <= rounding * size)
     return torch.cat(masks)
 
 

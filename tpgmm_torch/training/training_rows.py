@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
 from tpgmm_torch.large_data.row_batches import Rows, StoredRows
@@ -156,6 +157,7 @@ def rows_in_memory(
     kinematics: Kinematics,
     *,
     responsibilities: str = "auto",
+    holds: Sequence[Hold] = (),
 ) -> LearningRows:
     """What a mixture learns from demonstrations that are in memory, in this process alone.
 
@@ -165,13 +167,15 @@ def rows_in_memory(
     operators : sequence of Operator
     kinematics : Kinematics
     responsibilities : {"auto", "instant", "point"}
+    holds : sequence of Hold, default=()
+        Objects that the robot held.
 
     Raises
     ------
     DataError
         If ``responsibilities="instant"`` and the demonstrations have different time grids.
     """
-    rows = local_data(demonstrations, operators, kinematics)
+    rows = local_data(demonstrations, operators, kinematics, holds=holds)
     aligned = share_one_grid(demonstrations)
     if responsibilities == "instant":
         _check_aligned(aligned)
@@ -210,6 +214,7 @@ def gather_rows(
     processes: Processes,
     *,
     responsibilities: str = "auto",
+    holds: Sequence[Hold] = (),
 ) -> LearningRows:
     """Read all demonstrations once, and keep what a mixture learns from.
 
@@ -223,6 +228,8 @@ def gather_rows(
         Where the local data go.
     processes : Processes
     responsibilities : {"auto", "instant", "point"}
+    holds : sequence of Hold, default=()
+        Objects that the robot held, the same in all processes.
 
     Raises
     ------
@@ -235,13 +242,13 @@ def gather_rows(
     for batch in batches:
         if expected is None:
             # process 0 has the first demonstration of all, whose hemispheres all follow
-            blocks = [operator.local(batch[0], kinematics) for operator in operators]
+            blocks = [operator.local(batch[0], kinematics, holds) for operator in operators]
             first = [tensor.cpu() for tensor in (batch[0].time, *blocks)]
             grid, *blocks = processes.gather(first)[0]
             expected = at_equal_phase([block.to(kinematics.lower) for block in blocks])
         aligned = aligned and all(torch.equal(item.time.cpu(), grid) for item in batch)
         for demonstration, rows in zip(
-            batch, local_data(batch, operators, kinematics, expected), strict=True
+            batch, local_data(batch, operators, kinematics, expected, holds), strict=True
         ):
             spans.append((demonstration.duration, file.n_rows, file.n_rows + len(rows)))
             file.append(rows.cpu().numpy())

@@ -102,8 +102,12 @@ def test_what_varies_by_rounding_alone_is_made_constant():
 def test_rounding_is_measured_by_the_largest_coordinate_of_the_operator():
     eps = np.finfo(np.float64).eps
     low = torch.tensor([0.0, -1000.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-    spread = torch.tensor([9.0, 9.0, 99e3 * eps, 101e3 * eps, 9.0, 1e3 * eps])
+    spread = torch.tensor([9.0, 9.0, 0.99e-7, 1.01e-7, 9.0, 1e3 * eps])
     mask = constant_columns(low, low + spread, [4, 2])
+    assert mask.tolist() == [False, False, True, False, False, False]
+    eps = np.finfo(np.float32).eps
+    spread = torch.tensor([9.0, 9.0, 99e3 * eps, 101e3 * eps, 9.0, 1e3 * eps])
+    mask = constant_columns(low.float(), low.float() + spread, [4, 2])
     assert mask.tolist() == [False, False, True, False, False, False]
 
 

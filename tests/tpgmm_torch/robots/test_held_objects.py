@@ -1,0 +1,74 @@
+"""Recorded objects, as places and as things."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tests.support.carrying import HAND, HELD, at_first, carries, operators
+from tests.support.worlds import RIGHT, upper_body
+from tpgmm_torch import Hold, RelativePosition
+from tpgmm_torch.robots.held_objects import held_objects
+
+SHOWN = carries()[0]
+STATE = upper_body().state(SHOWN.joints)
+BEGIN, END = (int((SHOWN.time < at).sum()) for at in (HELD.begin, HELD.end))
+
+
+def test_as_a_place_it_is_where_it_was_last_free():
+    state, frames = held_objects(STATE, SHOWN.time, SHOWN.frames, [HELD])
+    recorded, place = SHOWN.frames["bottle"].position, frames["bottle"].position
+    assert torch.equal(place[:BEGIN], recorded[:BEGIN])
+    assert torch.equal(place[BEGIN:END], recorded[BEGIN].expand(END - BEGIN, 3))
+    assert torch.equal(place[END:], recorded[END:])
+    assert torch.equal(state.position("bottle"), recorded)
+    assert frames["tray"] is SHOWN.frames["tray"]
+    assert (state.carrier("bottle") == -1).all()
+
+
+@pytest.mark.parametrize("hold", [HELD, Hold("bottle", HAND, HELD.begin)])
+def test_what_was_recorded_once_is_carried_by_the_link(hold):
+    once = at_first(SHOWN)
+    state, frames = held_objects(STATE, SHOWN.time, once.frames, [hold])
+    there, recorded = state.pose("bottle"), SHOWN.frames["bottle"]
+    assert torch.equal(there.position[:BEGIN], recorded.position[:BEGIN])
+    # the recorded one was carried in the same way, by hands that are there to 1e-6
+    carried = slice(BEGIN, END)
+    close = {"rtol": 0, "atol": 1e-4}
+    torch.testing.assert_close(there.position[carried], recorded.position[carried], **close)
+    until = END if hold is HELD else len(SHOWN)
+    first = once.frames["bottle"].position
+    assert torch.equal(frames["bottle"].position[:until], first.expand(until, 3))
+    assert (there.position[END:] == there.position[END]).all() or hold is not HELD
+
+
+def test_holds_one_after_the_other_and_beyond_the_recording():
+    once = at_first(SHOWN)
+    first, second = Hold("bottle", HAND, 2.3, 4.0), Hold("bottle", RIGHT, 4.5)
+    state, frames = held_objects(STATE, SHOWN.time, once.frames, [first, second])
+    at = {name: int((SHOWN.time < t).sum()) for name, t in (("let", 4.0), ("taken", 4.5))}
+    place = frames["bottle"].position
+    torch.testing.assert_close(place[at["let"] :], place[at["let"]].expand(121 - at["let"], 3))
+    grasp = state.pose("bottle")[at["taken"]].seen_from(STATE.pose(RIGHT)[at["taken"]])
+    carried = STATE.pose(RIGHT)[at["taken"] :].compose(grasp)
+    torch.testing.assert_close(state.position("bottle")[at["taken"] :], carried.position)
+    _, never = held_objects(STATE, SHOWN.time, SHOWN.frames, [Hold("bottle", HAND, 99.0)])
+    assert torch.equal(never["bottle"].position, SHOWN.frames["bottle"].position)
+    _, always = held_objects(STATE, SHOWN.time, SHOWN.frames, [Hold("bottle", HAND)])
+    assert (always["bottle"].position == SHOWN.frames["bottle"].position[0]).all()
+
+
+def test_local_data_follow_the_same_rule():
+    place, thing = RelativePosition(HAND, "bottle"), RelativePosition(HAND, "bottle", held=True)
+    robot = upper_body()
+    held = thing.local(SHOWN, robot, [HELD])
+    assert torch.equal(held, place.local(SHOWN, robot))  # as recorded
+    still = held[BEGIN:END] - held[BEGIN]
+    assert float(still.abs().max()) < 1e-3
+    nominal = place.local(at_first(SHOWN), robot)
+    assert torch.equal(place.local(SHOWN, robot, [HELD])[:END], nominal[:END])
+    put = operators()[1].local(SHOWN, robot, [HELD])
+    assert float(put[END:, :3].abs().max()) < 1e-3
+    unaware = replace(SHOWN, frames={**SHOWN.frames, "tray": SHOWN.frames["bottle"]})
+    other = RelativePosition(HAND, "tray")
+    assert torch.equal(other.local(unaware, robot, [HELD]), other.local(unaware, robot))

@@ -1,0 +1,192 @@
+"""Who holds what, found in demonstrations."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.carrying import ARRIVES, HAND, HELD, LEAVES, LIFTS, PUTS, at_first, carries
+from tests.support.skills import few_bottles
+from tests.support.worlds import upper_body
+from tpgmm_torch import Demonstration, Frame, Hold, Kinematics, Poses, quaternions
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators import RelativePosition
+from tpgmm_torch.training.hold_detection import find_holds, holds_for
+
+TIME = torch.linspace(0, 6, 121, dtype=torch.float64)
+
+
+def along(x, y=0.0, z=0.0, turn=0.0) -> Frame:
+    """A path, in which numbers stand still."""
+    parts = [torch.as_tensor(part, dtype=torch.float64).expand(len(TIME)) for part in (x, y, z)]
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    angle = torch.as_tensor(turn, dtype=torch.float64).expand(len(TIME))
+    return Frame(torch.stack(parts, -1), quaternions.exp(angle[:, None] * axis))
+
+
+def ramp(begin: float, end: float) -> torch.Tensor:
+    return ((TIME - begin) / (end - begin)).clamp(0, 1)
+
+
+def shown(hands: dict[str, Frame], **objects: Frame) -> tuple[Demonstration, Poses]:
+    return Demonstration(TIME, Poses.joints(hands), objects), Poses(tuple(hands))
+
+
+def seen(frame: Frame, rng: np.random.Generator, size: float) -> Frame:
+    """With the noise of a tracker [m, and rad / m]."""
+    shape = len(frame.position), 3
+    shift, turn = (torch.from_numpy(size * rng.standard_normal(shape)) for _ in range(2))
+    turned = quaternions.product(quaternions.exp(5 * turn), frame.orientation)
+    return Frame(frame.position + shift, turned)
+
+
+class Gripping(Kinematics):
+    """Tracked bodies, and one number more."""
+
+    def __init__(self, poses: Poses) -> None:
+        self.poses, self.links = poses, poses.links
+        self.joint_names = (*poses.joint_names, "gripper")
+        self.upper = torch.full((len(self.joint_names),), torch.inf, dtype=torch.float64)
+        self.lower, self.velocity = -self.upper, self.upper
+
+    def state(self, joints):
+        return replace(self.poses.state(self.joint_tensor(joints)[..., :-1]), joints=joints)
+
+
+def test_the_bottle_is_held_from_the_grasp_until_it_is_let_go():
+    [hold] = find_holds(carries(), upper_body())
+    assert (hold.frame, hold.link, hold.share) == ("bottle", HAND, 1.0)
+    assert ARRIVES <= hold.begin <= LIFTS and PUTS <= hold.end <= LEAVES
+    # between the instant of the grasp and that of the motion, to about a tick
+    assert abs(hold.begin - HELD.begin) < 0.1 and abs(hold.end - HELD.end) < 0.1
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.002])
+def test_trackers_are_noisy(noise):
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(
+            d,
+            frames={
+                n: seen(f, rng, noise) if f.batch_shape else f for n, f in d.frames.items()
+            },
+        )
+        for d in carries()
+    ]
+    [hold] = find_holds(noisy, upper_body())
+    assert (hold.frame, hold.link) == ("bottle", HAND)
+    # to within the time it takes to move by the tolerance
+    assert ARRIVES - 0.4 <= hold.begin <= LIFTS + 0.4
+    assert PUTS - 0.4 <= hold.end <= LEAVES + 0.4
+
+
+def test_what_never_moves_is_never_held():
+    assert find_holds(few_bottles(), upper_body()) == ()
+    assert find_holds([at_first(d) for d in carries()], upper_body()) == ()
+    still = [
+        replace(
+            d,
+            frames={
+                n: f[:1].expand((121,)) if f.batch_shape else f for n, f in d.frames.items()
+            },
+        )
+        for d in carries()
+    ]
+    assert find_holds(still, upper_body()) == ()
+
+
+def test_what_somebody_else_moves_is_not_held():
+    hands = {"left": along(0.1 * torch.sin(TIME)), "right": along(0.0, 1.0)}
+    demonstration, poses = shown(hands, cup=along(0.3 * ramp(1, 3), 0.2))
+    assert find_holds([demonstration], poses) == ()
+
+
+def test_one_after_the_other():
+    x, y = 0.4 * ramp(1, 2) + 0.2 * ramp(4, 5), 0.5 * ramp(0, 0.5) * (1 - ramp(5.2, 5.8))
+    left = along(0.4 * ramp(1, 2) - 0.3 * ramp(2.5, 3), 0.3 * (1 - ramp(0.1, 0.5)))
+    right = along(0.8 - 0.4 * ramp(2, 3) + 0.2 * ramp(4, 5), 0.1, y)
+    demonstration, poses = shown({"left": left, "right": right}, cup=along(x, turn=0.0))
+    first, second = find_holds([demonstration], poses)
+    assert (first.link, second.link) == ("left", "right")
+    assert 0.5 <= first.begin <= 1 and 2 <= first.end <= 2.6
+    assert 3 <= second.begin <= 4 and 5 <= second.end <= 5.3
+
+
+def test_a_pause_on_the_way_is_no_release():
+    x = 0.3 * ramp(1, 2) + 0.3 * ramp(4, 5)
+    hand = along(x - 0.2 * (1 - ramp(0, 0.5)), turn=x)
+    demonstration, poses = shown({"hand": hand}, cup=along(x, turn=x))
+    [hold] = find_holds([demonstration], poses)
+    assert 0.5 <= hold.begin <= 1 and hold.end == np.inf
+
+
+def test_of_two_hands_one_is_the_holder_in_all_demonstrations():
+    x = 0.3 * ramp(1, 3)
+    near = {"left": along(x, 0.2), "right": along(x, -0.2)}
+    rng, count = np.random.default_rng(0), 6
+    noisy = [
+        shown({n: seen(f, rng, 2e-4) for n, f in near.items()}, cup=along(x))
+        for _ in range(count)
+    ]
+    [hold] = find_holds([one for one, _ in noisy], noisy[0][1])
+    assert hold.link == "left" and hold.share == 1.0
+    # the right one slips
+    slipping = {"left": along(x, 0.2), "right": along(x, -0.2 - 0.008 * ramp(1, 3))}
+    demonstration, poses = shown(dict(reversed(slipping.items())), cup=along(x))
+    assert find_holds([demonstration], poses)[0].link == "left"
+
+
+def test_a_gripper_narrows_the_hold():
+    x = 0.3 * ramp(2, 3)
+    opening = 0.05 - 0.04 * ramp(1.4, 1.6) + 0.04 * ramp(4.4, 4.6)
+    demonstration, poses = shown({"hand": along(x)}, cup=along(x))
+    gripping = Gripping(poses)
+    joints = torch.cat((demonstration.joints, opening[:, None]), 1)
+    closing = replace(demonstration, joints=joints)
+    [alone] = find_holds([closing], gripping)
+    assert alone.begin < 1.2 and alone.end == np.inf
+    [hold] = find_holds([closing], gripping, grippers={"hand": "gripper"})
+    assert 1.5 <= hold.begin <= 2 and 3 <= hold.end <= 4.5
+
+
+def test_the_median_demonstration_counts_and_most_must_agree():
+    usual = list(carries()[:5])
+    odd = [at_first(usual[0]), usual[1]]
+    late = replace(usual[2], time=usual[2].time + 0.5)
+    [hold] = find_holds([*usual, late], upper_body())
+    [before] = find_holds(usual, upper_body())
+    assert abs(hold.begin - before.begin) < 0.05
+    [hold] = find_holds(odd, upper_body())
+    assert hold.share == 0.5
+    assert find_holds(odd, upper_body(), agreement=0.6) == ()
+
+
+def test_what_cannot_be_is_refused():
+    one = list(carries()[:1])
+    with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['bottle', 'tray'\]"):
+        find_holds(one, upper_body(), frames=["cup"])
+    with pytest.raises(UnknownNameError, match="link 'tail' is not in the robot"):
+        find_holds(one, upper_body(), grippers={"tail": "l_elbow"})
+    with pytest.raises(UnknownNameError, match="joint 'finger' is not in the robot"):
+        find_holds(one, upper_body(), grippers={HAND: "finger"})
+    for name in ("tolerance", "angle"):
+        with pytest.raises(DataError, match=f"{name} must be positive and finite, got 0"):
+            find_holds(one, upper_body(), **{name: 0})
+
+
+def test_they_are_found_given_or_none():
+    robot, demonstrations = upper_body(), carries()
+    seen_from_bottle, seen_from_tray = (
+        [RelativePosition(HAND, name)] for name in ("bottle", "tray")
+    )
+    assert holds_for("auto", demonstrations, seen_from_bottle, robot) == find_holds(
+        demonstrations, robot
+    )
+    assert holds_for("auto", demonstrations, seen_from_tray, robot) == ()
+    assert holds_for(None, demonstrations, seen_from_bottle, robot) == ()
+    assert holds_for([HELD], demonstrations, seen_from_bottle, robot) == (HELD,)
+    with pytest.raises(
+        UnknownNameError, match=r"'cup' is not in the demonstration \(hold cup@"
+    ):
+        holds_for([Hold("cup", HAND)], demonstrations, seen_from_bottle, robot)

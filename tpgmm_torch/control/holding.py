@@ -1,0 +1,268 @@
+"""What robots hold: where objects were last free, and what moves with a link."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold, check_holds
+from tpgmm_torch.exceptions import UnknownNameError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import carried_objects
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+
+__all__ = ["Held", "Holding"]
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Who holds an object, and how.
+
+    Parameters
+    ----------
+    carrier : int, or Tensor of int, of shape (...)
+        The index of the link that holds it, for all robots or each of them; -1 if it is free.
+    grasp : Frame, optional
+        Its pose in that link; None if it was not held yet.
+    told : bool, or Tensor of bool, of shape (...)
+        Whether what was told at run time counts, and no longer the holds of the model.
+    """
+
+    carrier: int | Tensor = -1
+    grasp: Frame | None = None
+    told: bool | Tensor = False
+
+
+@dataclass(frozen=True, eq=False)
+class Holding:
+    """The objects of a batch of robots, in one moment of a skill; made by :meth:`start`.
+
+    While an object is free, its frame is where it is seen. From the tick at which a link takes
+    it, its frame, as a place, stays as it was, and, as a thing, it moves with the link; when
+    the link lets go, it stays where that was, until it is seen elsewhere.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    holds : tuple of Hold
+    objects : tuple of str
+        Those that operators refer to as things.
+    frames : mapping of str to Frame
+        Where all objects were when they were last free, as operators take them.
+    held : mapping of str to Held
+        Objects that are held now, or were.
+    """
+
+    kinematics: Kinematics
+    holds: tuple[Hold, ...]
+    objects: tuple[str, ...]
+    frames: Mapping[str, Frame]
+    held: Mapping[str, Held] = field(default_factory=dict)
+
+    @classmethod
+    def start(
+        cls,
+        kinematics: Kinematics,
+        operators: Sequence[Operator],
+        holds: Sequence[Hold],
+        frames: Mapping[str, Frame],
+    ) -> Self:
+        """Before anything is held.
+
+        Parameters
+        ----------
+        kinematics : Kinematics
+        operators : sequence of Operator
+            What refers to objects.
+        holds : sequence of Hold
+            Those of the model, or others.
+        frames : mapping of str to Frame
+            Where the objects are.
+
+        Raises
+        ------
+        UnknownNameError, DataError
+            If a frame or a link is not known, or an object is held by two links at once.
+        """
+        checked = check_holds(holds, frames, kinematics.links)
+        return cls(kinematics, checked, carried_objects(operators, kinematics), dict(frames))
+
+    @property
+    def carries(self) -> bool:
+        """Whether an object that operators refer to as a thing may be held by some robot."""
+        return any(
+            name in self.held and self.held[name].grasp is not None for name in self.objects
+        )
+
+    def advance(
+        self,
+        time: float | Tensor,
+        joints: Tensor,
+        frames: Mapping[str, Frame] | None = None,
+        told: Mapping[str, str | None] | None = None,
+        where: Tensor | None = None,
+    ) -> Self:
+        """The next moment.
+
+        Parameters
+        ----------
+        time : float, or Tensor of shape () or (...)
+            In the skill [s]: the holds' times are in it.
+        joints : Tensor of shape (..., n_joints)
+            Where the robots stand [rad or m].
+        frames : mapping of str to Frame, optional
+            Objects that are seen now. Those that are held may be left out; one that is seen
+            exactly where it was taken, when it is let go, counts as not seen.
+        told : mapping of str to str or None, optional
+            For objects of which it is known, the link that holds them from now on; None if
+            they are free from now on. The model's holds of that object no longer count.
+        where : Tensor of bool, of shape (...), optional
+            For which robots that is told; by default for all.
+
+        Raises
+        ------
+        UnknownNameError
+            If what is told names a frame or link that does not exist.
+        """
+        for name in told or ():
+            if name not in self.frames:
+                raise UnknownNameError("frame", name, "the situation", self.frames)
+        if not self.holds and not self.held and not told:
+            return self if not frames else replace(self, frames={**self.frames, **frames})
+        places, held, seen = {**self.frames, **(frames or {})}, dict(self.held), frames or {}
+        time = time.item() if isinstance(time, Tensor) and not time.ndim else time
+        state: RobotState | None = None
+        for name in dict.fromkeys((*(hold.frame for hold in self.holds), *held, *(told or ()))):
+            before = held.get(name, FREE)
+            carrier, is_told = self._carrier(name, time, before, told or {}, where)
+            place = self.frames[name]
+            if _equal(carrier, before.carrier):
+                places[name] = _choose(_held(carrier), place, seen.get(name, place))
+                if is_told is not before.told:
+                    held[name] = replace(before, told=is_told)
+                continue
+            state = self.kinematics.state(joints) if state is None else state
+            now = self._now(name, before, seen.get(name), state)
+            held[name] = self._taken(before, carrier, is_told, now, state)
+            still = _held(before.carrier) & _held(carrier)
+            places[name] = _choose(still, place, now)
+        same = held.keys() == self.held.keys() and all(held[n] is self.held[n] for n in held)
+        return replace(self, frames=places, held=self.held if same else held)
+
+    def state(self, state: RobotState) -> RobotState:
+        """The state of the robots with what they hold, as operators refer to it.
+
+        Parameters
+        ----------
+        state : RobotState
+            Of the robots alone.
+        """
+        for name in self.objects:
+            if name in self.held and self.held[name].grasp is not None:
+                state = self._with(state, name, self.held[name])
+        return state
+
+    def _carrier(
+        self,
+        name: str,
+        time: float | Tensor,
+        before: Held,
+        told: Mapping[str, str | None],
+        where: Tensor | None,
+    ) -> tuple[int | Tensor, bool | Tensor]:
+        """Who holds an object now, and for which robots that was told."""
+        carrier: int | Tensor = -1
+        for hold in self.holds:
+            if hold.frame == name:
+                now = (hold.begin <= time) & (time < hold.end)
+                carrier = _choose_index(now, self.kinematics.links.index(hold.link), carrier)
+        carrier = _choose_index(before.told, before.carrier, carrier)
+        if name not in told:
+            return carrier, before.told
+        link = told[name]
+        if link is not None and link not in self.kinematics.links:
+            raise UnknownNameError("link", link, "the robot", self.kinematics.links)
+        index = -1 if link is None else self.kinematics.links.index(link)
+        if where is None:
+            return index, True
+        return _choose_index(where, index, carrier), before.told | where
+
+    def _now(self, name: str, before: Held, seen: Frame | None, state: RobotState) -> Frame:
+        """Where an object is that is taken or let go."""
+        place = self.frames[name]
+        if before.grasp is None:
+            return place if seen is None else seen
+        carried = self._with(state, name, before).pose(name)
+        if seen is None:
+            return carried
+        elsewhere = (seen.position != place.position).any(-1)
+        elsewhere = elsewhere | (seen.orientation != place.orientation).any(-1)
+        return _choose(elsewhere | ~torch.as_tensor(_held(before.carrier)), seen, carried)
+
+    def _taken(
+        self,
+        before: Held,
+        carrier: int | Tensor,
+        told: bool | Tensor,
+        now: Frame,
+        state: RobotState,
+    ) -> Held:
+        """Who holds an object from now on, and how."""
+        grasp = before.grasp
+        for index in _indices(carrier):
+            other = now.seen_from(state.pose(self.kinematics.links[index]))
+            if grasp is None:
+                grasp = other
+            news = torch.as_tensor(carrier == index) & torch.as_tensor(before.carrier != index)
+            grasp = _choose(news, other, grasp)
+        return Held(carrier, grasp, told)
+
+    def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
+        """A state with an object as a link: free for some robots, held by others."""
+        assert held.grasp is not None
+        links = self.kinematics.links
+        if isinstance(held.carrier, int) and held.carrier >= 0:
+            return state.with_link(name, links[held.carrier], held.grasp)
+        state = state.with_link(name, None, self.frames[name])
+        for index in _indices(held.carrier):
+            where = torch.as_tensor(held.carrier == index)
+            state = state.with_link(name, links[index], held.grasp, where)
+        return state
+
+
+FREE = Held()
+
+
+def _indices(carrier: int | Tensor) -> list[int]:
+    """The links that hold something."""
+    each = [carrier] if isinstance(carrier, int) else carrier.unique().tolist()
+    return [index for index in each if index >= 0]
+
+
+def _held(carrier: int | Tensor) -> bool | Tensor:
+    return carrier >= 0
+
+
+def _equal(one: int | Tensor, other: int | Tensor) -> bool:
+    same = one == other
+    return bool(same.all()) if isinstance(same, Tensor) else same
+
+
+def _choose_index(where: bool | Tensor, one: int | Tensor, other: int | Tensor) -> int | Tensor:
+    if isinstance(where, bool):
+        return one if where else other
+    return torch.where(where, torch.as_tensor(one), torch.as_tensor(other))
+
+
+def _choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:
+    """One pose for some robots, the other for the rest."""
+    if isinstance(where, bool):
+        return one if where else other
+    mask = where[..., None]
+    position = torch.where(mask, one.position, other.position)
+    return Frame._from(position, torch.where(mask, one.orientation, other.orientation))

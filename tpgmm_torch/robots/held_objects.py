@@ -1,0 +1,67 @@
+"""Where objects were, in a recording of a robot that held them: as places, and as things."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.robots.kinematics import RobotState
+
+__all__ = ["held_objects"]
+
+
+def held_objects(
+    state: RobotState, time: Tensor, frames: Mapping[str, Frame], holds: Sequence[Hold]
+) -> tuple[RobotState, dict[str, Frame]]:
+    """Objects that were held as links of the state, and as the places where they were free.
+
+    Parameters
+    ----------
+    state : RobotState
+        Of a recording, with leading shape (T,).
+    time : Tensor of shape (T,)
+        Seconds.
+    frames : mapping of str to Frame
+        Recorded poses: one for each instant; or one, where an object was when it was first
+        held, from where the link that holds it carries it.
+    holds : sequence of Hold
+        In the order of time.
+
+    Returns
+    -------
+    state : RobotState
+        With the objects that were held, wherever they were: what an operator refers to as a
+        thing.
+    frames : dict of str to Frame
+        While an object is held, its frame is where it was last free: a place.
+    """
+    places = dict(frames)
+    for name in dict.fromkeys(hold.frame for hold in holds):
+        recorded, pose = bool(frames[name].batch_shape), frames[name].expand(time.shape)
+        last_free = torch.arange(len(time), device=time.device)
+        for hold in holds:
+            # the first instants that are not before
+            begin, end = (int((time < at).sum()) for at in (hold.begin, hold.end))
+            if hold.frame == name and begin < end:
+                last_free[begin:end] = begin
+                pose = pose if recorded else _carried(state, pose, hold.link, begin, end)
+        state = state.with_link(name, None, pose)
+        places[name] = pose[last_free]
+    return state, places
+
+
+def _carried(state: RobotState, pose: Frame, link: str, begin: int, end: int) -> Frame:
+    """Poses (T,) of what a link carries between two instants, and leaves where it is then."""
+    hand = state.pose(link)
+    grasp = pose[begin].seen_from(hand[begin])
+    instants = torch.arange(len(hand.position), device=hand.position.device)
+    there = hand[instants.clamp(max=min(end, len(instants) - 1))].compose(grasp)
+    before = (instants <= begin)[:, None]
+    return Frame._from(
+        torch.where(before, pose.position, there.position),
+        torch.where(before, pose.orientation, there.orientation),
+    )

@@ -1,0 +1,275 @@
+"""Which link held which object, and when: found in demonstrations.
+
+An object is held by a link while it moves and its pose in the link does not change. It must
+move for that: of one that stands still beside a hand that stands still nothing can be said, and
+poses that were recorded once, where an object was at first, are never held.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.affine import Affine
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold, check_holds
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["find_holds", "holds_for"]
+
+#: What moved by less than so many tolerances may as well have been jolted, or seen badly.
+TRAVEL = 3.0
+#: A grasp is steady to this share of the tolerance, at best.
+FINEST = 0.1
+#: A link that held an object for a smaller share of the time than another is not its holder.
+LONG = 0.8
+#: Over so long motion is measured [s]: less is noise, more blurs where it begins.
+WINDOW = 0.2
+
+
+#: Opening of a gripper, as a share of its range, that is no opening.
+STILL = 0.1
+#: How far poses are from others, in units of the tolerances: at least 0, at most 1 if alike.
+Change = Callable[[Frame, Frame], Tensor]
+
+
+def find_holds(
+    demonstrations: Sequence[Demonstration],
+    kinematics: Kinematics,
+    *,
+    frames: Sequence[str] | None = None,
+    grippers: Mapping[str, str] | None = None,
+    tolerance: float = 0.01,
+    angle: float = 0.1,
+    agreement: float = 0.5,
+) -> tuple[Hold, ...]:
+    """Find from when to when objects move rigidly with a link, alike in the demonstrations.
+
+    A hold begins between the instant from which the object's pose in the link is constant and
+    the one at which it starts to move, in the middle; it ends likewise. Over demonstrations,
+    which should be aligned in time, the median counts. Where two hands carry an object, the
+    holder is the one in which it is steadier in most demonstrations.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        With objects recorded over time; what was recorded once is never held.
+    kinematics : Kinematics
+        Whose links may hold.
+    frames : sequence of str, optional
+        Where to look; by default all frames.
+    grippers : mapping of str to str, optional
+        For links that have one, the joint that opens and closes it: a link holds as long as
+        that stands still too, to a tenth of its range.
+    tolerance : float, default=0.01
+        How much an object's position in the link may change while it is held [m].
+    angle : float, default=0.1
+        How much it may turn [rad].
+    agreement : float, default=0.5
+        The share of the demonstrations that must show the same holds of an object in the same
+        order; otherwise it counts as never held.
+
+    Returns
+    -------
+    tuple of Hold
+        In the order of time; ``share`` says how many of the demonstrations show it.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such frame, link or joint.
+    DataError
+        If a tolerance is not positive.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from tpgmm_torch import Demonstration, Frame, Poses
+    >>> time = torch.linspace(0, 4, 81, dtype=torch.float64)
+    >>> x = torch.stack((time - 2, 0 * time, 0 * time), dim=-1)  # of the hand
+    >>> hand, cup = Frame(x), Frame(x.clamp(min=0))  # comes to the cup, and takes it along
+    >>> shown = Demonstration(time, Poses.joints({"hand": hand}), {"cup": cup})
+    >>> [hold] = find_holds([shown], Poses(["hand"]))
+    >>> hold.frame, hold.link, round(hold.begin, 1), hold.end
+    ('cup', 'hand', 2.0, inf)
+    """
+    for name, value in (("tolerance", tolerance), ("angle", angle)):
+        if not 0 < value < math.inf:
+            raise DataError(f"{name} must be positive and finite, got {value}")
+    known = demonstrations[0].frames
+    for frame in frames or ():
+        if frame not in known:
+            raise UnknownNameError("frame", frame, "the demonstration", known)
+    for link, joint in (grippers or {}).items():
+        if link not in kinematics.links:
+            raise UnknownNameError("link", link, "the robot", kinematics.links)
+        if joint not in kinematics.joint_names:
+            raise UnknownNameError("joint", joint, "the robot", kinematics.joint_names)
+    names = [name for name in (known if frames is None else frames) if kinematics.links]
+    change = _change_in(tolerance, angle)
+    found: dict[str, list[list[Hold]]] = {name: [] for name in names}
+    for demonstration in demonstrations:
+        motion: _Motion | None = None
+        for name in names:
+            pose, shown = demonstration.frames[name], list[Hold]()
+            recorded = pose.batch_shape and not isinstance(pose, Affine)
+            if recorded and float(change(pose[:1], pose).max()) > TRAVEL:
+                motion = motion or _Motion.of(demonstration, kinematics, grippers or {})
+                shown = motion.holds(name, pose.to(motion.time), change)
+            found[name].append(shown)
+    holds = [hold for each in found.values() for hold in _agreed(each, agreement)]
+    return check_holds(holds, known, kinematics.links)
+
+
+def _change_in(tolerance: float, angle: float) -> Change:
+    def change(one: Frame, other: Frame) -> Tensor:
+        distance = torch.linalg.vector_norm(other.position - one.position, dim=-1)
+        inner = (one.orientation * other.orientation).sum(-1).abs().clamp(max=1)
+        return torch.maximum(distance / tolerance, 2 * torch.acos(inner) / angle)
+
+    return change
+
+
+def holds_for(
+    holds: str | Sequence[Hold] | None,
+    demonstrations: Sequence[Demonstration],
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+) -> tuple[Hold, ...]:
+    """What an estimator's parameter ``holds`` comes to, once demonstrations are given.
+
+    Parameters
+    ----------
+    holds : "auto", sequence of Hold or None
+        Found, given, or none.
+    demonstrations : sequence of Demonstration
+        At least one.
+    operators : sequence of Operator
+        Only the frames that they refer to are looked at.
+    kinematics : Kinematics
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the holds that are given cannot be.
+    """
+    if holds is None:
+        return ()
+    if isinstance(holds, str):
+        names = frame_names(operators, kinematics)
+        return find_holds(demonstrations, kinematics, frames=names)
+    return check_holds(holds, demonstrations[0].frames, kinematics.links)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """One demonstration: where the links were, and how open their grippers, over time (T,)."""
+
+    time: Tensor
+    links: Mapping[str, Frame]
+    grippers: Mapping[str, Tensor]
+
+    @classmethod
+    def of(
+        cls, demonstration: Demonstration, kinematics: Kinematics, grippers: Mapping[str, str]
+    ) -> _Motion:
+        state = kinematics.state(demonstration.reordered(kinematics.joint_names).joints)
+        openings = {}
+        for link, joint in grippers.items():
+            opening = state.joints[:, kinematics.joint_names.index(joint)]
+            span = opening.amax() - opening.amin()
+            openings[link] = opening / (STILL * torch.where(span > 0, span, 1.0))
+        links = {link: state.pose(link) for link in kinematics.links}
+        return cls(demonstration.time.to(state.joints), links, openings)
+
+    def holds(self, name: str, pose: Frame, change: Change) -> list[Hold]:
+        """The holds of an object that had these poses (T,), in the order of time."""
+        later = torch.searchsorted(self.time, self.time + WINDOW / 2)
+        later = later.clamp(max=len(self.time) - 1)
+        sooner = torch.searchsorted(self.time, self.time - WINDOW / 2)
+        speed = change(pose[sooner], pose[later])
+        found: list[tuple[int, int, Hold]] = []
+        while float(speed.max()) > FINEST:
+            seed = int(speed.argmax())  # the faster it moves, the surer is who holds it
+            first, last = int(sooner[seed]), int(later[seed])
+            span = self._span(name, pose, seed, change)
+            if span is not None:
+                found.append(span)
+                first, last = span[:2]
+            speed[first : last + 1] = 0
+        holds: list[Hold] = []
+        for _, _, hold in sorted(found, key=lambda span: span[:2]):
+            before = holds[-1] if holds else None
+            if before is None or before.end < hold.begin - WINDOW:
+                holds.append(hold)
+            elif before.link == hold.link:  # it slipped
+                holds[-1] = replace(before, end=max(before.end, hold.end))
+            elif before.begin < hold.begin < hold.end:  # from hand to hand
+                holds[-1:] = [replace(before, end=hold.begin), hold]
+        return holds
+
+    def _span(
+        self, name: str, pose: Frame, seed: int, change: Change
+    ) -> tuple[int, int, Hold] | None:
+        """Around a moment in motion: who held the object, if anyone did, and for how long."""
+        carried: list[tuple[str, int, int, Tensor]] = []
+        for link, hand in self.links.items():
+            grasp = pose.seen_from(hand)
+            slip = change(grasp[seed : seed + 1], grasp)
+            if link in self.grippers:
+                opening = self.grippers[link]
+                slip = torch.maximum(slip, (opening - opening[seed]).abs())
+            first, last = _run(slip <= 1, seed)
+            if float(change(pose[first : first + 1], pose[first : last + 1]).max()) > TRAVEL:
+                carried.append((link, first, last, slip))
+        if not carried:
+            return None
+        # of several that hold it, the steadiest; the first, if there is no difference
+        longest = max(last - first for _, first, last, _ in carried)
+        carried = [one for one in carried if one[2] - one[1] >= LONG * longest]
+        slips = [float(slip[first : last + 1].mean()) for _, first, last, slip in carried]
+        steady = next(i for i, one in enumerate(slips) if one <= min(slips) + FINEST)
+        link, first, last, slip = carried[steady]
+        finest = 2 * float(slip[first : last + 1].quantile(0.9))
+        finest = min(max(finest, FINEST), 1.0)
+        # steady in the hand from `first` to `last`, in motion from `lifted` to `put`
+        first, last = _run(slip <= finest, seed)
+        at_rest = change(pose[first : first + 1], pose) <= finest
+        lifted = first + int((~at_rest[first : seed + 1]).int().argmax()) - 1
+        at_rest = change(pose[last : last + 1], pose) <= finest
+        put = last - int((~at_rest[seed : last + 1]).flip(0).int().argmax()) + 1
+        begin = float(self.time[first] + self.time[max(lifted, first)]) / 2
+        end = float(self.time[last] + self.time[min(put, last)]) / 2
+        if last == len(self.time) - 1:
+            end = math.inf
+        return (first, last, Hold(name, link, begin, end)) if begin < end else None
+
+
+def _run(true: Tensor, seed: int) -> tuple[int, int]:
+    """First and last index of the stretch around ``seed`` in which all are true."""
+    false = torch.nonzero(~true)[:, 0]
+    before, after = false[false < seed], false[false > seed]
+    first = int(before[-1]) + 1 if len(before) else 0
+    return first, int(after[0]) - 1 if len(after) else len(true) - 1
+
+
+def _agreed(shown: Sequence[list[Hold]], agreement: float) -> Iterator[Hold]:
+    """Of the holds of one object in each demonstration, what most of them show."""
+    orders = Counter(tuple(hold.link for hold in holds) for holds in shown if holds)
+    for order, count in orders.most_common(1):
+        if count < agreement * len(shown):
+            return
+        alike = [holds for holds in shown if tuple(hold.link for hold in holds) == order]
+        for holds in zip(*alike, strict=True):
+            begin, end = median(h.begin for h in holds), median(h.end for h in holds)
+            yield Hold(holds[0].frame, holds[0].link, begin, end, count / len(shown))
