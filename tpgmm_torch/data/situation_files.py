@@ -14,6 +14,9 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 __all__ = ["read_situations"]
 
+#: What a situation may have beside its start and its frames.
+TIMES = ("time", "frames_time")
+
 
 def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situation]:
     """Read a JSON list of situations.
@@ -21,8 +24,9 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
     Each is an object with ``joints``, a list of numbers or an object from joint names to
     numbers [rad or m]; ``frames``, an object from names to ``{"position": [x, y, z],
     "orientation": [w, x, y, z]}``, the orientation optional, or to task parameters
-    ``{"A": rows, "b": [...]}``, all also one per time step; and optionally ``time``, a list of
-    seconds.
+    ``{"A": rows, "b": [...]}``, all also one per time step; and optionally ``time`` and
+    ``frames_time``, lists of seconds: when references are wanted, and when the poses of frames
+    that move were recorded.
 
     Parameters
     ----------
@@ -66,7 +70,7 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
 
 
 def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
-    _check_keys(item, "a situation", required={"joints"}, optional={"frames", "time"})
+    _check_keys(item, "a situation", required={"joints"}, optional={"frames", *TIMES})
     frames = item.get("frames", {})
     if not isinstance(frames, dict):
         raise DataError(f"'frames' maps names to poses, got {frames!r}")
@@ -79,7 +83,8 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
             continue
         _check_keys(pose, what, required={"position"}, optional={"orientation"})
         poses[name] = Frame(pose["position"], pose.get("orientation"))
-    return Situation(_joints(item["joints"], joint_names), poses, item.get("time"))
+    times = {name: item.get(name) for name in TIMES}
+    return Situation(_joints(item["joints"], joint_names), poses, **times)
 
 
 def _joints(joints: Any, names: Sequence[str]) -> Any:

@@ -36,6 +36,15 @@ def test_a_frame_without_orientation_is_not_turned(tmp_path):
     assert situation.frames["cup"].orientation.tolist() == [1, 0, 0, 0]
 
 
+def test_frames_that_move_may_have_their_own_clock(tmp_path):
+    moving = {"position": [[0, 0, 0], [1, 0, 0]]}
+    items = [{"joints": [0, 0], "frames": {"cup": moving}, "frames_time": [0.0, 2.0]}]
+    [situation] = read_situations(written(tmp_path / "s.json", items), NAMES)
+    assert situation.time is None
+    frames = situation.frames_at(torch.tensor([0.5, 3.0], dtype=torch.float64))
+    assert frames["cup"].position[:, 0].tolist() == [0.25, 1.0]
+
+
 def test_task_parameters_are_written_as_they_are_called(tmp_path):
     frames = {"rail": {"A": [[2.0, 0.0], [0.0, 3.0]], "b": [1.0, 0.0]}, "cup": POSE}
     items = [{"joints": [0, 0], "frames": frames}]
