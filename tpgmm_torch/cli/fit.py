@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -71,8 +72,17 @@ def fit(
         learning(
             "What is learned together, repeatable: 'canonical' (the joints), "
             "'position:LINK@FRAME', 'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), "
-            "without @FRAME in the base frame; FRAME may be another link; '+' stacks. "
+            "without @FRAME in the base frame; FRAME may be another link, or held:FRAME an "
+            "object as it is carried, which LINK may be too; '+' stacks. "
             "Default: the poses of all links in all frames, stacked, and canonical."
+        ),
+    ] = None,
+    hold: Annotated[
+        list[str] | None,
+        learning(
+            "When a link holds an object, repeatable: FRAME@LINK:BEGIN-END in seconds, as in "
+            "'bottle@l_hand:4.3-' to the end; or 'none'. Default: found in episodes whose "
+            "frames were recorded over time."
         ),
     ] = None,
     n_components: Annotated[int, learning("K, the number of Gaussians.", min=1)] = 10,
@@ -140,6 +150,7 @@ def fit(
     under torchrun.
     """
     from tpgmm_torch.cli.training_data import read_training_data
+    from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.large_data.checkpoints import Checkpoint
     from tpgmm_torch.large_data.processes import joined_processes
@@ -147,6 +158,7 @@ def fit(
 
     write = model_format(output_format)
     operators = [parse_operator(text) for text in operator or ()]
+    given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
     recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
     links = kinematics.links if kinematics is not None else ()
@@ -158,6 +170,7 @@ def fit(
             n_components,
             operators or default_operators(links, list(data.frames)),
             kinematics,
+            holds=given if hold else "auto",
             covariance_type=covariance_type,
             reg_covar=reg_covar,
             tol=tol,
@@ -206,6 +219,10 @@ def _report(
     for number, operator in enumerate(model.operators_, start=1):
         size = operator.dimension(kinematics)
         lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"
+    for hold in model.holds_:
+        end = "the end" if math.isinf(hold.end) else f"{hold.end:.2f} s"
+        shown = f"{max(hold.begin, 0.0):.2f} s to {end} (in {hold.share:.0%} of them)"
+        lines[f"{hold.frame} held"] = f"by {hold.link} from {shown}"
     lines |= {
         "components": f"{model.n_components} ({model.covariance_type})",
         "iterations": f"{model.n_iter_}, {converged}",

@@ -6,7 +6,7 @@ import numpy as np
 
 from tests.support.command_line import UPPER_BODY, output, refusal
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import Demonstration, Poses, TaskParameterizedGMM
+from tpgmm_torch import Demonstration, Hold, Poses, TaskParameterizedGMM
 from tpgmm_torch.cli.fit import fit as fit_command
 from tpgmm_torch.operators.text import default_operators, format_operator
 
@@ -31,6 +31,33 @@ def test_fit_takes_operators_as_text(dataset, tmp_path):
     output("fit", dataset, *UPPER_BODY, *chosen, *few, "--out", tmp_path / "model")
     model = TaskParameterizedGMM.load(tmp_path / "model")
     assert [format_operator(operator) for operator in model.operators_] == operators
+
+
+def test_fit_takes_holds_as_text(dataset, tmp_path):
+    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear")
+    for given, holds in (
+        (("bottle@l_hand:5.25-",), [Hold("bottle", "l_hand", 5.25)]),
+        (
+            ("bottle@l_hand:5-6", "bottle@r_hand:6-"),
+            [Hold("bottle", "l_hand", 5, 6), Hold("bottle", "r_hand", 6)],
+        ),
+        (("none",), None),
+    ):
+        chosen = [word for text in given for word in ("--hold", text)]
+        text = output("fit", dataset, *UPPER_BODY, *chosen, *few, "--out", tmp_path / "model")
+        model = TaskParameterizedGMM.load(tmp_path / "model")
+        assert model.holds == holds and model.holds_ == tuple(holds or ())
+        assert ("by l_hand from 5.25 s to the end (in 100% of them)" in text) is (
+            "5.25-" in given[0]
+        )
+    line = refusal(
+        "fit", dataset, *UPPER_BODY, "--hold", "bottle", *few, "--out", tmp_path / "m"
+    )
+    assert "hold 'bottle' is not of the form FRAME@LINK:BEGIN-END" in line
+    line = refusal(
+        "fit", dataset, *UPPER_BODY, "--hold", "cup@l_hand", *few, "--out", tmp_path / "m"
+    )
+    assert "frame 'cup' is not in the demonstration" in line
 
 
 def test_fit_without_a_robot_learns_joints(dataset, tmp_path):
