@@ -91,10 +91,10 @@ class Stiffness:
     [499.8, 93.1, 11.0]
     """
 
-    lowest: Numbers = 10.0
+    lowest: Numbers = 5.0
     highest: Numbers = 400.0
-    effort: Numbers = 1.0
-    inertia: Numbers = 1.0
+    effort: Numbers = 0.1
+    inertia: Numbers = 0.1
     damping_ratio: float = math.sqrt(0.5)
 
     def __post_init__(self) -> None:

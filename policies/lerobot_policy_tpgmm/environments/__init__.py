@@ -16,13 +16,17 @@ from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["AlohaStateConfig", "BottleShakingConfig"]
+__all__ = ["AlohaStateConfig", "BottleShakingConfig", "BottleTorqueConfig"]
 
 _PACKAGE = "lerobot_policy_tpgmm"
 
 gym.register(
     id=f"{_PACKAGE}/BottleShaking-v0",
     entry_point=f"{_PACKAGE}.environments.bottle.shaking:BottleShakingEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/BottleTorque-v0",
+    entry_point=f"{_PACKAGE}.environments.bottle.torque:BottleTorqueEnv",
 )
 gym.register(
     id=f"{_PACKAGE}/AlohaState-v0",
@@ -103,6 +107,32 @@ class BottleShakingConfig(_StateEnvConfig):
     frequency: float | None = None
     amplitude: float | None = None
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))
+
+
+@EnvConfig.register_subclass("bottle_torque")
+@dataclass
+class BottleTorqueConfig(BottleShakingConfig):
+    """``--env.type=bottle_torque``: torque motors, gravity, and something in the way.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker, fps, mode, \
+    episode_length, pushes, noise, track, condition, frequency, amplitude, render_mode, \
+    render_width, render_height
+        As of :class:`BottleShakingConfig`.
+    control, obstacle
+        Options of
+        :class:`~lerobot_policy_tpgmm.environments.bottle.torque.BottleTorqueEnv`; here, actions
+        are references by default, as those of most policies.
+    """
+
+    task: str | None = "BottleTorque-v0"
+    control: str = "reference"
+    obstacle: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.control == "impedance":
+            self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(51,))
 
 
 @EnvConfig.register_subclass("aloha_state")

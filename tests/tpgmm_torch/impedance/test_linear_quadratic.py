@@ -121,7 +121,7 @@ def test_without_end_it_is_as_stiff_as_the_rule_says():
     covariance = 1e-4 * definite(n=3)
     path = torch.zeros(2, 3, dtype=torch.float64)
     plan = TrackingPlan.along(path, covariance.expand(2, 3, 3), dt=1e-4, effort=2.0)
-    rule = Stiffness(lowest=1e-9, highest=1e9, effort=2.0)
+    rule = Stiffness(lowest=1e-9, highest=1e9, effort=2.0, inertia=1.0)
     stiffness = rule.matrix(covariance)
     expected = torch.cat((stiffness, rule.damping(stiffness)), -1)
     torch.testing.assert_close(plan.gains[-1], expected, rtol=5e-3, atol=1e-2)

@@ -41,7 +41,7 @@ def test_the_geometric_mean_solves_its_equation():
 def test_without_bounds_it_is_the_linear_quadratic_regulator():
     # of the double integrator with unit inertia, for a cost of control that is isotropic
     covariance, effort = covariances() + 1e-4 * torch.eye(5), 3.0
-    rule = Stiffness(**FREE, effort=effort)
+    rule = Stiffness(**FREE, effort=effort, inertia=1.0)
     n = len(covariance)
     zero, one = np.zeros((n, n)), np.eye(n)
     a, b = np.block([[zero, one], [zero, zero]]), np.vstack((zero, one))
@@ -99,7 +99,7 @@ def test_what_is_not_known_is_soft_and_spares_the_others(value):
     covariance[1, 2, 3] = value
     stiffness = Stiffness().matrix(covariance)
     torch.testing.assert_close(stiffness[[0, 2]], expected[[0, 2]])
-    torch.testing.assert_close(stiffness[1], 10 * torch.eye(5).double())
+    torch.testing.assert_close(stiffness[1], 5 * torch.eye(5).double())
 
 
 def test_a_robot_of_a_batch_is_the_robot_alone():
@@ -129,7 +129,7 @@ def test_it_changes_at_most_half_as_fast_as_the_covariance():
 
 
 def test_modes_have_the_damping_ratio():
-    rule = Stiffness(damping_ratio=0.6)
+    rule = Stiffness(inertia=1.0, damping_ratio=0.6)
     inertia, stiffness = covariances(4, seed=4), rule.matrix(covariances(4))
     damping = rule.damping(stiffness, inertia)
     for m, d, k in zip(inertia.numpy(), damping.numpy(), stiffness.numpy(), strict=True):

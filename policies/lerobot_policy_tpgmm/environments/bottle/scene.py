@@ -24,7 +24,17 @@ except ModuleNotFoundError as error:
         "bottle_shaking needs MuJoCo: pip install 'lerobot_policy_tpgmm[environments]'"
     ) from error
 
-__all__ = ["CAMERA", "FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "bottle_model"]
+__all__ = [
+    "CAMERA",
+    "DAMPING",
+    "FOOT",
+    "STIFFNESS",
+    "TABLE_LOW",
+    "TIMESTEP",
+    "BottleScene",
+    "Snapshot",
+    "bottle_spec",
+]
 
 #: Of the simulation and of the position control of the joints [s].
 TIMESTEP = 1e-3
@@ -44,12 +54,12 @@ _DIVERGED = [
 _TABLE, _PALM = 1, 2  # what collides with the bottle, as bits; nothing else collides
 
 
-def bottle_model() -> mujoco.MjModel:
-    """Compile the model.
+def bottle_spec() -> mujoco.MjSpec:
+    """What the model is made of.
 
     Returns
     -------
-    mujoco.MjModel
+    mujoco.MjSpec
         The robot's joints in the URDF's order with a position actuator each, then the bottle's
         free joint; bodies ``bottle`` and ``table``; geoms ``bottle``, ``l_palm`` and
         ``r_palm``; a weld between each hand and the bottle, not active.
@@ -72,7 +82,7 @@ def bottle_model() -> mujoco.MjModel:
         weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2="bottle")
         weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
     _add_view(spec)
-    return spec.compile()
+    return spec
 
 
 def _add_table(spec: Any) -> None:
@@ -141,6 +151,11 @@ class Snapshot:
 class BottleScene:
     """The state of the simulated world, and what can happen in it.
 
+    Parameters
+    ----------
+    spec : mujoco.MjSpec, optional
+        That of :func:`bottle_spec`, with more in it.
+
     Attributes
     ----------
     model : mujoco.MjModel
@@ -149,8 +164,8 @@ class BottleScene:
         Whether the bottle is attached to both hands.
     """
 
-    def __init__(self) -> None:
-        self.model = model = bottle_model()
+    def __init__(self, spec: mujoco.MjSpec | None = None) -> None:
+        self.model = model = (bottle_spec() if spec is None else spec).compile()
         self.data = mujoco.MjData(model)
         self.held = False
         self._n = model.nu
@@ -159,10 +174,6 @@ class BottleScene:
         self._bottle, self._table = model.body("bottle").id, model.body("table").id
         self._surface = model.geom("bottle").id
         self._unit_inertia = model.body_inertia[self._bottle].copy()  # of 1 kg
-        # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
-        # is its damping, the joint's own and the control's: so much it has to be led
-        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
-        self._lead = damping / model.actuator_gainprm[:, 0]
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -216,17 +227,30 @@ class BottleScene:
             From outside, during each time step [N m].
         """
         model, data, n = self.model, self.data, self._n
-        control = references[1:] + self._lead * np.diff(references, axis=0) / TIMESTEP
+        control = self._controls(references[1:], np.diff(references, axis=0) / TIMESTEP)
         for i in range(len(control)):
-            data.ctrl[:] = control[i]
             if torques is not None:
                 data.qfrc_applied[:n] = torques[i]
-            mujoco.mj_step(model, data)
+            self._step(control[i])
         if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
             raise DataError(f"the simulation diverges at {references[-1].tolist()}")
         mujoco.mj_kinematics(model, data)
         if self.held:
             self._sink(len(control) * TIMESTEP)
+
+    def _controls(
+        self, references: NDArray[np.float64], speeds: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """What the actuators are told at each time step."""
+        # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
+        # is its damping, the joint's own and the control's: so much it has to be led
+        model = self.model
+        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
+        return references + damping / model.actuator_gainprm[:, 0] * speeds
+
+    def _step(self, control: NDArray[np.float64]) -> None:
+        self.data.ctrl[:] = control
+        mujoco.mj_step(self.model, self.data)
 
     def place(self, joints: NDArray[np.float64], seconds: float) -> None:
         """Put the joints somewhere without dynamics.
