@@ -10,12 +10,12 @@ import stat
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["open_whole", "read_whole", "recover", "replacing"]
+__all__ = ["consistent", "open_whole", "read_whole", "recover", "replacing"]
 
 # How Linux and macOS let two names change places: <fcntl.h>, <linux/fs.h>, <sys/stdio.h>.
 AT_FDCWD, RENAME_EXCHANGE, RENAME_SWAP = -100, 2, 2
@@ -127,6 +127,39 @@ def open_whole(path: str | Path) -> Iterator[BinaryIO]:
             )
         file.seek(0)
         yield file
+
+
+def consistent[T](path: str | Path, read: Callable[[], T]) -> T:
+    """What ``read`` returns of a folder that may be replaced meanwhile.
+
+    Parameters
+    ----------
+    path : str or Path
+        The folder; :func:`recover` is called for it.
+    read : callable
+        Reads some of its files. It is called again if another folder has taken the place in
+        between, of which the second file may have come; its errors count where none has.
+    """
+    path = Path(path)
+    while True:
+        recover(path)
+        before = _identity(path)
+        try:
+            result = read()
+        except Exception:
+            if _identity(path) == before:
+                raise
+            continue
+        if _identity(path) == before:
+            return result
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def read_whole(path: str | Path) -> bytes:

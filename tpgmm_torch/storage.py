@@ -17,7 +17,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from tpgmm_torch.atomic import read_whole, recover, replacing
+from tpgmm_torch.atomic import consistent, read_whole, replacing
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["Folder"]
@@ -134,7 +134,9 @@ class Folder:
             If a file is missing, truncated, changed, or of another version.
         """
         path = Path(path)
-        recover(path)
+        return consistent(path, lambda: self._checked(path))
+
+    def _checked(self, path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         config = self._read(path / CONFIG, json.loads)
         blob = self._read(path / self.tensors, bytes)
         if not isinstance(config, dict) or config.get("format") != self._format:

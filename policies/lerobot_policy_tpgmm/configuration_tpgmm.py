@@ -109,8 +109,9 @@ class TPGMMConfig(StatePolicyConfig):
         the data set: LeRobot tells a policy neither.
     units : str or dict, optional
         Unit of the joints in states and actions: ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, or
-        ``[factor, offset]`` that bring a value to radians; for all, or by name. By default
-        what the data set declares, else radians (and metres).
+        ``[factor, offset]`` that bring a value to radians; for all, or by name; to begin with,
+        the path of LeRobot's calibration file, ``"arm.json"``. By default what the data set
+        declares, else radians (and metres).
     frames : dict of str to list, optional
         Where the seven values x y z qw qx qy qz of each frame are: positions in
         ``observation.environment_state``, or names of entries of it or of

@@ -9,6 +9,7 @@ from typing import Any
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import default_operators
@@ -35,6 +36,10 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
     config.fps = float(dataset.fps)
     if config.units is None:
         config.units = _units(dataset.features)
+    elif isinstance(config.units, str) and config.units.endswith(".json"):
+        names = config.state_names or []
+        scales = calibrated_units(config.units, tuple(names))
+        config.units = {name: [scale.factor, scale.offset] for name, scale in scales.items()}
     config.validate_features()
     config.input_features = {
         key: feature

@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets.signals import Signals
 from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["write_pretrained"]
@@ -52,7 +53,7 @@ def _replaceable(path: Path) -> bool:
         return False
     config = path / "config.json"
     try:
-        is_policy = json.loads(config.read_text()).get("type") == TPGMMPolicy.name
-    except (OSError, ValueError, AttributeError):
+        is_policy = json.loads(read_whole(config)).get("type") == TPGMMPolicy.name
+    except (OSError, ValueError, AttributeError, RecursionError):
         is_policy = False
     return is_policy or not any(path.iterdir())

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
-from tpgmm_torch.atomic import read_whole, recover, replacing
+from tpgmm_torch.atomic import consistent, read_whole, replacing
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["check_files", "read_tensors", "write_files"]
@@ -73,7 +73,10 @@ def check_files(directory: Path) -> bytes:
     ModelFileError
         If one cannot be read, or is not the one that was saved with the numbers.
     """
-    recover(directory)
+    return consistent(directory, lambda: _checked(directory))
+
+
+def _checked(directory: Path) -> bytes:
     file = directory / SAFETENSORS_SINGLE_FILE
     try:
         blob = read_whole(file)

@@ -1,5 +1,7 @@
 """What a data set tells: a policy that is to be trained, and ``tpgmm fit``."""
 
+import json
+
 import draccus
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_metadata import dataset
 from tests.support.policies import ENVIRONMENT, STATE, fitted
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_datasets.units import Scale
 from tpgmm_torch import Canonical, Robot
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.joint_space import JointSpace
@@ -105,3 +108,12 @@ def test_joints_are_chosen_by_patterns(joints):
     assert list(made.kinematics().joint_names) == chosen
     again = draccus.decode(TPGMMConfig, draccus.encode(made))
     assert again.joints == made.joints
+
+
+def test_units_may_be_the_calibration_of_the_robot(tmp_path):
+    motors = {name: {"drive_mode": 0, "range_min": 0, "range_max": 2048} for name in NAMES[:3]}
+    (tmp_path / "arm.json").write_text(json.dumps(motors))
+    made = config(**UPPER_BODY, units=str(tmp_path / "arm.json"))
+    adopt(made, dataset(20, **environment(POSE)))
+    scale = Scale.calibrated(0, 2048)
+    assert made.units == {name: [scale.factor, scale.offset] for name in NAMES[:3]}

@@ -1,6 +1,7 @@
 """Damaged files give what was saved, or an error that says so: nothing else, and at once."""
 
 import copy
+import json
 import re
 from collections import Counter
 
@@ -16,6 +17,7 @@ from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Demonstration, Robot, TaskParameterizedGMM
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.situation_files import read_situations
 from tpgmm_torch.exceptions import TPGMMError
 
 DEMONSTRATIONS = 50
@@ -178,6 +180,30 @@ def test_data_sets_without_check_sums(foreign, tmp_path, seeds):
         )
 
     check_all(foreign, tmp_path, TABLES, seeds, load_lerobot, consistent)
+
+
+# Situations
+
+
+def test_situations(tmp_path):
+    pose = {"position": [0.3, 0.0, 0.1], "orientation": [0.6, 0.0, 0.0, 0.8]}
+    affine = {"A": [[1.0, 0.0], [0.0, 2.0]], "b": [0.1, 0.2]}
+    given = [
+        {"joints": [0.1, 0.2], "frames": {"cup": pose, "view": affine}},
+        {"joints": {"elbow": 0.2, "shoulder": 0.1}, "time": [0.0, 0.5, 1.0]},
+    ]
+    original = tmp_path / "original"
+    original.mkdir()
+    (original / "situations.json").write_text(json.dumps(given))
+
+    def load(path):
+        return read_situations(path / "situations.json", ["shoulder", "elbow"])
+
+    def finite(found):
+        return all(bool(one.joints.isfinite().all()) and len(one.joints) == 2 for one in found)
+
+    for seeds in blocks(100, 2000):
+        check_all(original, tmp_path, WITH_JSON, seeds, load, finite)
 
 
 # URDFs

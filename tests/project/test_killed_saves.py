@@ -17,7 +17,7 @@ from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_torch import TaskParameterizedGMM, atomic
 from tpgmm_torch.large_data.checkpoints import FOLDER
 
-KILLS = 200 if FULL else 8
+KILLS = 200 if FULL else 4
 
 
 @pytest.fixture(params=["in one step", "in two"])
@@ -164,6 +164,26 @@ def test_a_writer_that_waits_too_long_says_for_whom(tmp_path, monkeypatch):
     with atomic.replacing(path) as new:  # a lock goes with its process
         new.mkdir()
     assert left_alone(path)
+
+
+@pytest.mark.usefixtures("exchange")
+def test_who_reads_while_it_is_saved_has_the_old_or_the_new(tmp_path):
+    path, model = tmp_path / "model", copy.deepcopy(skills.hands())
+    mean = model.means_[0].clone()
+
+    def save():
+        for number in range(30):
+            model.n_iter_, model.means_[0] = number, mean + number
+            model.save(path)
+
+    model.save(path)
+    pid, seen = forked(save), set()
+    while os.waitpid(pid, os.WNOHANG) == (0, 0):
+        found = TaskParameterizedGMM.load(path)
+        if found.n_iter_ != skills.hands().n_iter_:
+            assert torch.equal(found.means_[0], mean + found.n_iter_)
+        seen.add(found.n_iter_)
+    assert len(seen) > 2
 
 
 def test_savers_of_one_model_leave_a_whole_one(tmp_path):

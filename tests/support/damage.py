@@ -129,11 +129,13 @@ def exchange_files(root: Path, rng: np.random.Generator) -> str:
 def edit_json(root: Path, rng: np.random.Generator) -> str:
     path = one(files(root, ".json"), rng)
     content = json.loads(path.read_text())
-    holder, key = content, one(list(content), rng)
+    holder, key = [content], 0
     while isinstance(holder[key], dict | list) and holder[key] and rng.random() < 0.9:
         holder = holder[key]
         key = one(list(holder) if isinstance(holder, dict) else list(range(len(holder))), rng)
-    if rng.random() < 0.2:
+    if holder[key] is content:
+        content = one(VALUES, rng)
+    elif rng.random() < 0.2:
         del holder[key]
     else:
         holder[key] = one(VALUES, rng)

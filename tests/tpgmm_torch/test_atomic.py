@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tpgmm_torch import atomic
-from tpgmm_torch.atomic import read_whole, recover, replacing
+from tpgmm_torch.atomic import consistent, read_whole, recover, replacing
 
 #: A process that saves, and dies at the n-th thing that it asks of the system, for every n;
 #: prints what is there then.
@@ -213,3 +213,23 @@ def test_permissions_are_those_of_any_other_file(tmp_path):
             stat.S_IMODE((tmp_path / name).stat().st_mode) for name in (kind, f"new {kind}")
         }
         assert len(modes) == 1
+
+
+def test_a_folder_that_is_replaced_while_it_is_read_is_read_again(tmp_path):
+    path, reads = tmp_path / "saved", []
+    save(path, "old")
+
+    def read():
+        first = (path / "settings").read_text()
+        if not reads:
+            save(path, "new")
+        reads.append(first + (path / "weights").read_text())
+        if reads[-1] != 2 * first:
+            raise ValueError(reads[-1])
+        return reads[-1]
+
+    assert consistent(path, read) == "newnew"
+    assert reads == ["oldnew", "newnew"]
+    (path / "weights").write_text("else")
+    with pytest.raises(ValueError, match="newelse"):
+        consistent(path, read)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
@@ -53,10 +54,12 @@ def read_situations(path: str | Path, joint_names: Sequence[str]) -> list[Situat
     """
     path = Path(path)
     try:
-        items = json.loads(path.read_text(encoding="utf-8"))
+        items = json.loads(read_whole(path))
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
-    except ValueError as error:
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error}") from error
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not JSON: {error}") from error
     if not isinstance(items, list) or not items:
         raise DataError(f"{path} is to hold a list of situations, [{{'joints': ...}}, ...]")

@@ -59,6 +59,7 @@ def test_task_parameters_are_written_as_they_are_called(tmp_path):
     [
         ("[{", "is not JSON"),
         ([], "a list of situations"),
+        ("[" * 100_000, "is not JSON"),
         ({"joints": [0, 0]}, "a list of situations"),
         ([[0, 0]], "situation 0: a situation is an object"),
         ([{"joints": [0, 0]}, {"frames": {}}], "situation 1: a situation lacks 'joints'"),
