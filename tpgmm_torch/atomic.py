@@ -117,8 +117,9 @@ def open_whole(path: str | Path) -> Iterator[BinaryIO]:
         If it is missing; if it cannot be read to its end, like a pipe that nobody writes to;
         or if Git LFS has not fetched it.
     """
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    with os.fdopen(descriptor, "rb", closefd=True) as file:
+    flags = (getattr(os, name, 0) for name in ("O_NONBLOCK", "O_BINARY"))  # none has both
+    descriptor = os.open(path, os.O_RDONLY | sum(flags))
+    with os.fdopen(descriptor, "rb") as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise OSError(f"{path} is not a regular file")
         if file.read(len(POINTER)) == POINTER:

@@ -103,7 +103,7 @@ def describe_lerobot(path: str | Path) -> DatasetInfo:
     Parameters
     ----------
     path : str or Path
-        A folder, or an id on the hub, as in ``load_lerobot``.
+        A folder, or a name on the hub, as in ``load_lerobot``.
 
     Returns
     -------

@@ -35,7 +35,9 @@ def in_panel(panel: str) -> Callable[..., Any]:
 
 of_data, of_robot = in_panel("Data set"), in_panel("Robot")
 
-Dataset = Annotated[str, typer.Argument(help="A LeRobot data set: its folder, or its hub id.")]
+Dataset = Annotated[
+    str, typer.Argument(help="A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.")
+]
 Model = Annotated[Path, typer.Argument(metavar="DIR", help="A model that 'tpgmm fit' saved.")]
 Frames = Annotated[
     list[str] | None,
@@ -115,7 +117,7 @@ def recordings(
     Parameters
     ----------
     dataset : str
-        A folder or a hub id.
+        A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
     frames, episodes, units, joints, rate

@@ -29,7 +29,9 @@ EXAMPLE = (
 @app.command(epilog=EXAMPLE)
 def plot(
     model: options.Model,
-    dataset: Annotated[str, typer.Option(help="A LeRobot data set: its folder or hub id.")],
+    dataset: Annotated[
+        str, typer.Option(help="A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.")
+    ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the pictures go.")],
     joint: Annotated[
         list[str] | None,

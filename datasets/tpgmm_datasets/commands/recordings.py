@@ -30,7 +30,7 @@ class Recordings(plugins.Recordings):
     Parameters
     ----------
     dataset : str
-        A folder or a hub id.
+        A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
     frames, episodes, units
