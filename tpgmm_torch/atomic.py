@@ -65,6 +65,8 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     'new'
     """
     path = Path(path)
+    if path.name in ("", ".."):  # "." has no name of its own
+        path = path.resolve()
     made = [folder for folder in path.parents if not folder.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     with _alone(path):

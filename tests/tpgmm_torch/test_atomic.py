@@ -233,3 +233,14 @@ def test_a_folder_that_is_replaced_while_it_is_read_is_read_again(tmp_path):
     (path / "weights").write_text("else")
     with pytest.raises(ValueError, match="newelse"):
         consistent(path, read)
+
+
+@pytest.mark.usefixtures("exchange")
+@pytest.mark.parametrize("here", [".", "inner/.."])
+def test_the_present_folder_is_replaced_too(tmp_path, monkeypatch, here):
+    path = tmp_path / "saved"
+    (path / "inner").mkdir(parents=True)
+    monkeypatch.chdir(path)
+    save(here, "new")
+    assert names(tmp_path) == ["saved"]
+    assert names(path) == ["settings", "weights"]
