@@ -406,8 +406,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ----------
         time : float or Tensor of the batch shape
             Now [s].
-        state : RobotState, or array-like of shape (..., n_joints)
-            The last reference q_{t-1}, or what was measured.
+        state : RobotState, array-like of shape (..., n_joints), or mapping of str to array-like
+            The last reference q_{t-1}, or what was measured; joints may go by name.
         frames : mapping of str to Frame
             Object poses now, of shapes that broadcast with the batch.
         candidates : bool, default=False

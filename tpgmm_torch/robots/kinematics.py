@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -313,13 +314,23 @@ class Kinematics(abc.ABC):
     def joint_tensor(self, joints: Any) -> Tensor:
         """Convert joint vectors to the robot's dtype and device.
 
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints), or mapping of str to array-like
+            By name, each of shape (...); joints that the robot does not have are left out, as
+            a robot's driver reports wheels, too.
+
         Raises
         ------
         ShapeError
-            If the last dimension is not ``n_joints``.
+            If the last dimension is not ``n_joints``, or named joints differ in shape.
+        UnknownNameError
+            If one of the robot's joints is not among those named.
         DataError
             If a value is not finite.
         """
+        if isinstance(joints, Mapping):
+            joints = self._by_name(joints)
         tensor = as_tensor(joints, "joints").to(self.lower.device, self.lower.dtype)
         if tensor.ndim == 0 or tensor.shape[-1] != self.n_joints:
             raise ShapeError(
@@ -327,6 +338,16 @@ class Kinematics(abc.ABC):
                 f"{list(self.joint_names)}, got {tuple(tensor.shape)}"
             )
         return tensor
+
+    def _by_name(self, joints: Mapping[str, Any]) -> Tensor:
+        for name in self.joint_names:
+            if name not in joints:
+                raise UnknownNameError("joint", name, "the joints given", joints)
+        columns = [as_tensor(joints[name], f"joint {name!r}") for name in self.joint_names]
+        shapes = {tuple(column.shape) for column in columns}
+        if len(shapes) > 1:
+            raise ShapeError(f"joints given by name have one shape, got {sorted(shapes)}")
+        return torch.stack([column.to(self.lower) for column in columns], -1)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None

@@ -259,6 +259,24 @@ class TestOwnKinematics:
             single.joint_tensor([0.0, math.nan, 0.0])
 
 
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_joints_may_be_given_by_name(batch: tuple[int, ...]) -> None:
+    robot = upper_body()
+    joints = random_joints(robot, *batch)
+    named: dict[str, Any] = dict(zip(robot.joint_names, joints.unbind(-1), strict=True))
+    shuffled = {"wheel": "off"} | dict(reversed(named.items()))
+    assert torch.equal(robot.joint_tensor(shuffled), joints)
+    assert torch.equal(robot.state(shuffled).positions, robot.state(joints).positions)
+    first = robot.joint_names[0]
+    with pytest.raises(ShapeError, match="have one shape, got"):
+        robot.joint_tensor(shuffled | {first: np.zeros((2, 2))})
+    with pytest.raises(DataError, match=rf"joint '{first}' holds 1 value"):
+        robot.joint_tensor(shuffled | {first: math.nan})
+    del shuffled[first]
+    with pytest.raises(UnknownNameError, match=f"joint '{first}' is not in the joints given"):
+        robot.joint_tensor(shuffled)
+
+
 def test_dtypes_go_by_name() -> None:
     for dtype in (torch.float32, torch.float64):
         assert dtype_named(dtype_name(dtype)) == dtype
