@@ -9,12 +9,14 @@ of both hands, which share the waist, along minimum-jerk paths.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_datasets.robots import upper_body_urdf
@@ -29,7 +31,15 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["TASK", "BottleShaking", "upper_body"]
+__all__ = [
+    "TASK",
+    "BottleShaking",
+    "BottleSkill",
+    "attached",
+    "between",
+    "upper_body",
+    "upright",
+]
 
 #: What LeRobot data sets of the skill call it.
 TASK = "shake the bottle"
@@ -40,10 +50,10 @@ GRASP_POINT = {"l_hand": (0.0, 0.08, 0.0), "r_hand": (0.0, -0.08, 0.0)}
 GRASP_TURN = (math.cos(-math.pi / 4), 0.0, math.sin(-math.pi / 4), 0.0)
 #: Where the hands wait before they close, in the bottle's frame [m].
 APPROACH_POINT = {"l_hand": (-0.05, 0.14, 0.0), "r_hand": (-0.05, -0.14, 0.0)}
+#: Height of the bottle's centre above its foot [m].
+FOOT = 0.11
 #: Where the bottle is brought, upright [m].
 CHEST = np.array((0.24, 0.0, 0.18))
-#: The box in which bottles stand [m], and by how much they are turned to either side [deg].
-LOWEST, HIGHEST, YAW = (0.24, -0.05, 0.10), (0.32, 0.05, 0.20), 20.0
 #: Nominal seconds of each phase; 13 in all, as in the paper.
 PHASES = MappingProxyType(
     {
@@ -70,7 +80,160 @@ def upper_body(**options: object) -> Robot:
 
 
 @dataclass(frozen=True)
-class BottleShaking:
+class BottleSkill:
+    """What skills of two hands with a bottle share.
+
+    Parameters
+    ----------
+    rate : float, default=100.0
+        Time steps per second.
+    stretch : float, default=0.18
+        Durations are spread evenly between ``1 - stretch`` and ``1 + stretch`` of the nominal
+        one; each phase moreover takes up to 12 % more or less of its demonstration.
+    start_spread : float, default=0.05
+        Start postures differ by up to this in each joint [rad].
+
+    Attributes
+    ----------
+    robot : Robot
+        The 17-joint upper body.
+    """
+
+    #: Nominal seconds of each phase.
+    phases: ClassVar[Mapping[str, float]]
+    #: The box in which bottles stand [m], and by how much they are turned to either side [deg].
+    lowest: ClassVar[tuple[float, float, float]] = (0.24, -0.05, 0.10)
+    highest: ClassVar[tuple[float, float, float]] = (0.32, 0.05, 0.20)
+    yaw: ClassVar[float] = 20.0
+
+    rate: float = 100.0
+    stretch: float = 0.18
+    start_spread: float = 0.05
+    robot: Robot = field(default_factory=upper_body, repr=False)
+
+    def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
+        """``n`` upright bottles, anywhere in the box."""
+        return upright(rng, self.lowest, self.highest, self.yaw, n)
+
+    def start_postures(self, n: int, rng: np.random.Generator) -> Tensor:
+        """``n`` start postures around the neutral one, shape (n, 17) [rad]."""
+        spread = rng.uniform(-self.start_spread, self.start_spread, (n, self.robot.n_joints))
+        joints = self.neutral_posture()
+        return torch.clamp(
+            joints + torch.from_numpy(spread), self.robot.lower, self.robot.upper
+        )
+
+    def usual(self, bottle: Frame) -> bool:
+        """Whether a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
+        low, high = (
+            bottle.position.new_tensor(corner) for corner in (self.lowest, self.highest)
+        )
+        inside = (low - 1e-9 <= bottle.position) & (bottle.position <= high + 1e-9)
+        w, x, y, z = bottle.orientation.tolist()
+        turn = math.degrees(2 * math.atan2(z, w))
+        return bool(inside.all()) and math.hypot(x, y) < 1e-6 and abs(turn) < self.yaw + 1e-6
+
+    def grasp_error(self, joints: Tensor, bottle: Frame) -> tuple[Tensor, Tensor]:
+        """How far the hands are from where they should hold the bottle, the worse of both.
+
+        Parameters
+        ----------
+        joints : Tensor of shape (..., 17)
+        bottle : Frame
+            Its initial pose.
+
+        Returns
+        -------
+        position : Tensor of shape (...)
+            In metres.
+        orientation : Tensor of shape (...)
+            In radians.
+        """
+        state = self.robot.state(joints)
+        distance, angle = [], []
+        for hand in HANDS:
+            target = attached(bottle, GRASP_POINT[hand])
+            distance.append(
+                torch.linalg.vector_norm(state.position(hand) - target.position, dim=-1)
+            )
+            between = quaternions.product(
+                target.orientation, quaternions.conjugate(state.orientation(hand))
+            )
+            angle.append(torch.linalg.vector_norm(quaternions.log(between), dim=-1))
+        return torch.maximum(*distance), torch.maximum(*angle)
+
+    def neutral_posture(self) -> Tensor:
+        """The humanoid's published home posture, elbows out and bent, shape (17,) [rad]."""
+        joints = torch.zeros(self.robot.n_joints, dtype=torch.float64)
+        for side, sign in (("l", 1.0), ("r", -1.0)):
+            home = {
+                "shoulder_pitch": 0.5,
+                "shoulder_roll": 0.5 * sign,
+                "shoulder_yaw": -0.3 * sign,
+                "elbow": -1.57,
+            }
+            for name, value in home.items():
+                joints[self.robot.joint_names.index(f"{side}_{name}")] = value
+        return joints
+
+    def _phase_ends(self, n: int, rng: np.random.Generator) -> Tensor:
+        """When each phase ends, shape (n, n_phases) [s]."""
+        return torch.from_numpy(self._phase_lengths(n, rng).cumsum(1))
+
+    def _phase_lengths(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        nominal = np.array(list(self.phases.values()))
+        shares = nominal * rng.uniform(0.88, 1.12, (n, len(nominal)))
+        total = nominal.sum() * rng.permutation(np.linspace(-1, 1, n) * self.stretch + 1)
+        return np.asarray(shares / shares.sum(1, keepdims=True) * total[:, None])
+
+    def _nominal_ends(self, n: int) -> Tensor:
+        """The same without any spread."""
+        return (
+            torch.tensor(list(self.phases.values()), dtype=torch.float64)
+            .cumsum(0)
+            .expand(n, -1)
+        )
+
+    def _progress(self, time: Tensor, ends: Tensor) -> dict[str, Tensor]:
+        """How much of each phase is done at times (..., n), in [0, 1]."""
+        starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
+        done = ((time[..., None] - starts) / (ends - starts)).clamp(0, 1)
+        return dict(zip(self.phases, done.unbind(-1), strict=True))
+
+    def _steps(self, ends: Tensor) -> list[int]:
+        """How many time steps each demonstration has."""
+        return [int(last) + 1 for last in torch.floor(ends[:, -1] * self.rate + 1e-9)]
+
+    def _times(self, steps: int) -> Tensor:
+        return torch.arange(steps, dtype=torch.float64) / self.rate
+
+    def _follow(
+        self, starts: Tensor, wanted: Callable[[Tensor], list[Frame]], steps: int
+    ) -> Tensor:
+        """Inverse kinematics of all demonstrations at once, shape (steps, n, 17).
+
+        ``wanted`` gives the poses of both hands at times (n,).
+        """
+        robot = self.robot
+        weights = torch.ones(robot.n_joints, dtype=torch.float64)
+        weights[
+            [robot.joint_names.index(f"waist_{axis}") for axis in ("roll", "pitch", "yaw")]
+        ] = 0.3
+        neutral = self.neutral_posture()
+        limit = robot.velocity / self.rate
+        joints, out = starts, [starts]
+        for time in self._times(steps)[1:]:
+            targets = wanted(time.expand(len(starts)))
+            step = _least_squares(robot, joints, targets, weights, neutral, 1 / self.rate)
+            joints = torch.clamp(
+                joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
+            )
+            out.append(joints)
+        return torch.stack(out)
+
+
+@dataclass(frozen=True)
+class BottleShaking(BottleSkill):
     """Generator of demonstrations and situations of the bimanual bottle-shaking skill.
 
     Parameters
@@ -105,29 +268,11 @@ class BottleShaking:
     (17, ['bottle'])
     """
 
-    rate: float = 100.0
+    phases: ClassVar[Mapping[str, float]] = PHASES
     amplitude: float = 0.25
     cycles: float = 3.0
-    stretch: float = 0.18
-    start_spread: float = 0.05
     chest_spread: float = 0.005
     steady_rhythm: bool = False
-    robot: Robot = field(default_factory=upper_body, repr=False)
-
-    def bottle_poses(self, n: int, rng: np.random.Generator) -> Frame:
-        """``n`` bottle poses within reach: a box of 8 x 10 x 10 cm, turned by up to 20 deg."""
-        position = rng.uniform(LOWEST, HIGHEST, (n, 3))
-        half = np.radians(rng.uniform(-YAW, YAW, n)) / 2
-        zero = np.zeros(n)
-        return Frame(position, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=1))
-
-    def start_postures(self, n: int, rng: np.random.Generator) -> Tensor:
-        """``n`` start postures around the neutral one, shape (n, 17) [rad]."""
-        spread = rng.uniform(-self.start_spread, self.start_spread, (n, self.robot.n_joints))
-        joints = self.neutral_posture()
-        return torch.clamp(
-            joints + torch.from_numpy(spread), self.robot.lower, self.robot.upper
-        )
 
     def situations(self, n: int, seed: int = 0) -> list[Situation]:
         """New bottle poses and start postures.
@@ -180,22 +325,13 @@ class BottleShaking:
             As :meth:`demonstrations` gives them, of 13 s.
         """
         n = len(situations)
-        ends = torch.tensor(list(PHASES.values()), dtype=torch.float64).cumsum(0)
         return self._demonstrations(
             Frame.stack([situation.frames["bottle"] for situation in situations]),
             Frame(CHEST).expand((n,)),
             torch.stack([situation.joints for situation in situations]),
-            ends.expand(n, -1),
+            self._nominal_ends(n),
             torch.full((n,), self.amplitude, dtype=torch.float64),
         )
-
-    def usual(self, bottle: Frame) -> bool:
-        """Whether a bottle stands where :meth:`bottle_poses` may put one, but for rounding."""
-        low, high = (bottle.position.new_tensor(corner) for corner in (LOWEST, HIGHEST))
-        inside = (low - 1e-9 <= bottle.position) & (bottle.position <= high + 1e-9)
-        w, x, y, z = bottle.orientation.tolist()
-        turn = math.degrees(2 * math.atan2(z, w))
-        return bool(inside.all()) and math.hypot(x, y) < 1e-6 and abs(turn) < YAW + 1e-6
 
     def _demonstrations(
         self,
@@ -205,21 +341,30 @@ class BottleShaking:
         ends: Tensor,
         amplitudes: Tensor,
     ) -> list[Demonstration]:
-        lengths = torch.floor(ends[:, -1] * self.rate + 1e-9).long() + 1
-        joints = self._follow(bottles, chests, starts, ends, amplitudes, int(lengths.max()))
-        phases = list(PHASES)
+        paths = [_Path(self.robot.state(starts), hand, bottles, chests) for hand in HANDS]
+        lengths = self._steps(ends)
+        joints = self._follow(
+            starts,
+            lambda time: [path.at(self._progress(time, ends)) for path in paths],
+            max(lengths),
+        )
+        u = self._progress(self._times(max(lengths))[:, None], ends)["shake"]
+        ramp = minimum_jerk(8 * u) * minimum_jerk(8 * (1 - u))
+        swing = amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u)
+        joints[..., [self.robot.joint_names.index(name) for name in SHOULDERS]] += swing[
+            ..., None
+        ]
         demonstrations = []
-        for i in range(len(starts)):
-            end = dict(zip(phases, ends[i].tolist(), strict=True))
+        for i, steps in enumerate(lengths):
+            end = dict(zip(self.phases, ends[i].tolist(), strict=True))
             events = {
                 "grasp": (end["close"] + end["hold"]) / 2,
                 "shake": end["pause"],
                 "rest": end["shake"],
             }
-            steps = int(lengths[i])
             demonstrations.append(
                 Demonstration(
-                    torch.arange(steps, dtype=torch.float64) / self.rate,
+                    self._times(steps),
                     joints[:steps, i],
                     {"bottle": bottles[i]},
                     self.robot.joint_names,
@@ -228,100 +373,16 @@ class BottleShaking:
             )
         return demonstrations
 
-    def grasp_error(self, joints: Tensor, bottle: Frame) -> tuple[Tensor, Tensor]:
-        """How far the hands are from where they should hold the bottle, the worse of both.
-
-        Parameters
-        ----------
-        joints : Tensor of shape (..., 17)
-        bottle : Frame
-            Its initial pose.
-
-        Returns
-        -------
-        position : Tensor of shape (...)
-            In metres.
-        orientation : Tensor of shape (...)
-            In radians.
-        """
-        state = self.robot.state(joints)
-        distance, angle = [], []
-        for hand in HANDS:
-            target = _attached(bottle, GRASP_POINT[hand])
-            distance.append(
-                torch.linalg.vector_norm(state.position(hand) - target.position, dim=-1)
-            )
-            between = quaternions.product(
-                target.orientation, quaternions.conjugate(state.orientation(hand))
-            )
-            angle.append(torch.linalg.vector_norm(quaternions.log(between), dim=-1))
-        return torch.maximum(*distance), torch.maximum(*angle)
-
     def shoulders(self, trajectory: Trajectory | Demonstration) -> Tensor:
         """Both shoulder pitches of a motion, shape (T, 2) [rad]."""
         columns = [self.robot.joint_names.index(name) for name in SHOULDERS]
         return trajectory.joints[:, columns]
 
-    def neutral_posture(self) -> Tensor:
-        """The humanoid's published home posture, elbows out and bent, shape (17,) [rad]."""
-        joints = torch.zeros(self.robot.n_joints, dtype=torch.float64)
-        for side, sign in (("l", 1.0), ("r", -1.0)):
-            home = {
-                "shoulder_pitch": 0.5,
-                "shoulder_roll": 0.5 * sign,
-                "shoulder_yaw": -0.3 * sign,
-                "elbow": -1.57,
-            }
-            for name, value in home.items():
-                joints[self.robot.joint_names.index(f"{side}_{name}")] = value
-        return joints
-
-    def _phase_ends(self, n: int, rng: np.random.Generator) -> Tensor:
-        """When each phase ends, shape (n, n_phases) [s]."""
-        nominal = np.array(list(PHASES.values()))
-        shares = nominal * rng.uniform(0.88, 1.12, (n, len(nominal)))
-        total = nominal.sum() * rng.permutation(np.linspace(-1, 1, n) * self.stretch + 1)
-        lengths = shares / shares.sum(1, keepdims=True) * total[:, None]
+    def _phase_lengths(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        lengths = super()._phase_lengths(n, rng)
         if self.steady_rhythm:
             lengths[:, list(PHASES).index("shake")] = PHASES["shake"]
-        return torch.from_numpy(lengths.cumsum(1))
-
-    def _follow(
-        self,
-        bottles: Frame,
-        chests: Frame,
-        starts: Tensor,
-        ends: Tensor,
-        amplitudes: Tensor,
-        steps: int,
-    ) -> Tensor:
-        """Inverse kinematics of all demonstrations at once, shape (steps, n, 17)."""
-        robot, n = self.robot, len(starts)
-        weights = torch.ones(robot.n_joints, dtype=torch.float64)
-        weights[
-            [robot.joint_names.index(f"waist_{axis}") for axis in ("roll", "pitch", "yaw")]
-        ] = 0.3
-        neutral = self.neutral_posture()
-        shaken = [robot.joint_names.index(name) for name in SHOULDERS]
-        first = robot.state(starts)
-        paths = {hand: _Path(first, hand, bottles, chests) for hand in HANDS}
-        limit = robot.velocity / self.rate
-        joints, out = starts, [starts]
-        for k in range(1, steps):
-            progress = _progress(torch.full((n,), k / self.rate, dtype=torch.float64), ends)
-            wanted = [paths[hand].at(progress) for hand in HANDS]
-            step = _least_squares(robot, joints, wanted, weights, neutral, 1 / self.rate)
-            joints = torch.clamp(
-                joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
-            )
-            u = progress["shake"]
-            ramp = minimum_jerk(8 * u) * minimum_jerk(8 * (1 - u))
-            swing = torch.zeros_like(joints)
-            swing[:, shaken] = (amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u))[
-                :, None
-            ]
-            out.append(joints + swing)
-        return torch.stack(out)
+        return lengths
 
 
 class _Path:
@@ -330,15 +391,15 @@ class _Path:
     def __init__(self, start: RobotState, hand: str, bottle: Frame, chest: Frame) -> None:
         self.hand, self.bottle, self.chest = hand, bottle, chest
         self.start = Frame(start.position(hand), start.orientation(hand))
-        self.approach = _attached(bottle, APPROACH_POINT[hand])
-        self.grasp = _attached(bottle, GRASP_POINT[hand])
+        self.approach = attached(bottle, APPROACH_POINT[hand])
+        self.grasp = attached(bottle, GRASP_POINT[hand])
 
     def at(self, progress: Mapping[str, Tensor]) -> Frame:
-        pose = _between(self.start, self.approach, progress["reach"])
-        pose = _between(pose, self.grasp, progress["close"])
+        pose = between(self.start, self.approach, progress["reach"])
+        pose = between(pose, self.grasp, progress["close"])
         # from the grasp on the bottle moves, and the hand with it
-        carried = _between(self.bottle, self.chest, progress["bring"])
-        held = _attached(carried, GRASP_POINT[self.hand])
+        carried = between(self.bottle, self.chest, progress["bring"])
+        held = attached(carried, GRASP_POINT[self.hand])
         bringing = (progress["bring"] > 0)[:, None]
         return Frame(
             torch.where(bringing, held.position, pose.position),
@@ -346,25 +407,33 @@ class _Path:
         )
 
 
-def _attached(frame: Frame, point: tuple[float, ...]) -> Frame:
+def upright(
+    rng: np.random.Generator,
+    lowest: Sequence[float],
+    highest: Sequence[float],
+    yaw: float,
+    n: int,
+) -> Frame:
+    """``n`` poses in a box [m], turned about the vertical by up to ``yaw`` either way [deg]."""
+    position = rng.uniform(lowest, highest, (n, 3))
+    half = np.radians(rng.uniform(-yaw, yaw, n)) / 2
+    zero = np.zeros(n)
+    return Frame(position, np.stack((np.cos(half), zero, zero, np.sin(half)), axis=1))
+
+
+def attached(frame: Frame, point: tuple[float, ...]) -> Frame:
     """The grasp orientation at a point of a frame."""
     turn = torch.tensor(GRASP_TURN, dtype=torch.float64).expand_as(frame.orientation)
     where = torch.tensor(point, dtype=torch.float64)
     return Frame(frame.transform(where), quaternions.product(frame.orientation, turn))
 
 
-def _between(a: Frame, b: Frame, progress: Tensor) -> Frame:
+def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
+    """The pose on a minimum-jerk way from one to another, where ``progress`` of it is done."""
     u = minimum_jerk(progress)
     position = a.position + u[:, None] * (b.position - a.position)
     start, end = torch.broadcast_tensors(a.orientation, b.orientation)
     return Frame(position, quaternions.slerp(start, end, u))
-
-
-def _progress(time: Tensor, ends: Tensor) -> dict[str, Tensor]:
-    """How much of each phase is done, in [0, 1]."""
-    starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
-    done = ((time[:, None] - starts) / (ends - starts)).clamp(0, 1)
-    return dict(zip(PHASES, done.T, strict=True))
 
 
 def _least_squares(

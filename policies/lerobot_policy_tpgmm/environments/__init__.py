@@ -16,7 +16,7 @@ from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["AlohaStateConfig", "BottleShakingConfig", "BottleTorqueConfig"]
+__all__ = ["AlohaStateConfig", "BottleShakingConfig", "BottleTorqueConfig", "CarryAndPutConfig"]
 
 _PACKAGE = "lerobot_policy_tpgmm"
 
@@ -27,6 +27,10 @@ gym.register(
 gym.register(
     id=f"{_PACKAGE}/BottleTorque-v0",
     entry_point=f"{_PACKAGE}.environments.bottle.torque:BottleTorqueEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/CarryAndPut-v0",
+    entry_point=f"{_PACKAGE}.environments.bottle.carrying:CarryAndPutEnv",
 )
 gym.register(
     id=f"{_PACKAGE}/AlohaState-v0",
@@ -133,6 +137,33 @@ class BottleTorqueConfig(BottleShakingConfig):
     def __post_init__(self) -> None:
         if self.control == "impedance":
             self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(51,))
+
+
+@EnvConfig.register_subclass("carry_and_put")
+@dataclass
+class CarryAndPutConfig(_StateEnvConfig):
+    """``--env.type=carry_and_put``.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, mode, episode_length, pushes, noise, condition
+        Options of
+        :class:`~lerobot_policy_tpgmm.environments.bottle.carrying.CarryAndPutEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "CarryAndPut-v0"
+    fps: int = 100
+    mode: str = "dynamic"
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    condition: str = NOMINAL
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17, 2))
 
 
 @EnvConfig.register_subclass("aloha_state")

@@ -14,15 +14,33 @@ import torch
 import lerobot_policy_tpgmm.environments  # noqa: F401  registers what gym.make finds
 from lerobot_policy_tpgmm.environments.aloha.demonstrations import record_aloha
 from lerobot_policy_tpgmm.environments.aloha.robot import aloha_operators, aloha_robot
-from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS
+from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS, PUT_LIMITS
 from lerobot_policy_tpgmm.environments.disturbances import CONDITIONS, NOMINAL
 from tpgmm_datasets import save_lerobot
+from tpgmm_datasets.bottle.carrying import TASK as CARRY
+from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
 from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import TASK, BottleShaking
-from tpgmm_torch import Demonstration, Kinematics, Operator
+from tpgmm_datasets.bottle.skill import HANDS, TASK, BottleShaking
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    Kinematics,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["BENCHMARKS", "Benchmark", "benchmark"]
+
+
+#: How hard the robot moved, as the report shows it.
+PEAKS = {
+    "peak_speed": ("peak speed [rad/s]", 1),
+    "peak_acceleration": ("peak acceleration [rad/s²]", 0),
+}
 
 
 class Benchmark(ABC):
@@ -99,37 +117,20 @@ class Benchmark(ABC):
         """
 
 
-class BottleBenchmark(Benchmark):
-    """Reach a bottle with both hands, grasp it, bring it, shake it."""
+class _HandlingBenchmark(Benchmark):
+    """A task with the bottle, demonstrated by a generator that the environment follows."""
 
-    env = "bottle_shaking"
     default_rate = 100
     n_components = 30
-    figures: ClassVar = {
-        "grasp_mm": ("grasp [mm]", 1),
-        "grasp_deg": ("grasp [deg]", 1),
-        "lift_mm": ("lift [mm]", 0),
-        "frequency_error": ("frequency error", 2),
-        "amplitude_error": ("amplitude error", 2),
-        "peak_speed": ("peak speed [rad/s]", 1),
-        "peak_acceleration": ("peak acceleration [rad/s²]", 0),
-    }
-    criteria: ClassVar = LIMITS
     disturbances: ClassVar = {"pushes": {"pushes": True}, "noise": {"noise": 1.0}}
     conditions: ClassVar = CONDITIONS
+    #: The environment's name, what its data sets call the task, and what is observed.
+    gym_id: ClassVar[str]
+    task: ClassVar[str]
+    objects: ClassVar[tuple[str, ...]]
     #: Demonstrations are drawn together; the first may train, the last ones validate.
     POOL, RESERVED = 100, 10
-
-    def __init__(
-        self, rate: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> None:
-        super().__init__(rate, options)
-        self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
-        self.robot = self.skill.robot
-
-    def operators(self, orientation: bool) -> list[Operator]:
-        """Both hands seen from the bottle, and the joints."""
-        return bottle_operators(orientation)
+    skill: BottleShaking | CarryAndPut
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
         """Let the environment follow generated demonstrations."""
@@ -143,7 +144,7 @@ class BottleBenchmark(Benchmark):
             "training": range(training),
             "validation": range(self.POOL, self.POOL + validation),
         }
-        env = gym.make("lerobot_policy_tpgmm/BottleShaking-v0", fps=self.rate, **self.options)
+        env = gym.make(f"lerobot_policy_tpgmm/{self.gym_id}", fps=self.rate, **self.options)
         successes = {}
         for name, chosen in numbers.items():
             motions = [pool[number] for number in chosen]
@@ -152,7 +153,7 @@ class BottleBenchmark(Benchmark):
                 [measured for measured, _ in followed],
                 folder / name,
                 fps=self.rate,
-                task=TASK,
+                task=self.task,
                 actions=[_references(motion) for motion in motions],
                 robot_type="upper_body",
             )
@@ -160,27 +161,110 @@ class BottleBenchmark(Benchmark):
         env.close()
         return successes["training"]
 
+    def _start(self, motion: Demonstration) -> dict[str, Any]:
+        """The options with which an episode begins as a demonstration does."""
+        poses = {name: motion.frame(name) for name in self.objects}
+        firsts = {name: pose[0] if pose.batch_shape else pose for name, pose in poses.items()}
+        return {
+            "joints": motion.joints[0].numpy(),
+            **{
+                name: torch.cat((f.position, f.orientation)).numpy()
+                for name, f in firsts.items()
+            },
+        }
+
     def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
         """What is measured while the environment follows a motion; whether it succeeds."""
-        bottle = motion.frame("bottle")
-        pose = torch.cat((bottle.position, bottle.orientation)).numpy()
-        start = {"joints": motion.joints[0].numpy(), "bottle": pose}
-        observation, info = env.reset(seed=seed, options=start)
-        measured, done = [], False
+        observation, info = env.reset(seed=seed, options=self._start(motion))
+        measured, seen, done = [], [], False
         references = _references(motion).numpy()
         for reference in references:
             if done:
                 raise DataError(f"an episode of {self.env} ends before a demonstration does")
             measured.append(observation["agent_pos"])
+            seen.append(observation["environment_state"])
             observation, _, terminated, truncated, info = env.step(reference)
             done = terminated or truncated
         while not done:
             *_, terminated, truncated, info = env.step(references[-1])
             done = terminated or truncated
-        joints = torch.from_numpy(np.array(measured))
+        joints, poses = (torch.from_numpy(np.array(values)) for values in (measured, seen))
         names = env.unwrapped.joint_names
-        frames = {"bottle": bottle}
+        frames = {
+            name: Frame(pose[:, :3], pose[:, 3:])
+            for name, pose in zip(self.objects, poses.split(7, dim=1), strict=True)
+        }
         return Demonstration(motion.time, joints, frames, names), bool(info["is_success"])
+
+
+class BottleBenchmark(_HandlingBenchmark):
+    """Reach a bottle with both hands, grasp it, bring it, shake it."""
+
+    env = "bottle_shaking"
+    gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
+    figures: ClassVar = {
+        "grasp_mm": ("grasp [mm]", 1),
+        "grasp_deg": ("grasp [deg]", 1),
+        "lift_mm": ("lift [mm]", 0),
+        "frequency_error": ("frequency error", 2),
+        "amplitude_error": ("amplitude error", 2),
+        **PEAKS,
+    }
+    criteria: ClassVar = LIMITS
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(rate, options)
+        self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
+        self.robot = self.skill.robot
+
+    def operators(self, orientation: bool) -> list[Operator]:
+        """Both hands seen from the bottle, and the joints."""
+        return bottle_operators(orientation)
+
+
+class CarryBenchmark(_HandlingBenchmark):
+    """Reach a bottle with both hands, grasp it, put it on a tray."""
+
+    env = "carry_and_put"
+    gym_id, task, objects = "CarryAndPut-v0", CARRY, ("bottle", "tray")
+    figures: ClassVar = {
+        "put_mm": ("at the tray [mm]", 2),
+        "put_deg": ("at the tray [deg]", 2),
+        "standing": ("put down", 0),
+        "grasp_mm": ("grasp [mm]", 1),
+        **PEAKS,
+    }
+    criteria: ClassVar = PUT_LIMITS
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(rate, options)
+        self.skill = CarryAndPut(rate=self.rate)
+        self.robot = self.skill.robot
+
+    def operators(self, orientation: bool) -> list[Operator]:
+        """Both hands seen from the bottle and from the tray, and the joints."""
+        return [*carry_operators(orientation), Canonical()]
+
+    def _start(self, motion: Demonstration) -> dict[str, Any]:
+        return {**super()._start(motion), "slide": slid(motion)}
+
+
+def carry_operators(orientation: bool) -> list[Operator]:
+    """Both hands seen from each object."""
+    return [
+        Stack(
+            *(
+                operator(hand, name)
+                for hand in HANDS
+                for operator in (RelativePosition, RelativeOrientation)[: 1 + orientation]
+            )
+        )
+        for name in CarryBenchmark.objects
+    ]
 
 
 def _references(motion: Demonstration) -> torch.Tensor:
@@ -228,6 +312,7 @@ class AlohaInsertionBenchmark(AlohaBenchmark):
 
 BENCHMARKS: dict[str, type[Benchmark]] = {
     "bottle_shaking": BottleBenchmark,
+    "carry_and_put": CarryBenchmark,
     "aloha_state": AlohaBenchmark,
     "aloha_insertion": AlohaInsertionBenchmark,
 }

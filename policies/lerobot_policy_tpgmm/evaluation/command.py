@@ -37,16 +37,20 @@ tpgmm compare --env aloha_state --demonstrations 25 --out out/aloha
 def compare(
     env: Annotated[
         str,
-        typer.Option(help="bottle_shaking, aloha_state (cube transfer) or aloha_insertion."),
+        typer.Option(
+            help="bottle_shaking, carry_and_put, aloha_state (cube transfer) or "
+            "aloha_insertion."
+        ),
     ] = "bottle_shaking",
     policies: Annotated[
         str,
         typer.Option(
             metavar="NAME,...",
-            help="Among tpgmm, tpgmm-open-loop (by the clock, as in 0.1.0), "
-            "tpgmm-position-only, act, act-phase, diffusion, diffusion-phase, nearest; or all "
-            "but the second. A tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside "
-            "disturbances the open loop is always there.",
+            help="Among tpgmm, tpgmm-open-loop (by the clock, as in 0.1.0), tpgmm-places "
+            "(objects are where they were at first), tpgmm-position-only, act, act-phase, "
+            "diffusion, diffusion-phase, nearest; or all but the second and third. A tpgmm may "
+            "have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the open loop is "
+            "always there.",
         ),
     ] = "all",
     demonstrations: Annotated[
@@ -95,7 +99,8 @@ def compare(
     from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP
 
     settings = Settings(env, episodes=episodes, budget=60 * budget)
-    chosen = list(POLICIES) if policies == "all" else policies.split(",")
+    usual = [policy for policy in POLICIES if policy != "tpgmm-places"]
+    chosen = usual if policies == "all" else policies.split(",")
     every = settings.benchmark().all_conditions
     tried = list(every) if conditions == "all" else conditions.split(",")
     if "tpgmm" in chosen and OPEN_LOOP not in chosen and tried != [NOMINAL]:

@@ -8,7 +8,7 @@ import platform
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,14 +26,14 @@ from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
 from tpgmm_datasets import load_lerobot
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.atomic import replacing
 
 __all__ = ["POLICIES", "record", "run"]
 
 #: In the order of the report.
-POLICIES = ("tpgmm", "tpgmm-position-only", *RECIPES, "nearest")
+POLICIES = ("tpgmm", "tpgmm-places", "tpgmm-position-only", *RECIPES, "nearest")
 RECORD = "training.json"
 PACKAGES = ("tpgmm-torch", "lerobot", "torch", "numpy", "gymnasium", "mujoco", "diffusers")
 
@@ -138,12 +138,14 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         joints="action",
         episodes=range(cell.demonstrations),
     )
+    if cell.variant.base == "tpgmm-places":
+        demonstrations = [_at_first(demonstration) for demonstration in demonstrations]
     if not benchmark.synchronous:
         warping = DynamicTimeWarping(features=["directions"])
         demonstrations = warping.fit_transform(demonstrations)
     model = TaskParameterizedGMM(
         settings.n_components or benchmark.n_components,
-        benchmark.operators(orientation=cell.variant.base == "tpgmm"),
+        benchmark.operators(orientation=cell.variant.base != "tpgmm-position-only"),
         benchmark.robot,
         random_state=cell.seed,
     )
@@ -152,3 +154,12 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"
     return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)
+
+
+def _at_first(demonstration: Demonstration) -> Demonstration:
+    """With all objects where they were at the beginning."""
+    frames = {
+        name: frame[0] if frame.batch_shape else frame
+        for name, frame in demonstration.frames.items()
+    }
+    return replace(demonstration, frames=frames)

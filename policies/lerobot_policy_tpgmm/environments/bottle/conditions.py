@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_policy_tpgmm.environments.base import finite_vector
-from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.bottle.skill import BottleShaking, BottleSkill
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["Conditions", "skill"]
@@ -53,8 +53,8 @@ class Conditions:
         [s]
     push_torque : float
         [N m]
-    misperception : ndarray of shape (6,)
-        Of the bottle's initial position and orientation, in standard deviations.
+    misperception : ndarray of shape (6 * n_objects,)
+        Of the objects' initial positions and orientations, in standard deviations.
     """
 
     bottle: NDArray[np.float64]
@@ -70,12 +70,16 @@ class Conditions:
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Self:
         """Draw, first what ``BottleShaking.situations(1, seed)`` draws."""
-        bottle = skill().bottle_poses(1, rng)[0]
-        names = skill().robot.joint_names
+        return cls(**cls._drawn(rng, skill()))
+
+    @staticmethod
+    def _drawn(rng: np.random.Generator, skill: BottleSkill) -> dict[str, Any]:
+        bottle = skill.bottle_poses(1, rng)[0]
+        names = skill.robot.joint_names
         strong = [i for i, name in enumerate(names) if any(part in name for part in PUSHED)]
-        return cls(
+        return dict(
             bottle=np.concatenate((bottle.position, bottle.orientation)),
-            joints=skill().start_postures(1, rng)[0].numpy(),
+            joints=skill.start_postures(1, rng)[0].numpy(),
             mass=rng.uniform(*MASS),
             delay=int(rng.integers(*DELAY, endpoint=True)),
             pushed=int(rng.choice(strong)),
@@ -86,12 +90,12 @@ class Conditions:
         )
 
     def with_start(self, options: Mapping[str, Any]) -> Self:
-        """Replace the bottle's pose or the start posture.
+        """Replace the objects' poses or the start posture.
 
         Parameters
         ----------
         options : mapping
-            ``"bottle"`` and ``"joints"`` are looked at, if they are there.
+            ``"joints"``, ``"bottle"`` and what else there is are looked at, if they are there.
 
         Raises
         ------
@@ -101,14 +105,15 @@ class Conditions:
         """
         given: dict[str, Any] = {
             name: finite_vector(name, options[name], len(getattr(self, name)))
-            for name in ("bottle", "joints")
-            if name in options
+            for name in ("bottle", "joints", "tray", "slide")
+            if name in options and hasattr(self, name)
         }
-        if "bottle" in given and abs(np.linalg.norm(given["bottle"][3:]) - 1) > 1e-3:
-            raise DataError(
-                "bottle is x, y, z and a unit quaternion w, x, y, z; "
-                f"got {given['bottle'].tolist()}"
-            )
+        for name in given.keys() & {"bottle", "tray"}:
+            if abs(np.linalg.norm(given[name][3:]) - 1) > 1e-3:
+                raise DataError(
+                    f"{name} is x, y, z and a unit quaternion w, x, y, z; "
+                    f"got {given[name].tolist()}"
+                )
         if "joints" in given:
             robot = skill().robot
             beyond = np.maximum(

@@ -174,9 +174,9 @@ class BottleEnv(StateEnv):
         )
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Snapshot]] = []
-        self._seen = np.concatenate(
-            [self._perceived(pose, start.misperception) for pose in self._scene.objects]
-        )
+        errors = start.misperception.reshape(-1, 6)
+        poses = zip(self._scene.objects, errors, strict=True)
+        self._seen = np.concatenate([self._perceived(*pair) for pair in poses])
         self._shown = self._seen
         for part in self._drawn:
             if part.start():
@@ -213,8 +213,9 @@ class BottleEnv(StateEnv):
         goal = self._reference if stopped else self._limited(wanted)
         clipped = float(np.abs(wanted - goal).max())
         seconds = self._move(goal)
-        began, self._time = self._time, self._time + seconds
-        self._free += 0.0 if stopped else seconds
+        # in whole milliseconds, so that no sum is rounded
+        began, self._time = self._time, round(self._time + seconds, 3)
+        self._free = round(self._free + (0.0 if stopped else seconds), 3)
         self._use_hands(stopped)
         self._record(seconds, stopped)
         self._steps += 1
@@ -285,13 +286,14 @@ class BottleEnv(StateEnv):
                 if closes or gap < self._nearest:
                     self._nearest, self._contact = gap, (scene.joints, scene.bottle)
                 if closes:
-                    self._close()
+                    self._close(at_once=False)
         elif scene.held:
             kinematic = self.mode == "kinematic"
             if scene.slip() > GRIP_SLIP if kinematic else scene.pull() > GRIP_FORCE:
                 scene.let_go()
 
-    def _close(self) -> None:
+    def _close(self, at_once: bool) -> None:
+        """Take hold of the bottle, without what happens meanwhile if ``at_once``."""
         self._grasp_step = self._counted
         self._contact = self._scene.joints, self._scene.bottle
         self._scene.hold()
@@ -346,7 +348,7 @@ class BottleEnv(StateEnv):
         held_for = instant - path.events["grasp"]
         if held_for > 0 and self._grasp_step is None:
             self._scene.place(_at(path, path.events["grasp"]), 0.0)
-            self._close()
+            self._close(at_once=True)
         self._scene.place(_at(path, instant), max(0.0, held_for))
         self._hold_still()
 

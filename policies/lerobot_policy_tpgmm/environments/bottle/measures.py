@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LIMITS", "Closing", "Shaking", "find_shaking", "successful"]
+__all__ = ["LIMITS", "PUT_LIMITS", "Closing", "Shaking", "find_shaking", "successful"]
 
 #: The figures of a successful episode: smallest and largest.
 LIMITS = MappingProxyType(
@@ -22,17 +22,23 @@ LIMITS = MappingProxyType(
         "amplitude_error": (0.0, 0.2),
     }
 )
+#: The same for a bottle that is put on a tray.
+PUT_LIMITS = MappingProxyType(
+    {"put_mm": (0.0, 5.0), "put_deg": (0.0, 3.0), "standing": (1.0, 1.0)}
+)
 
 
-def successful(figures: Mapping[str, float]) -> bool:
+def successful(
+    figures: Mapping[str, float], limits: Mapping[str, tuple[float, float]] = LIMITS
+) -> bool:
     """Whether the figures of an episode are good enough.
 
     Parameters
     ----------
     figures : mapping of str to float
-        Those of ``LIMITS``; more are ignored.
+        Those of ``limits``; more are ignored.
     """
-    return all(low <= figures[name] <= high for name, (low, high) in LIMITS.items())
+    return all(low <= figures[name] <= high for name, (low, high) in limits.items())
 
 
 @dataclass

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpgmm_datasets.bottle.skill import GRASP_POINT, HANDS
+from tpgmm_datasets.bottle.skill import FOOT, GRASP_POINT, HANDS
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError, DependencyError
 
@@ -33,6 +33,7 @@ __all__ = [
     "TIMESTEP",
     "BottleScene",
     "Snapshot",
+    "TrayScene",
     "bottle_spec",
 ]
 
@@ -40,8 +41,6 @@ __all__ = [
 TIMESTEP = 1e-3
 #: Gains of the position control [N m / rad, N m s / rad].
 STIFFNESS, DAMPING = 1000.0, 30.0
-#: Height of the bottle's centre above its foot [m].
-FOOT = 0.11
 #: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
 #: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2
@@ -54,8 +53,13 @@ _DIVERGED = [
 _TABLE, _PALM = 1, 2  # what collides with the bottle, as bits; nothing else collides
 
 
-def bottle_spec() -> mujoco.MjSpec:
+def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
     """What the model is made of.
+
+    Parameters
+    ----------
+    tray : bool, default=False
+        Whether there is a flat tray, a body ``tray``, that nothing collides with.
 
     Returns
     -------
@@ -81,6 +85,15 @@ def bottle_spec() -> mujoco.MjSpec:
     for hand in HANDS:
         weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2="bottle")
         weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
+    if tray:
+        body = spec.worldbody.add_body(name="tray")
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(0.09, 0.09, 0.001),
+            contype=0,
+            conaffinity=0,
+            rgba=(0.2, 0.6, 0.3, 1),
+        )
     _add_view(spec)
     return spec
 
@@ -184,6 +197,11 @@ class BottleScene:
     def bottle(self) -> NDArray[np.float64]:
         """The bottle's position [m] and orientation, a unit quaternion; shape (7,)."""
         return self.data.qpos[self._n :].copy()
+
+    @property
+    def table(self) -> float:
+        """Height of the table [m]."""
+        return float(self.model.body_pos[self._table, 2])
 
     @property
     def objects(self) -> list[NDArray[np.float64]]:
@@ -293,8 +311,7 @@ class BottleScene:
 
     def snapshot(self) -> Snapshot:
         """The state without velocities."""
-        height = float(self.model.body_pos[self._table, 2])
-        return Snapshot(self.data.qpos.copy(), self.held, height)
+        return Snapshot(self.data.qpos.copy(), self.held, self.table)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Bring everything to where it was, in hands that took hold of the bottle as now."""
@@ -355,3 +372,30 @@ class BottleScene:
     def _sink(self, seconds: float) -> None:
         height = self.model.body_pos[self._table, 2] - TABLE_SPEED * seconds
         self.model.body_pos[self._table, 2] = max(height, TABLE_LOW)
+
+
+class TrayScene(BottleScene):
+    """The same with a tray on the table, which does not sink."""
+
+    def __init__(self) -> None:
+        super().__init__(bottle_spec(tray=True))
+        self._tray = self.model.body("tray").id
+
+    @property
+    def tray(self) -> NDArray[np.float64]:
+        """Its position [m] and orientation, a unit quaternion; shape (7,)."""
+        place = self.model.body_pos[self._tray], self.model.body_quat[self._tray]
+        return np.concatenate(place)
+
+    @property
+    def objects(self) -> list[NDArray[np.float64]]:
+        """The poses of bottle and tray."""
+        return [self.bottle, self.tray]
+
+    def put_tray(self, pose: NDArray[np.float64]) -> None:
+        """Put the tray somewhere; shape (7,)."""
+        self.model.body_pos[self._tray], self.model.body_quat[self._tray] = pose[:3], pose[3:]
+        mujoco.mj_forward(self.model, self.data)
+
+    def _sink(self, seconds: float) -> None:
+        """It stands."""

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from lerobot_policy_tpgmm.environments.bottle.conditions import Conditions, skill
 from lerobot_policy_tpgmm.environments.bottle.handling import BottleEnv
 from lerobot_policy_tpgmm.environments.bottle.measures import find_shaking, successful
-from lerobot_policy_tpgmm.environments.bottle.scene import FOOT, TABLE_LOW, BottleScene
+from lerobot_policy_tpgmm.environments.bottle.scene import TABLE_LOW, BottleScene
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL, Course, Disturbance
-from tpgmm_datasets.bottle.skill import PHASES, SHOULDERS, TASK, BottleShaking
+from tpgmm_datasets.bottle.skill import FOOT, PHASES, SHOULDERS, TASK, BottleShaking
 from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.exceptions import DataError
 

@@ -20,6 +20,7 @@ __all__ = ["draw_curves", "draw_errors", "draw_success"]
 LOOKS = {
     "tpgmm": ("tab:red", "o", True),
     "tpgmm-open-loop": ("tab:red", "o", False),
+    "tpgmm-places": ("tab:brown", "v", False),
     "tpgmm-position-only": ("tab:orange", "s", True),
     "act": ("tab:blue", "^", False),
     "act-phase": ("tab:blue", "^", True),

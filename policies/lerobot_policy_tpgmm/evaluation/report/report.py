@@ -34,6 +34,8 @@ DESCRIPTIONS = {
     "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
     "and the joints",
     OPEN_LOOP: "the same, played by the clock with what is seen at the start, as in 0.1.0",
+    "tpgmm-places": "the same, learned and played with all objects as places: where they were "
+    "at the beginning, whoever holds them later",
     "tpgmm-position-only": "the same without the orientation of the hands",
     "act": "LeRobot's Action Chunking Transformer on joints and object poses",
     "act-phase": "the same, informed of the time and learning from episodes on a common clock",

@@ -1,0 +1,291 @@
+"""Carry and put, generated: take a bottle with both hands and put it on a tray.
+
+The bottle slides in the hands while they close, by another distance each time: where the hands
+have to go with it follows from where it then is, not from where it was expected.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tpgmm_datasets.bottle.skill import (
+    APPROACH_POINT,
+    FOOT,
+    GRASP_POINT,
+    HANDS,
+    BottleSkill,
+    attached,
+    between,
+    upright,
+)
+from tpgmm_torch import Demonstration, Frame, Situation, quaternions
+
+__all__ = ["TASK", "CarryAndPut", "before_sliding", "composed", "slid", "slide"]
+
+#: What LeRobot data sets of the skill call it.
+TASK = "put the bottle on the tray"
+#: Nominal seconds of each phase; 12.3 in all.
+PHASES = MappingProxyType(
+    {
+        "reach": 2.5,
+        "close": 1.5,
+        "hold": 0.8,
+        "lift": 1.0,
+        "carry": 2.5,
+        "lower": 1.5,
+        "open": 0.8,
+        "leave": 1.2,
+        "rest": 0.5,
+    }
+)
+#: When the bottle slides, after the hands have arrived, and how long [s].
+SLIDE = (0.2, 0.2)
+#: How high the bottle is carried above where it stood and above where it is put [m].
+LIFT = 0.05
+
+
+@dataclass(frozen=True)
+class CarryAndPut(BottleSkill):
+    """Generator of demonstrations and situations of bringing a bottle to a tray.
+
+    Bottles stand in a box of 8 x 4 x 6 cm on the left, trays are on the right, as far from the
+    middle, on the same table: both turned by up to 10 degrees. In the middle of the tray, which
+    is flat, is the bottle's place, turned as the tray is.
+
+    Parameters
+    ----------
+    rate, stretch, start_spread
+        As for :class:`~tpgmm_datasets.bottle.skill.BottleShaking`.
+    slide : float, default=0.03
+        By how much the bottle slides between the palms, forwards or backwards, at most [m].
+    turn : float, default=10
+        By how much it turns there about its axis, to either side, at most [deg].
+
+    Examples
+    --------
+    >>> [situation] = CarryAndPut().situations(1, seed=0)
+    >>> list(situation.frames)
+    ['bottle', 'tray']
+    """
+
+    phases: ClassVar[Mapping[str, float]] = PHASES
+    lowest: ClassVar[tuple[float, float, float]] = (0.24, 0.02, 0.09)
+    highest: ClassVar[tuple[float, float, float]] = (0.32, 0.06, 0.15)
+    yaw: ClassVar[float] = 10.0
+
+    slide: float = 0.03
+    turn: float = 10.0
+
+    def tray_poses(self, bottles: Frame, rng: np.random.Generator) -> Frame:
+        """A tray for each bottle (n,), anywhere on the right of its table."""
+        (x, y, _), (far, wide, _) = self.lowest, self.highest
+        trays = upright(rng, (x, -wide, 0.0), (far, -y, 0.0), self.yaw, len(bottles.position))
+        trays.position[:, 2] = bottles.position[:, 2] - FOOT
+        return trays
+
+    def slides(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """How far bottles slide [m] and turn [rad] in the hands, shape (n, 2)."""
+        most = self.slide, math.radians(self.turn)
+        return rng.uniform(-1, 1, (n, 2)) * most
+
+    def situations(self, n: int, seed: int = 0) -> list[Situation]:
+        """New poses of bottle and tray, and start postures.
+
+        Parameters
+        ----------
+        n : int
+        seed : int, default=0
+
+        Returns
+        -------
+        list of Situation
+        """
+        rng = np.random.default_rng(seed)
+        bottles, starts = self.bottle_poses(n, rng), self.start_postures(n, rng)
+        trays = self.tray_poses(bottles, rng)
+        return [
+            Situation(starts[i], {"bottle": bottles[i], "tray": trays[i]}) for i in range(n)
+        ]
+
+    def demonstrations(self, n: int = 10, seed: int = 0) -> list[Demonstration]:
+        """Demonstrations with different objects, slides, start postures and timing.
+
+        Parameters
+        ----------
+        n : int, default=10
+        seed : int, default=0
+
+        Returns
+        -------
+        list of Demonstration
+            With the frames ``"bottle"``, where it is at each time step, and ``"tray"``, and the
+            events ``"grasp"``, ``"put"`` and ``"rest"``.
+        """
+        situations = self.situations(n, seed)
+        rng = np.random.default_rng((seed, 1))
+        slides = self.slides(n, rng)
+        return self._demonstrations(situations, slides, self._phase_ends(n, rng))
+
+    def nominal(
+        self, situations: Sequence[Situation], slides: NDArray[np.float64] | None = None
+    ) -> list[Demonstration]:
+        """The skill in given situations, without its spread in timing.
+
+        Parameters
+        ----------
+        situations : sequence of Situation
+            With the frames ``"bottle"`` and ``"tray"``.
+        slides : ndarray of shape (n, 2), optional
+            As :meth:`slides` draws them; none by default.
+
+        Returns
+        -------
+        list of Demonstration
+            As :meth:`demonstrations` gives them, of 12.3 s.
+        """
+        n = len(situations)
+        slides = np.zeros((n, 2)) if slides is None else slides
+        return self._demonstrations(situations, slides, self._nominal_ends(n))
+
+    def put_error(self, bottle: Frame, tray: Frame) -> tuple[Tensor, Tensor]:
+        """How far a bottle is from its place on a tray.
+
+        Returns
+        -------
+        position : Tensor of shape (...)
+            In metres.
+        orientation : Tensor of shape (...)
+            In radians.
+        """
+        place = composed(tray, Frame((0.0, 0.0, FOOT)))
+        turn = quaternions.product(bottle.orientation, quaternions.conjugate(place.orientation))
+        distance = torch.linalg.vector_norm(bottle.position - place.position, dim=-1)
+        return distance, torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
+
+    def _demonstrations(
+        self, situations: Sequence[Situation], slides: NDArray[np.float64], ends: Tensor
+    ) -> list[Demonstration]:
+        starts = torch.stack([situation.joints for situation in situations])
+        bottles, trays = (
+            Frame.stack([situation.frames[name] for situation in situations])
+            for name in ("bottle", "tray")
+        )
+        first = self.robot.state(starts)
+        hands = [Frame(first.position(hand), first.orientation(hand)) for hand in HANDS]
+        lengths = self._steps(ends)
+
+        def bottle_at(time: Tensor) -> Frame:
+            return self._bottle(self._progress(time, ends), time, ends, bottles, trays, slides)
+
+        def wanted(time: Tensor) -> list[Frame]:
+            progress = self._progress(time, ends)
+            held = before_sliding(bottle_at(time), slides)
+            poses = []
+            for start, hand in zip(hands, HANDS, strict=True):
+                away = attached(bottles, APPROACH_POINT[hand])
+                pose = between(start, away, progress["reach"])
+                pose = between(pose, attached(bottles, GRASP_POINT[hand]), progress["close"])
+                grasp = attached(held, GRASP_POINT[hand])
+                leave = between(grasp, attached(held, APPROACH_POINT[hand]), progress["leave"])
+                carrying = (progress["lift"] > 0)[:, None]
+                poses.append(
+                    Frame(
+                        torch.where(carrying, leave.position, pose.position),
+                        torch.where(carrying, leave.orientation, pose.orientation),
+                    )
+                )
+            return poses
+
+        joints = self._follow(starts, wanted, max(lengths))
+        times = self._times(max(lengths))
+        poses = [bottle_at(time.expand(len(starts))) for time in times]
+        demonstrations = []
+        for i, steps in enumerate(lengths):
+            end = dict(zip(self.phases, ends[i].tolist(), strict=True))
+            bottle = Frame(
+                torch.stack([pose.position[i] for pose in poses[:steps]]),
+                torch.stack([pose.orientation[i] for pose in poses[:steps]]),
+            )
+            demonstrations.append(
+                Demonstration(
+                    times[:steps],
+                    joints[:steps, i],
+                    {"bottle": bottle, "tray": trays[i]},
+                    self.robot.joint_names,
+                    {"grasp": end["hold"], "put": end["lower"], "rest": end["leave"]},
+                )
+            )
+        return demonstrations
+
+    def _bottle(
+        self,
+        progress: Mapping[str, Tensor],
+        time: Tensor,
+        ends: Tensor,
+        bottles: Frame,
+        trays: Frame,
+        slides: NDArray[np.float64],
+    ) -> Frame:
+        """Where the bottles are."""
+        begin, length = SLIDE
+        arrived = ends[:, list(self.phases).index("close")]
+        slid = ((time - arrived - begin) / length).clamp(0, 1)
+        grasped = composed(bottles, slide(slides))
+        pose = between(bottles, grasped, slid)
+        place = composed(trays, Frame((0.0, 0.0, FOOT)))
+        for end, phase in (
+            (_above(grasped), "lift"),
+            (_above(place), "carry"),
+            (place, "lower"),
+        ):
+            pose = between(pose, end, progress[phase])
+        return pose
+
+
+def slide(slides: NDArray[np.float64]) -> Frame:
+    """The bottle, seen from where it stood before it slid and turned by (..., 2) [m, rad]."""
+    given = torch.as_tensor(slides, dtype=torch.float64)
+    zero = torch.zeros_like(given[..., 0])
+    half = given[..., 1] / 2
+    return Frame(
+        torch.stack((given[..., 0], zero, zero), dim=-1),
+        torch.stack((half.cos(), zero, zero, half.sin()), dim=-1),
+    )
+
+
+def slid(demonstration: Demonstration) -> NDArray[np.float64]:
+    """How far the bottle of a demonstration slides [m] and turns [rad], shape (2,)."""
+    bottle, time = demonstration.frame("bottle"), demonstration.time
+    grasped = bottle[int(torch.searchsorted(time, demonstration.events["grasp"]))]
+    turn = quaternions.product(
+        quaternions.conjugate(bottle[0].orientation), grasped.orientation
+    )
+    forwards = bottle[0].inverse_transform(grasped.position)[0]
+    return np.array((float(forwards), 2 * math.atan2(float(turn[3]), float(turn[0]))))
+
+
+def before_sliding(bottle: Frame, slides: NDArray[np.float64]) -> Frame:
+    """Where a bottle that has slid would be in the same hands if it had not."""
+    slid = slide(slides)
+    turn = quaternions.product(bottle.orientation, quaternions.conjugate(slid.orientation))
+    return Frame(bottle.position - quaternions.rotate(turn, slid.position), turn)
+
+
+def composed(frame: Frame, pose: Frame) -> Frame:
+    """A pose that is given as seen from a frame."""
+    return Frame(
+        frame.transform(pose.position), quaternions.product(frame.orientation, pose.orientation)
+    )
+
+
+def _above(pose: Frame) -> Frame:
+    return Frame(pose.position + pose.position.new_tensor((0, 0, LIFT)), pose.orientation)
