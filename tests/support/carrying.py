@@ -174,4 +174,5 @@ HELD = Hold("bottle", HAND, (ARRIVES + LIFTS) / 2, (PUTS + LEAVES) / 2)
 @cache
 def carrying_model(texts: Sequence[str] = PUT, **options: object) -> TaskParameterizedGMM:
     """Fitted to the ten; not to be changed."""
-    return TaskParameterizedGMM(15, operators(texts), upper_body(), **options).fit(carries())
+    settings = {"tol": 1e-2} | options
+    return TaskParameterizedGMM(15, operators(texts), upper_body(), **settings).fit(carries())

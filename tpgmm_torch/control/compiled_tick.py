@@ -156,7 +156,7 @@ class CompiledRegression(Regression):
         if isinstance(kinematics, Robot) and update is not None and update.task is not None:
             like = kinematics.lower
             terms = pose_terms(update.task.leaves, kinematics.links, like.dtype, like.device)
-        if terms is None:
+        if terms is None or not terms.fixed:
             raise DataError(
                 "compile() serves models with robot=Robot.from_urdf(...), Canonical() and "
                 "position and orientation operators in the base frame or an object's, "

@@ -35,11 +35,20 @@ class PoseTerms:
     Parameters
     ----------
     operators : sequence of Operator
-        Of the four classes, referring to no link of the robot.
+        Of the four classes.
     links : tuple of str
-        Links of the robot's states.
+        Links of the robot itself.
     dtype : torch.dtype
     device : torch.device
+
+    Attributes
+    ----------
+    names : tuple of str
+        The places that the operators refer to.
+    objects : tuple of str
+        What they refer to as things, which the robot may carry.
+    fixed : bool
+        Whether all that they refer to stands still, whatever the joints do.
     """
 
     def __init__(
@@ -49,38 +58,54 @@ class PoseTerms:
         dtype: torch.dtype,
         device: torch.device,
     ) -> None:
-        self.names = tuple(dict.fromkeys(f for o in operators for f in o.references()))
+        every = (name for o in operators for name in o.references())
+        self.names = tuple(dict.fromkeys(name for name in every if name not in links))
+        every = (name for o in operators for name in o.links())
+        self.objects = tuple(dict.fromkeys(name for name in every if name not in links))
+        moving = (*links, *self.objects)  # with the joints, or perhaps
+        self._moving, self._n_links = moving, len(links)
         height = 3 * len(operators)
         width = sum(3 if type(o) in POSITIONS else 4 for o in operators)
-        n_poses = len(links) + len(self.names)
+        n_poses = len(moving) + len(self.names)
         # the last row holds the present quaternions, by which hemispheres are chosen
         matrix = torch.zeros(len(operators), 16, height + 1, width, dtype=torch.float64)
         shift = torch.zeros(n_poses, 3, height, dtype=torch.float64)
         product = _quaternion_products()
         rows: list[int] = []
+        still = 6 * len(moving)  # behind the rows of all Jacobians, one of zeros
+        carried: list[int] = []  # the rows of what is referred to, if it moves
+        swinging: list[int] = []
+        self._bodies: list[tuple[int, int]] = []
         first: list[int] = []
         second: list[int] = []
         column = 0
         for index, operator in enumerate(operators):
-            link, row = links.index(operator.links()[0]), 3 * index
+            link, *things = operator.links()
+            place, row = moving.index(link), 3 * index
             reference = n_poses  # the identity, which stands behind all poses
-            if operator.references():
-                reference = len(links) + self.names.index(operator.references()[0])
+            for name in (*things, *operator.references()):
+                known = moving if name in things or name in links else self.names
+                reference = known.index(name) + (0 if known is moving else len(moving))
             second.append(reference)
+            moves = reference < len(moving)
+            self._bodies.append((place, reference if moves else -1))
             axes = torch.arange(3)
-            if isinstance(operator, POSITIONS):
+            angular = 3 if isinstance(operator, ORIENTATIONS) else 0
+            rows += range(6 * place + angular, 6 * place + angular + 3)
+            for listed, part in ((carried, angular), (swinging, 3)):
+                start = 6 * reference + part
+                listed += range(start, start + 3) if moves else [still] * 3
+            if not angular:
                 first.append(reference)
-                rows += range(6 * link, 6 * link + 3)
                 matrix[index, :, row : row + 3, column : column + 3] = product[:, 1:, 1:]
-                shift[link, axes, row + axes] = -1.0
-                if operator.references():
+                shift[place, axes, row + axes] = -1.0
+                if reference < n_poses:
                     shift[reference, axes, row + axes] = 1.0
                 column += 3
-            elif isinstance(operator, ORIENTATIONS):
-                first.append(link)
-                rows += range(6 * link + 3, 6 * link + 6)
+            else:
+                first.append(place)
                 block = slice(column, column + 4)
-                matrix[index, :, row : row + 3, block] = operator.gain * product[:, 1:]
+                matrix[index, :, row : row + 3, block] = operator.gain * product[:, 1:]  # type: ignore[attr-defined]
                 matrix[index, :, height, block] = product[:, 0]
                 column += 4
         # M row by row, the present quaternions, and c: all are linear in products of two
@@ -101,18 +126,20 @@ class PoseTerms:
         left += range(3 * n_poses)
         right += [identity] * (3 * n_poses)
         self._pairs = torch.tensor([*left, *right], device=device)
-        every = list(range(6 * len(links)))
-        self._rows = None if rows == every else torch.tensor(rows, device=device)
+        whole = list(range(still))
+        self._rows = None if rows == whole else torch.tensor(rows, device=device)
+        self._carried = None
+        if any(row != still for row in carried):
+            self._carried = torch.tensor([*carried, *swinging], device=device)
+        self.fixed = self._carried is None and not self.objects
         self._identity = quaternions.identity(dtype, device)
+        self._speaking: dict[tuple[int, ...], Tensor | None] = {}
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J``, ``M``, ``c`` and the present quaternions of the stack."""
         poses = [Reference.of(name, state, frames).frame for name in self.names]
-        positions, orientations, jacobian = state.positions, state.orientations, state.jacobians
-        if state.carriers is not None:  # objects that others refer to
-            own = len(state.robot_links)
-            positions, orientations = positions[..., :own, :], orientations[..., :own, :]
-            jacobian = jacobian[..., :own, :, :]
+        state = self._with_objects(state, frames)
+        positions, orientations = state.positions, state.orientations
         batch = common_shape(positions.shape[:-2], *(f.position.shape[:-1] for f in poses))
         if positions.shape[:-2] != batch:
             positions = positions.expand(*batch, -1, 3)
@@ -127,10 +154,64 @@ class PoseTerms:
             factors.narrow(-1, 0, half) * factors.narrow(-1, half, half), self._terms
         )
         matrix, present, shift = both.split(self._sizes, -1)
-        jacobian = jacobian.flatten(-3, -2)
+        matrix = matrix.view(*batch, *self._shape)
+        whole = jacobian = state.jacobians.flatten(-3, -2)
         if self._rows is not None:
-            jacobian = jacobian.index_select(-2, self._rows)
-        return Linearization(jacobian, matrix.view(*batch, *self._shape), shift, present)
+            jacobian = whole.index_select(-2, self._rows)
+        if self._carried is not None:
+            jacobian = jacobian - self._of_references(whole, shift)
+        if not self.objects:
+            return Linearization(jacobian, matrix, shift, present)
+        speaks = self._speaks(state)
+        if speaks is None:
+            return Linearization(jacobian, matrix, shift, present)
+        jacobian, matrix = jacobian * speaks[..., None], matrix * speaks[..., None]
+        noise = (1.0 - speaks).expand_as(shift)
+        return Linearization(jacobian, matrix, shift * speaks, present, noise)
+
+    def _with_objects(self, state: RobotState, frames: Mapping[str, Frame]) -> RobotState:
+        """The robot's links and the objects, in that order, and nothing else."""
+        if state.links == self._moving:
+            return state
+        for name in self.objects:
+            if name not in state.links:
+                state = state.with_link(name, None, Reference.of(name, state, frames).frame)
+        return state.with_objects(self.objects)
+
+    def _of_references(self, jacobians: Tensor, shift: Tensor) -> Tensor:
+        """How the references move with the joints, and carry the links' points along."""
+        assert self._carried is not None
+        zero = torch.zeros_like(jacobians[..., :1, :])
+        rows = torch.cat((jacobians, zero), -2).index_select(-2, self._carried)
+        own, angular = rows.chunk(2, -2)
+        arms = shift.unflatten(-1, (-1, 3))[..., None]
+        angular = angular.unflatten(-2, (-1, 3))
+        batch = common_shape(arms.shape[:-3], angular.shape[:-3])
+        angular = angular.expand(*batch, *angular.shape[-3:])
+        swing = torch.linalg.cross(angular, arms.expand(*batch, *arms.shape[-3:]), dim=-2)
+        return own - swing.flatten(-3, -2)
+
+    def _speaks(self, state: RobotState) -> Tensor | None:
+        """1 for rows that the joints change, 0 for others, (..., m); None if all speak."""
+        carriers = state.carriers
+        assert carriers is not None
+        if carriers.ndim == 1:
+            key = tuple(carriers.tolist())
+            if key not in self._speaking:
+                self._speaking[key] = self._speaks_with(carriers)
+            return self._speaking[key]
+        return self._speaks_with(carriers)
+
+    def _speaks_with(self, carriers: Tensor) -> Tensor | None:
+        """:meth:`_speaks`, of objects with these carriers (..., V)."""
+        batch, n = carriers.shape[:-1], self._n_links
+        own = torch.arange(n, device=carriers.device).expand(*batch, n)
+        bodies = torch.cat((own, carriers, torch.full_like(own[..., :1], -1)), -1)
+        one, other = (bodies[..., list(of)] for of in zip(*self._bodies, strict=True))
+        speaks = one != other
+        if bool(speaks.all()):
+            return None
+        return speaks.to(self._terms.dtype).repeat_interleave(3, -1)
 
 
 @lru_cache(maxsize=64)
@@ -145,8 +226,8 @@ def pose_terms(
     Parameters
     ----------
     operators : tuple of Operator
-        Position and orientation operators in the base frame or in an object's frame; others,
-        and those that refer to another link or an object that is held, speak for themselves.
+        Position and orientation operators; others, and those that refer to their own link,
+        speak for themselves.
     links : tuple of str
     dtype : torch.dtype
     device : torch.device
@@ -158,8 +239,8 @@ def pose_terms(
     for operator in operators:
         if type(operator) not in (*POSITIONS, *ORIENTATIONS):
             return None
-        own, *held = operator.links()
-        if own not in links or held or set(operator.references()) & set(links):
+        link, *references = *operator.links(), *operator.references()
+        if link in references:
             return None
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):

@@ -157,21 +157,24 @@ class Regression:
         Many robots run part by part, of those that are at about the same time: few components
         count for them. Robots that carry something are given by their states.
         """
+        given = None
         if isinstance(joints, RobotState):
-            return self._bounded(self._estimate(time, joints, frames), bounds)
+            given, joints = joints, joints.joints
         poses = {name: frames[name] for name in self._frame_names if name in frames}
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
-            estimate = self._estimate(time, self.kinematics.state(joints), frames)
-            return self._bounded(estimate, bounds)
+            state = self.kinematics.state(joints) if given is None else given
+            return self._bounded(self._estimate(time, state, frames), bounds)
+        if given is not None:
+            given = given.flatten(batch)
         joints = joints.expand(*batch, -1).flatten(0, -2)
         poses = {name: pose.expand(batch).flatten() for name, pose in poses.items()}
         time = time.expand(batch).flatten() if time.ndim else time
         order = time.argsort() if time.ndim else torch.arange(batch.numel())
         parts = []
         for part in order.split(PART):
-            state = self.kinematics.state(joints[part])
+            state = self.kinematics.state(joints[part]) if given is None else given[part]
             here = {name: pose[part] for name, pose in poses.items()}
             parts.append(self._estimate(time[part] if time.ndim else time, state, here))
         back = order.argsort()

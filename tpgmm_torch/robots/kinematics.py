@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -189,7 +189,10 @@ class RobotState:
             here = self.jacobians[..., self._index(name), :, :]
             jacobian = torch.where(where[..., None, None], jacobian, here)
             index = torch.where(where, index, self.carrier(name))
-        state = self._without(name) if name in self.links else self
+        state = self
+        if name in self.links:
+            objects = self.links[len(self.robot_links) :]
+            state = self.with_objects([other for other in objects if other != name])
         batch = common_shape(state.joints.shape[:-1], position.shape[:-1], index.shape)
         carriers = [index.expand(batch)[..., None]]
         if state.carriers is not None:
@@ -210,6 +213,34 @@ class RobotState:
             carriers=torch.cat(carriers, -1),
         )
 
+    def flatten(self, batch: torch.Size) -> Self:
+        """The states of a whole batch, its dimensions as one."""
+        tails = {"joints": 1, "positions": 2, "orientations": 2, "jacobians": 3, "carriers": 1}
+        parts = {name: getattr(self, name) for name in tails}
+        whole = {
+            name: part.expand(*batch, *part.shape[-tails[name] :]).flatten(0, len(batch) - 1)
+            for name, part in parts.items()
+            if part is not None
+        }
+        return replace(self, **whole)
+
+    def with_objects(self, names: Sequence[str]) -> Self:
+        """The state with these of its objects, in that order, and no others."""
+        if self.carriers is None:
+            for name in names:
+                raise UnknownNameError("object", name, "the state", ())
+            return self
+        own = len(self.robot_links)
+        chosen = [*range(own), *(self._index(name) for name in names)]
+        return replace(
+            self,
+            links=tuple(self.links[i] for i in chosen),
+            positions=self.positions[..., chosen, :],
+            orientations=self.orientations[..., chosen, :],
+            jacobians=self.jacobians[..., chosen, :, :],
+            carriers=None if not names else self.carriers[..., [i - own for i in chosen[own:]]],
+        )
+
     def __getitem__(self, index: Any) -> Self:
         """Select along the leading dimensions."""
         return replace(
@@ -219,21 +250,6 @@ class RobotState:
             orientations=self.orientations[index],
             jacobians=self.jacobians[index],
             carriers=None if self.carriers is None else self.carriers[index],
-        )
-
-    def _without(self, name: str) -> Self:
-        """The state without one of its objects."""
-        assert self.carriers is not None
-        kept = [i for i, link in enumerate(self.links) if link != name]
-        own = len(self.robot_links)
-        objects = [i - own for i in kept if i >= own]
-        return replace(
-            self,
-            links=tuple(self.links[i] for i in kept),
-            positions=self.positions[..., kept, :],
-            orientations=self.orientations[..., kept, :],
-            jacobians=self.jacobians[..., kept, :, :],
-            carriers=self.carriers[..., objects] if objects else None,
         )
 
     def _index(self, link: str) -> int:

@@ -186,6 +186,17 @@ def test_a_prediction_carries_what_it_holds():
         assert (share[put:] == 0).all()
 
 
+def test_one_robot_of_many_is_as_if_alone():
+    model, scene, rows = carrying_model(), scenes(300, seed=5), (0, 7, 255, 256, 299)
+    together = model.controller(scene.start, scene.frames)
+    alone = [model.controller(scene.start[i], scene[i].frames) for i in rows]
+    for now in (0.0, 1.0, 2.3, 2.4, 3.0, 3.5, 4.0, 4.5, 4.9, 5.0):
+        for controller in (together, *alone):
+            controller.step(now - controller.time)
+        for i, one in zip(rows, alone, strict=True):
+            torch.testing.assert_close(together.reference[i], one.reference, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("texts", [PLACES, None], ids=["places", "things"])
 def test_frames_that_live_to_the_end_change_nothing(texts):
     model = carrying_model() if texts is None else carrying_model(texts)

@@ -28,6 +28,22 @@ STACKS = {
         RelativeOrientation("l_hand", "cup", 1.1),
         AbsolutePosition("r_hand"),
     ),
+    "hand to hand": Stack(
+        RelativeOrientation("r_hand", "l_hand", 1.2),
+        RelativePosition("l_hand", "cup"),
+        RelativePosition("r_hand", "l_hand"),
+    ),
+    "things": Stack(
+        RelativePosition("cup", "lid"),
+        RelativeOrientation("cup", "lid"),
+        AbsolutePosition("cup"),
+        RelativePosition("r_hand", "cup", held=True),
+        RelativeOrientation("r_hand", "cup", held=True),
+        RelativePosition("l_hand", "cup", held=True),
+        RelativePosition("l_hand", "cup"),
+        RelativeOrientation("lid", "cup", held=True),
+        RelativePosition("cup", "l_hand"),
+    ),
 }
 
 
@@ -54,6 +70,10 @@ def one_by_one(state: RobotState) -> SaysItself:
     return SaysItself(*(getattr(state, field.name) for field in fields(state)))
 
 
+#: How something is held.
+GRASP = Frame([0.05, -0.12, 0.08], [0.5, -0.5, 0.1, 0.7])
+
+
 @pytest.mark.parametrize("batch", [(), (1,), (6,), (2, 3)])
 @pytest.mark.parametrize("stack", STACKS.values(), ids=list(STACKS))
 def test_together_is_one_by_one(stack, batch):
@@ -71,6 +91,62 @@ def test_together_is_one_by_one(stack, batch):
     for start in stack.quaternion_starts(upper_body()):
         turned[..., start : start + 4] = coordinates[..., start : start + 4]
     torch.testing.assert_close(together.present, turned, rtol=0, atol=1e-14)
+
+
+GRASPS = {
+    "free": lambda state, frames: state,
+    "known to be free": lambda state, frames: state.with_link("lid", None, frames["lid"]),
+    "held": lambda state, frames: state.with_link("cup", "r_hand", GRASP),
+    "both": lambda state, frames: (
+        state.with_link("spoon", "l_hand", GRASP)
+        .with_link("lid", "l_hand", GRASP)
+        .with_link("cup", "r_hand", GRASP)
+    ),
+    "one on the other": lambda state, frames: state.with_link("cup", "r_hand", GRASP).with_link(
+        "lid", "cup", GRASP
+    ),
+}
+
+
+@pytest.mark.parametrize("batch", [(), (6,), (2, 3)])
+@pytest.mark.parametrize("held", GRASPS.values(), ids=list(GRASPS))
+@pytest.mark.parametrize("name", ["things", "hand to hand", "two frames"])
+def test_together_is_one_by_one_whatever_is_held(name, held, batch):
+    state, frames = scene(*batch)
+    assert_together(STACKS[name], held(state, frames), frames)
+
+
+def test_robots_of_a_batch_hold_different_things():
+    state, frames = scene(6)
+    state = state.with_link("cup", None, frames["cup"])
+    state = state.with_link("cup", "r_hand", GRASP, torch.arange(6) % 3 == 0)
+    state = state.with_link("cup", "l_hand", GRASP, torch.arange(6) % 3 == 1)
+    assert_together(STACKS["things"], state, frames)
+    together = STACKS["things"].linearize(state, frames)
+    silent = together.noise.unflatten(-1, (-1, 3))[..., 0].bool()
+    assert (
+        silent.tolist()
+        == [
+            [False, False, False, True, True, False, False, False, False],
+            [False, False, False, False, False, True, False, False, True],
+            [True, True, True, False, False, False, False, True, False],
+        ]
+        * 2
+    )
+
+
+def assert_together(stack, state, frames):
+    together = stack.linearize(state, frames)
+    expected = stack.linearize(one_by_one(state), frames)
+    assert together.present is not None and expected.present is None
+    for name in ("jacobian", "matrix", "displacement"):
+        one, other = getattr(together, name), getattr(expected, name)
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
+        assert torch.equal(one == 0, other == 0) or name == "jacobian"
+    zero = torch.zeros_like(together.displacement)
+    one, other = (zero if at.noise is None else at.noise for at in (together, expected))
+    assert torch.equal(one, other)
+    assert bool((together.jacobian[one == 1] == 0).all())
 
 
 def test_one_frame_serves_many_robots_and_many_frames_one():
@@ -94,7 +170,7 @@ def test_operators_that_differ_speak_for_themselves():
     class Mine(AbsolutePosition):
         pass
 
-    for other in (Canonical(), Mine("l_hand"), RelativePosition("l_hand", "r_hand")):
+    for other in (Canonical(), Mine("l_hand"), RelativePosition("l_hand", "l_hand")):
         operators = (AbsolutePosition("l_hand"), other)
         assert pose_terms(operators, links, like.dtype, like.device) is None
 
