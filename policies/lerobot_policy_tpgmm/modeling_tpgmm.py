@@ -23,7 +23,7 @@ from lerobot_policy_tpgmm.configuration_tpgmm import (
 from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
-from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
+from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures, poses_named
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import Controller, TaskParameterizedGMM
@@ -83,8 +83,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self.kinematics = kinematics.to(getattr(torch, config.dtype))
         self.operators = tuple(operators)
         required = frame_names(operators, self.kinematics)
+        # an object that only stands where links do is told from a misspelt link by its data
+        known = {name for operator in operators for name in operator.references()}
+        known |= {*(config.frames or ()), *poses_named(config.environment_names)}
+        known |= {*poses_named(config.state_names)}
         for operator in operators:
-            operator.check(self.kinematics, required)
+            operator.check(self.kinematics, known - set(self.kinematics.links))
         dimensions = [operator.dimension(self.kinematics) for operator in operators]
         self.mixture = MixtureParameters(
             config.n_components, dimensions, config.n_steps, getattr(torch, config.dtype)

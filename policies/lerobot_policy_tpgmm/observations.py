@@ -19,7 +19,7 @@ from tpgmm_datasets.units import Scale, as_scale
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
-__all__ = ["FrameFeatures", "JointFeatures"]
+__all__ = ["FrameFeatures", "JointFeatures", "poses_named"]
 
 REMEDY = (
     "Does the robot have joints that the data have not? --policy.joints='left_*,right_*' names "
@@ -148,7 +148,7 @@ class FrameFeatures:
         for name in places or {}:
             if name not in frame_names:
                 raise UnknownNameError("frame", name, "the model", frame_names)
-        named, stated = _named(environment_names), _named(state_names)
+        named, stated = poses_named(environment_names), poses_named(state_names)
         self.in_environment: dict[str, list[int]] = {}
         self.in_state: dict[str, list[int]] = {}
         for index, name in enumerate(frame_names):
@@ -235,8 +235,8 @@ def _scale(units: Any, name: str, joint: str) -> Scale:
     return as_scale(unit, name)
 
 
-def _named(names: Sequence[str] | None) -> dict[str, list[int]]:
-    """Poses that names tell of; LeRobot's robots put ``.pos`` behind every name."""
+def poses_named(names: Sequence[str] | None) -> dict[str, list[int]]:
+    """Where poses are that names tell of; LeRobot puts ``.pos`` behind the names of robots."""
     plain = [name.removesuffix(".pos") for name in names or ()]
     return {name: list(group) for name, group in pose_groups(plain).items()}
 
