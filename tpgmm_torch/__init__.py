@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock
+    from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock, parse_clock
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.data.affine import Affine
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.tracked_poses import Poses
+    from tpgmm_torch.sensing.pose_filter import OneEuro
+    from tpgmm_torch.sensing.trust import Trust
     from tpgmm_torch.training.hold_detection import find_holds
 
     __version__: str
@@ -61,6 +63,7 @@ __all__ = [
     "LinearDynamics",
     "Linearization",
     "MotionBounds",
+    "OneEuro",
     "Operator",
     "Poses",
     "RelativeOrientation",
@@ -75,12 +78,14 @@ __all__ = [
     "TaskParameters",
     "TrackingPlan",
     "Trajectory",
+    "Trust",
     "WaitingClock",
     "find_holds",
+    "parse_clock",
 ]
 
 _HOMES = {
-    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
+    "control.clocks": ("Clock", "EvenClock", "WaitingClock", "parse_clock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
     "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
@@ -108,6 +113,8 @@ _HOMES = {
     "robots.tracked_poses": ("Poses",),
     "regression.regression": ("Estimate",),
     "robots.robot": ("Robot",),
+    "sensing.pose_filter": ("OneEuro",),
+    "sensing.trust": ("Trust",),
     "data.trajectories": ("Candidate", "Trajectory"),
     "training.hold_detection": ("find_holds",),
 }

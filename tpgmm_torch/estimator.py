@@ -19,6 +19,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
@@ -29,6 +30,7 @@ from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
 from tpgmm_torch.large_data.row_file import RowFile
@@ -43,6 +45,8 @@ from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.sensing.pose_filter import OneEuro
+from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import (
@@ -378,12 +382,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise DataError(f"predict takes a list of Situation, got {type(X).__name__}")
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
+        # what has no limit of speed is no robot that could be asked too much
+        limited = self.keep_limits and bool(self.kinematics_.velocity.isfinite().any())
+        bounds = self.motion_bounds() if limited else None
         return rollout(
             self.regression(),
             situations,
             self.time_,
             self.blend,
-            self.keep_limits,
+            bounds,
             candidates,
             self.holds_,
         )
@@ -484,7 +491,18 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise
         return self
 
-    def controller(self, joints: Any, frames: Mapping[str, Frame] | None = None) -> Controller:
+    def controller(
+        self,
+        joints: Any,
+        frames: Mapping[str, Frame] | None = None,
+        *,
+        clock: Clock | str = "waiting",
+        trust: Trust | None = Trust(),  # noqa: B008  (frozen)
+        smoothing: OneEuro | None = OneEuro(),  # noqa: B008  (frozen)
+        bounds: MotionBounds | Mapping[str, Any] | None = None,
+        feedback: str = "reference",
+        impedance: Impedance | None = None,
+    ) -> Controller:
         """The skill, to be run tick by tick.
 
         Parameters
@@ -493,26 +511,50 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             Start postures.
         frames : mapping of str to Frame, optional
             Object poses, of shapes that broadcast with the batch; a step may be given others.
+        clock : Clock or str, default="waiting"
+            How time goes on; text is for :func:`parse_clock`. Without measured joints, every
+            clock runs evenly.
+        trust : Trust, optional
+            When to believe what the steps are told; None believes everything.
+        smoothing : OneEuro, optional
+            What takes the noise from poses that steps are told; None leaves them as they are.
+        bounds : MotionBounds or mapping, optional
+            Of position, speed, acceleration and jerk, or those that are tighter than
+            :meth:`motion_bounds` has them; with ``keep_limits=False`` there are none.
+        feedback : {"reference", "measured"}
+            What q_{t-1} is.
+        impedance : Impedance, optional
+            What stiffness and damping are made with; by default ``Impedance(robot)``.
 
         Returns
         -------
         Controller
-            Its ``step(dt)`` finds the next ``reference``.
+            Its ``step(dt)`` finds the next command.
 
         Raises
         ------
-        ShapeError, DataError, NotFittedError
-            If the postures do not fit the robot.
+        ShapeError, DataError, NotFittedError, UnknownNameError
+            If the postures do not fit the robot, frames are missing, or bounds contradict
+            each other. Nothing moves.
         """
         self._check_fitted()
+        for operator in self.operators_:
+            operator.check(self.kinematics_, frames or {})
+        if not isinstance(bounds, MotionBounds):
+            bounds = self.motion_bounds(**(bounds or {}))
         return Controller(
             self.regression(),
             joints,
             frames,
             begin=float(self.time_[0]),
             end=float(self.time_[-1]),
+            clock=parse_clock(clock) if isinstance(clock, str) else clock,
             blend=self.blend,
-            keep_limits=self.keep_limits,
+            bounds=bounds if self.keep_limits else None,
+            trust=trust,
+            smoothing=smoothing,
+            feedback=feedback,
+            impedance=impedance or Impedance(self.kinematics_),
             holds=self.holds_,
         )
 

@@ -12,7 +12,15 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import Kinematics, Operator, Robot, TaskParameterizedGMM
+from tpgmm_torch import (
+    Kinematics,
+    OneEuro,
+    Operator,
+    Robot,
+    TaskParameterizedGMM,
+    Trust,
+    parse_clock,
+)
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
@@ -119,8 +127,20 @@ class TPGMMConfig(StatePolicyConfig):
         one another in ``observation.environment_state``.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
-    follow_frames : bool, default=False
-        Read the frames at every step, instead of at the start of an episode.
+    follow_frames : bool, default=True
+        Read the frames at every step, instead of at the start of an episode alone.
+    closed_loop : bool, default=True
+        Read the joints at every step: the clock looks at them, and a robot stands whose
+        joints cannot be believed. Else a skill is played as it was at the start.
+    clock : str, default="waiting"
+        How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
+        ``"waiting"`` or ``"localizing"``, with options.
+    smoothing : float or None, default=0.5
+        Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
+    patience : float, default=0.2
+        How long a robot goes on with what it last knew, before it stands [s].
+    velocity, acceleration, jerk : float, list of float or dict, optional
+        Bounds that are tighter than those of the robot and of the demonstrations [rad/s^n].
     fps : float, optional
         Steps per second of the demonstrations.
     control_fps : float, optional
@@ -185,7 +205,14 @@ class TPGMMConfig(StatePolicyConfig):
     units: dict[str, list[float] | str] | str | None = None
     frames: dict[str, list[int | str]] | None = None
     default_environment_state: list[float] | None = None
-    follow_frames: bool = False
+    follow_frames: bool = True
+    closed_loop: bool = True
+    clock: str = "waiting"
+    smoothing: float | None = 0.5
+    patience: float = 0.2
+    velocity: dict[str, float] | list[float] | float | None = None
+    acceleration: dict[str, float] | list[float] | float | None = None
+    jerk: dict[str, float] | list[float] | float | None = None
 
     fps: float | None = None
     control_fps: float | None = None
@@ -224,6 +251,7 @@ class TPGMMConfig(StatePolicyConfig):
                 "the imitation error is that of actions that follow measured joints: "
                 "--policy.learn_from=commanded goes with --policy.loss=likelihood"
             )
+        self.control()
         self.estimator(None, ()).check_parameters()
 
     @property
@@ -239,6 +267,17 @@ class TPGMMConfig(StatePolicyConfig):
         if rate is None:
             raise DataError("the policy does not know its rate: set fps or control_fps")
         return rate
+
+    def control(self) -> dict[str, Any]:
+        """Options of :meth:`tpgmm_torch.TaskParameterizedGMM.controller`."""
+        limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
+        return {
+            "clock": parse_clock(self.clock),
+            "trust": Trust(patience=self.patience),
+            "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
+            "feedback": "measured" if self.feedback == "observation" else "reference",
+            "bounds": {name: limit for name, limit in limits.items() if limit is not None},
+        }
 
     def kinematics(self) -> Kinematics | None:
         """The robot that ``robot`` describes, None for joints alone."""

@@ -35,6 +35,9 @@ __all__ = ["TPGMMPolicy"]
 
 log = logging.getLogger(__name__)
 
+#: When an observation was made [s], of environments and robots that tell.
+TIMESTAMP = "observation.timestamp"
+
 
 class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     """A task-parameterised Gaussian mixture as a LeRobot policy.
@@ -207,6 +210,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
+        self._timestamp: Tensor | None = None
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -215,9 +219,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Parameters
         ----------
         batch : dict of str to Tensor
-            ``observation.state`` (B, n_state) and what the frames are read from. Only the
-            first observation after :meth:`reset` counts, unless ``feedback`` or
-            ``follow_frames`` say otherwise.
+            ``observation.state`` (B, n_state) and what the frames are read from; in the middle
+            of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
+            much time has passed [s], where it is there.
 
         Returns
         -------
@@ -257,22 +261,33 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
         model = self.to_estimator()
-        return model.controller(self._observed(batch), self.frames.frames(batch))
+        self._timestamp = None
+        return model.controller(
+            self._observed(batch), self.frames.frames(batch), **self.config.control()
+        )
 
     def _step(self, controller: Controller, batch: Mapping[str, Tensor]) -> Tensor:
         """The references (B, n_joints) of the next action."""
-        start, first = controller.reference, controller.estimate is None
-        frames = self.frames.frames(batch) if self.config.follow_frames else None
-        measured = self._observed(batch) if self.config.feedback == "observation" else None
+        start, first, config = controller.reference, controller.command is None, self.config
+        measured = self._observed(batch) if config.closed_loop else None
+        frames = self.frames.poses(batch) if config.follow_frames and not first else None
         if measured is not None and measured.shape != start.shape:
             raise ShapeError(
                 f"the episode began with {len(start)} robots, now there are {len(measured)}: "
                 "call reset() between episodes"
             )
-        estimate = controller.step(1 / self.config.rate, measured, frames)
+        command = controller.step(self._passed(batch), measured, frames)
         if first:
-            self._check_start(start, estimate.joints)
+            self._check_start(start, command.estimate.joints)
         return controller.reference
+
+    def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
+        """Seconds since the last observation."""
+        period, now = 1 / self.config.rate, batch.get(TIMESTAMP)
+        if now is None:
+            return period
+        last, self._timestamp = self._timestamp, now.flatten().to(torch.float64).cpu()
+        return period if last is None else self._timestamp - last
 
     def _check_start(self, start: Tensor, wanted: Tensor) -> None:
         """Refuse to move robots that stand far from where the skill begins."""

@@ -201,9 +201,27 @@ class FrameFeatures:
                 f"{OBS_ENV_STATE} has shape ({len(state)}, {self.n_environment}), got "
                 f"{tuple(environment.shape)}: is this policy for another environment?"
             )
-        return {name: self._frame(name, state, environment) for name in self.frame_names}
+        poses = {name: self._pose(name, state, environment) for name in self.frame_names}
+        frames = {}
+        for name, pose in poses.items():
+            try:
+                frames[name] = Frame(pose[:, :3], pose[:, 3:])
+            except DataError as error:
+                raise DataError(f"frame {name!r}: {error}") from error
+        return frames
 
-    def _frame(self, name: str, state: Tensor, environment: Tensor | None) -> Frame:
+    def poses(self, batch: Mapping[str, Any]) -> dict[str, Tensor | None]:
+        """The same in the middle of an episode: (B, 7), of any values; None for a lost one."""
+        state, environment = batch[OBS_STATE], batch.get(OBS_ENV_STATE)
+        poses: dict[str, Tensor | None] = {}
+        for name in self.frame_names:
+            try:
+                poses[name] = self._pose(name, state, environment)
+            except (DataError, IndexError):
+                poses[name] = None
+        return poses
+
+    def _pose(self, name: str, state: Tensor, environment: Tensor | None) -> Tensor:
         if environment is not None and name in self.in_environment:
             values = environment[:, self.in_environment[name]]
         elif name in self.in_state:
@@ -217,11 +235,7 @@ class FrameFeatures:
                 f"has no {name}.x ... {name}.qz. Let the robot observe it, or give "
                 "--policy.default_environment_state='[x,y,z,qw,qx,qy,qz]'"
             )
-        values = values.to(torch.float64)
-        try:
-            return Frame(values[:, :3], values[:, 3:])
-        except DataError as error:
-            raise DataError(f"frame {name!r}: {error}") from error
+        return values.to(torch.float64)
 
 
 def _scale(units: Any, name: str, joint: str) -> Scale:

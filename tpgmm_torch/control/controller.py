@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from tpgmm_torch.control.clocks import Clock, EvenClock, Observation
+from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.impedance.stiffness import Impedance
+from tpgmm_torch.motion.follower import Follower
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.sensing.inputs import Inputs
+from tpgmm_torch.sensing.pose_filter import OneEuro
+from tpgmm_torch.sensing.trust import Trust
 
 __all__ = ["Controller"]
 
 
 class Controller:
-    """A batch of robots that reproduce a skill in step, from its beginning to its end.
+    """A batch of robots that run a skill, each at its own pace, from its beginning to its end.
 
-    Each reference is the state q_{t-1} of the next step, unless a measured one is given. The
-    difference between the start posture and the first estimate fades out by a minimum-jerk
-    step. After the end the last reference is held.
+    At each step a clock says how far each robot is, from what is observed; the model says which
+    posture is wanted there; a follower goes there within the bounds of motion. What cannot be
+    believed is not used, and a robot that has nothing to believe stands until there is
+    something. After the end the last reference is held. Robots of a batch do not know of each
+    other.
 
     Parameters
     ----------
@@ -34,26 +47,39 @@ class Controller:
     joints : array-like of shape (..., n_joints)
         The start postures.
     frames : mapping of str to Frame, optional
-        Poses of the objects until others are given, of shapes that broadcast with the batch.
+        Poses of the objects until others are told, of shapes that broadcast with the batch.
     begin, end : float
         When the skill begins and ends [s].
+    clock : Clock, optional
+        How the skill goes on; evenly by default.
     blend : float
-        How long the difference at the start fades [s].
-    keep_limits : bool
-        Whether references respect the robot's limits of position and speed.
-    holds : sequence of Hold, default=()
-        From when to when links hold objects.
+        How long the difference between posture and model fades, at the start and whenever a
+        robot goes on from somewhere else [s]. The difference goes by a minimum-jerk step.
+    bounds : MotionBounds, optional
+        Of position, speed, acceleration and jerk; None takes each estimate for a reference.
+    trust : Trust, optional
+        When to believe what is told; None believes everything, and raises on what is wrong.
+    smoothing : OneEuro, optional
+        What takes the noise from poses that come at each step; only with ``trust``.
+    holds : sequence of Hold
+        From when to when which link holds which object.
+    at_rest : bool
+        Whether robots stand when the skill begins; else they move as the model does.
+    feedback : {"reference", "measured"}
+        What q_{t-1} is: the last reference, or the measured posture.
+    impedance : Impedance, optional
+        What stiffness and damping are made with.
 
     Attributes
     ----------
-    time : float
-        Of the last step [s]; the beginning before the first one.
-    reference : Tensor of shape (..., n_joints)
-        The last reference; the start posture before the first step.
     holding : Holding
         What the robots hold, and where objects were last free.
-    estimate : Estimate or None
-        What the last reference was made from: it is without the fading difference.
+    reference : Tensor of shape (..., n_joints)
+        The last reference; the start posture before the first step.
+    time : Tensor of shape () or (...)
+        Progress at the last step [s]; the beginning before the first one.
+    command : Command or None
+        What the last step returned.
 
     Raises
     ------
@@ -69,107 +95,250 @@ class Controller:
         *,
         begin: float,
         end: float,
+        clock: Clock = EvenClock(),  # noqa: B008  (frozen)
         blend: float = 0.0,
-        keep_limits: bool = True,
+        bounds: MotionBounds | None = None,
+        trust: Trust | None = None,
+        smoothing: OneEuro | None = None,
         holds: Sequence[Hold] = (),
+        at_rest: bool = True,
+        feedback: str = "reference",
+        impedance: Impedance | None = None,
     ) -> None:
-        self.time, self._begin, self._end = begin, begin, end
-        self.reference = regression.kinematics.joint_tensor(joints)
-        self.estimate: Estimate | None = None
-        self._regression, self._blend, self._keep_limits = regression, blend, keep_limits
-        self._like = regression.kinematics.lower
-        self.holding = Holding.start(
-            regression.kinematics, regression.operators, holds, self._converted(frames or {})
-        )
-        self._gap = torch.zeros_like(self.reference)
+        if feedback not in ("reference", "measured"):
+            raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
+        kinematics = regression.kinematics
+        self.reference = kinematics.joint_tensor(joints)
+        self.command: Command | None = None
+        self._regression, self._end, self._blend = regression, end, blend
+        self._measured_feedback, self._impedance = feedback == "measured", impedance
+        self._frames = self._converted(frames or {})
+        self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
+        self._trust = trust
+        self._inputs: Inputs | None = None
+        if trust is not None:
+            self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
+        self._progress = clock.start(regression, begin, end, self.reference, self._frames)
+        self._follower: Follower | None = None
+        self._bounds, self._position_bounds = bounds, None
+        if bounds is not None:
+            self._follower = Follower.at(bounds, self.reference) if at_rest else None
+            self._position_bounds = bounds.lower, bounds.upper
+        self._velocity = torch.zeros_like(self.reference)
+        shape = self.reference.shape[:-1]
+        self._codes = torch.zeros(shape, dtype=torch.int8, device=self.reference.device)
+        self._gap, self._since = self._velocity, torch.full_like(self._velocity[..., 0], -1.0)
+        self._fading = blend > 0
+
+    @property
+    def time(self) -> Tensor:
+        """Progress at the last step [s], the same for all robots or of each one."""
+        return self._progress.time
 
     @property
     def finished(self) -> bool:
-        """Whether the end has been reached: further steps hold the last reference."""
-        return self.estimate is not None and self.time >= self._end
+        """Whether all robots are at the end: further steps hold the last reference."""
+        return self.command is not None and bool((self.time >= self._end).all())
 
     def step(
         self,
-        dt: float,
-        joints: Tensor | None = None,
-        frames: Mapping[str, Frame] | None = None,
+        dt: float | Tensor,
+        joints: Any = None,
+        frames: Mapping[str, Any] | None = None,
+        *,
         told: Mapping[str, str | None] | None = None,
-    ) -> Estimate:
-        """Find the next ``reference``.
+        ages: Mapping[str, float] | None = None,
+    ) -> Command:
+        """Find the next reference.
 
         Parameters
         ----------
-        dt : float
-            Seconds since the last step. The first step is at the beginning, whatever it is.
-        joints : Tensor of shape (..., n_joints), optional
-            Where the robots stand, in place of the last reference as q_{t-1}. Limits of speed
-            are those of the references anyhow.
+        dt : float or Tensor of shape (...)
+            Seconds since the last step. The first step is at the beginning, whatever it is. A
+            robot whose time did not increase is held for this step.
+        joints : array-like of shape (..., n_joints), optional
+            Where the robots stand [rad].
         frames : mapping of str to Frame, optional
-            Poses of the objects from now on.
+            Poses of the objects from now on. With ``trust`` also arrays (..., 7) of positions
+            and quaternions (w, x, y, z), which need not be finite, or None for a lost one.
         told : mapping of str to str or None, optional
             Which link holds an object from now on, None if it is free from now on: in place
             of the holds that the skill began with.
+        ages : mapping of str to float, optional
+            How old ``"joints"`` and the frames are [s].
 
         Returns
         -------
-        Estimate
-            What the reference was made from.
+        Command
 
         Raises
         ------
         ShapeError
-            If there are more or fewer robots than at the start.
+            If there are more or fewer robots than at the start. Nothing has moved then.
         """
-        last = self.reference
-        if joints is not None and joints.shape != last.shape:
-            raise ShapeError(
-                f"the skill began with joints of shape {tuple(last.shape)}, now there are "
-                f"{tuple(joints.shape)}: begin it anew for other robots"
+        last = self.command
+        passed: float | Tensor = dt
+        if isinstance(dt, Tensor):  # the follower has one time step for all
+            increased = (dt > 0) & dt.isfinite()
+            passed = torch.where(increased, dt, 0.0)
+            dt = float(dt[increased].median()) if bool(increased.any()) else 0.0
+        if last is not None and not 0 < dt < math.inf:
+            return self._refuse(last, f"time did not increase: dt = {dt} s")
+        measured, halted = self._hear(dt, joints, frames, ages)
+        self._go_on_from(measured)
+        before = self._progress
+        if last is not None:
+            if self._trust is not None and dt > self._trust.longest_step:
+                passed = dt = self._trust.longest_step
+            if halted is not None:
+                passed = torch.where(halted, 0.0, passed)
+            observed = Observation(
+                measured, self.reference, self._velocity, self.holding.frames, last.estimate
             )
-        time = self.time if self.estimate is None else self.time + dt
-        if self.estimate is not None and time > self._end + 1e-6 * dt:  # but for rounding
-            self.time = self._end
-            return self.estimate
-        time = min(time, self._end)
-        gap = self._fading(time)
-        bounds = self._bounds(dt, gap) if self._keep_limits else None
-        now, joints = self._like.new_tensor(time), last if joints is None else joints
-        seen = None if frames is None else self._converted(frames)
-        self.holding = self.holding.advance(time, joints, seen, told)
-        at: Tensor | RobotState = joints
+            self._progress = before.advance(passed, observed)
+            if measured is not None and bool((moved := self._progress.relocalized).any()):
+                self._restart_fading(moved)
+        time, ended = self._progress.time, None
+        if last is not None and bool((time >= self._end).any()):
+            ended = (time >= self._end) & (before.time >= self._end)
+            if bool(ended.all()):  # nothing more is asked: the follower comes to rest
+                return self._send(last.estimate, self._wanted, dt, halted, ended)
+        at = self.reference
+        if self._measured_feedback and measured is not None:
+            at = torch.where(measured.isnan(), at, measured)
+        seen = None if frames is None else self._frames
+        self.holding = self.holding.advance(time, at, seen, told)
+        state: Tensor | RobotState = at
         if self.holding.carries:
-            at = self.holding.state(self._regression.kinematics.state(joints))
-        estimate = self._regression.tick(now, at, self.holding.frames, bounds)
-        if self.estimate is None:
-            self._gap = last - estimate.joints
-            gap = self._fading(time)
-        references = estimate.joints if gap is None else estimate.joints + gap
-        self.reference = self._regression.kinematics.retract(references)
-        self.time, self.estimate = time, estimate
-        return estimate
+            state = self.holding.state(self._regression.kinematics.state(at))
+        estimate = self._regression.tick(
+            time, state, self.holding.frames, self._position_bounds
+        )
+        wanted = estimate.joints
+        if self._fading:
+            wanted = wanted + self._fade(estimate.joints, 0.0 if last is None else dt)
+        wanted = self._regression.kinematics.retract(wanted)
+        if ended is not None and bool(ended.any()):
+            wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
+        return self._send(estimate, wanted, dt, halted, ended)
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
         return copy.copy(self)  # its tensors are replaced, never changed
 
-    def _fading(self, time: float) -> Tensor | None:
-        """What is left of the difference at the start; None once it is nothing."""
-        if self._blend <= 0 or time - self._begin >= self._blend:
-            return None
-        passed = self._like.new_tensor((time - self._begin) / self._blend)
-        return (1 - minimum_jerk(passed)) * self._gap
+    def _hear(
+        self,
+        dt: float,
+        joints: Any,
+        frames: Mapping[str, Any] | None,
+        ages: Mapping[str, float] | None,
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Measured joints, and robots that are halted; frames are kept."""
+        if self._inputs is None:
+            if frames is not None:
+                self._frames = self._converted(frames)
+            return self._checked(joints), None
+        dt = dt if self.command else max(dt, 1e-3)
+        self._inputs = inputs = self._inputs.hear(dt, joints, frames, ages)
+        self._frames = inputs.frames
+        untrusted = inputs.untrusted()
+        halted = None if untrusted is None else torch.as_tensor(untrusted)
+        return inputs.measured, halted
 
-    def _bounds(self, dt: float, gap: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Limits of position, and of speed since the last reference, on the estimate."""
-        kinematics = self._regression.kinematics
-        low, high = kinematics.lower, kinematics.upper
-        if self.estimate is not None:
-            # a start beyond a limit comes back as fast as the speed allows
-            reach = kinematics.velocity * dt
-            slowest, fastest = self.reference - reach, self.reference + reach
-            low, high = low.clamp(slowest, fastest), high.clamp(slowest, fastest)
-        # the fading difference comes on top of the estimate
-        return (low, high) if gap is None else (low - gap, high - gap)
+    def _go_on_from(self, measured: Tensor | None) -> None:
+        """Take the place of robots that were driven away for their references."""
+        if measured is None or self._inputs is None:
+            return
+        trust = self._inputs.trust  # in numpy, which takes a third of the time of torch
+        gap = np.abs(measured.numpy(force=True) - self.reference.numpy(force=True))
+        allowed = trust.largest_gap + trust.lag * np.abs(self._velocity.numpy(force=True))
+        far = gap > allowed  # not where nothing is believed
+        if not far.any():
+            return
+        away = torch.as_tensor(far.any(-1), device=self.reference.device)
+        self.reference = torch.where(away.unsqueeze(-1), measured, self.reference)
+        self._velocity = torch.where(away.unsqueeze(-1), 0.0, self._velocity)
+        if self._follower is not None:
+            self._follower = self._follower.reset(self.reference, robots=away)
+        self._restart_fading(away)
+
+    def _checked(self, joints: Any) -> Tensor | None:
+        if joints is None:
+            return None
+        measured = self._regression.kinematics.joint_tensor(joints)
+        if measured.shape != self.reference.shape:
+            raise ShapeError(
+                f"the skill began with joints of shape {tuple(self.reference.shape)}, now "
+                f"there are {tuple(measured.shape)}: begin it anew for other robots"
+            )
+        return measured
+
+    def _refuse(self, last: Command, reason: str) -> Command:
+        """The last command again: nothing moves, and why."""
+        codes = torch.full_like(self._codes, Status.HOLDING.code)
+        robots = np.ndindex(*self._codes.shape)
+        self.command = replace(last, codes=codes, reasons=dict.fromkeys(robots, reason))
+        return self.command
 
     def _converted(self, frames: Mapping[str, Frame]) -> dict[str, Frame]:
-        return {name: frame.to(self._like) for name, frame in frames.items()}
+        like = self._regression.kinematics.lower
+        return {name: frame.to(like) for name, frame in frames.items()}
+
+    def _restart_fading(self, robots: Tensor) -> None:
+        self._since = torch.where(robots, -1.0, self._since)  # their gap is not known yet
+        self._fading = self._blend > 0
+
+    def _fade(self, estimate: Tensor, dt: float) -> Tensor:
+        """What is left of the difference between where robots went on and the estimate."""
+        fresh = self._since < 0
+        if bool(fresh.any()):
+            gap = self.reference - estimate
+            self._gap = torch.where(fresh.unsqueeze(-1), gap, self._gap)
+        self._since = torch.where(fresh, 0.0, self._since + dt)
+        left = 1 - minimum_jerk(self._since / self._blend)
+        self._fading = bool((left > 0).any())
+        return left.unsqueeze(-1) * self._gap
+
+    def _send(
+        self,
+        estimate: Estimate,
+        wanted: Tensor,
+        dt: float,
+        halted: Tensor | None,
+        ended: Tensor | None,
+    ) -> Command:
+        """The command that brings robots where they are wanted, within their bounds."""
+        last, self._wanted = self.reference, wanted
+        if self._bounds is None:
+            if halted is not None:
+                wanted = torch.where(halted.unsqueeze(-1), last, wanted)
+            if self.command is not None:
+                self._velocity = (wanted - last) / dt
+            self.reference = wanted
+        elif self.command is not None:  # the first reference is where robots stand
+            if halted is not None:  # what is not finite brings a robot to rest
+                wanted = torch.where(halted.unsqueeze(-1), torch.nan, wanted)
+            if self._follower is None:
+                fastest = self._bounds.velocity
+                moving = ((wanted - last) / dt).clamp(-fastest, fastest)
+                self._follower = Follower.at(self._bounds, last, moving)
+            follower = self._follower.take(wanted, dt) or self._follower.advance(wanted, dt)
+            self._follower = follower
+            self.reference, self._velocity = follower.reference, follower.velocity
+        codes = self._codes
+        reasons: Mapping[tuple[int, ...], str] = {}
+        if ended is not None and bool(ended.any()):
+            codes = torch.where(ended, Status.FINISHED.code, codes)
+        if halted is not None and self._inputs is not None:
+            codes = torch.where(halted, Status.HOLDING.code, codes)
+            reasons = self._inputs.reasons(halted.numpy())
+        self.command = Command(
+            self.reference,
+            self._velocity,
+            self.time,
+            estimate,
+            codes.to(torch.int8),
+            reasons,
+            self._impedance,
+        )
+        return self.command

@@ -13,6 +13,7 @@ from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import PART, Estimate, Regression
 
 __all__ = ["rollout"]
@@ -23,7 +24,7 @@ def rollout(
     situations: Sequence[Situation],
     skill_time: torch.Tensor,
     blend: float,
-    keep_limits: bool,
+    bounds: MotionBounds | None,
     candidates: bool,
     holds: Sequence[Hold] = (),
 ) -> list[Trajectory]:
@@ -39,8 +40,8 @@ def rollout(
         From when to when the skill lasts [s]: what comes before or after is held.
     blend : float
         How long the difference between the start posture and the first reference fades [s].
-    keep_limits : bool
-        Whether references respect the robot's limits of position and speed.
+    bounds : MotionBounds or None
+        What references keep within.
     candidates : bool
         Whether to keep each operator's own estimate.
     holds : sequence of Hold, default=()
@@ -55,7 +56,7 @@ def rollout(
     for members in _groups(situations):
         batch = [situations[index] for index in members]
         together = _run_together(
-            regression, batch, skill_time, blend, keep_limits, candidates, holds
+            regression, batch, skill_time, blend, bounds, candidates, holds
         )
         trajectories.update(zip(members, together, strict=True))
     return [trajectories[index] for index in range(len(situations))]
@@ -76,7 +77,7 @@ def _run_together(
     situations: Sequence[Situation],
     skill_time: torch.Tensor,
     blend: float,
-    keep_limits: bool,
+    bounds: MotionBounds | None,
     candidates: bool,
     holds: Sequence[Hold],
 ) -> list[Trajectory]:
@@ -100,8 +101,9 @@ def _run_together(
         begin=grid[0],
         end=grid[-1],
         blend=blend,
-        keep_limits=keep_limits,
         holds=holds,
+        bounds=bounds,
+        at_rest=False,  # a situation does not say how its robot moves
     )
     references: list[torch.Tensor] = []
     estimates: list[Estimate] = []
@@ -117,8 +119,9 @@ def _run_together(
             continue
         with torch.inference_mode(inferring):
             here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
-            dt = now - controller.time
-            estimates.append(controller.step(dt, frames=here if moving else None))
+            dt = now - grid[k - 1] if k else 0.0
+            command = controller.step(dt, frames=here if moving else None)
+            estimates.append(command.estimate)
             references.append(controller.reference)
             holdings.append(controller.holding)
     whole = Estimate(

@@ -12,6 +12,7 @@ from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
 
 NAMES = ["the paper's", "poses in two frames"]
@@ -40,8 +41,9 @@ def situations(problem: Problem, *grids: Tensor, moves: bool = False) -> list[Si
 
 
 def run(regression: Regression, given: list[Situation], **options) -> list[Trajectory]:
-    defaults = {"blend": 0.5, "keep_limits": False, "candidates": True}
-    return rollout(regression, given, grid(), **{**defaults, **options})
+    options = {"blend": 0.5, "keep_limits": False, "candidates": True} | options
+    bounds = MotionBounds.of(regression.kinematics) if options.pop("keep_limits") else None
+    return rollout(regression, given, grid(), bounds=bounds, **options)
 
 
 def assert_same(a: Trajectory, b: Trajectory) -> None:

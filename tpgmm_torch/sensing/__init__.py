@@ -1,0 +1,1 @@
+"""What a running skill is told, and what it believes of it."""

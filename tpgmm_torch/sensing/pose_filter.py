@@ -1,0 +1,150 @@
+"""Observed poses of objects without their noise: the 1-euro filter on positions and turns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["OneEuro", "PoseFilter"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class OneEuro:
+    """Settings of the 1-euro filter: little jitter at rest, little lag in motion.
+
+    A first-order low pass whose cutoff frequency grows with the filtered speed,
+
+        ``cutoff (1 + (noise / n)^2) + slope * speed``.
+
+    What is seen without noise passes unchanged: n is the median of the last second differences
+    of the pose, which neither a motion nor a jump adds to.
+
+    Parameters
+    ----------
+    cutoff : float
+        Of a noisy object at rest [Hz]; ``inf`` passes everything as it is.
+    slope : float
+        By how much the cutoff grows with the speed [Hz s/m; rotations count 0.2 m/rad].
+    speed_cutoff : float
+        Of the speed itself [Hz].
+    noise : float
+        What is little noise, as a standard deviation [m].
+
+    Raises
+    ------
+    DataError
+        If one is not positive; the slope may be 0.
+
+    References
+    ----------
+    Casiez, Roussel, Vogel: 1 Euro Filter: A Simple Speed-based Low-pass Filter for Noisy Input
+    in Interactive Systems, CHI 2012.
+    """
+
+    cutoff: float = 0.5
+    slope: float = 8.0
+    speed_cutoff: float = 0.5
+    noise: float = 5e-4
+
+    def __post_init__(self) -> None:
+        for name in ("cutoff", "slope", "speed_cutoff", "noise"):
+            value = getattr(self, name)
+            if not (value > 0 or (name == "slope" and value == 0)):
+                raise DataError(f"{name} of OneEuro is positive, got {value!r}")
+
+
+#: A radian counts as that many metres of an object's motion: half the size of what hands hold.
+METRES_PER_RADIAN = 0.2
+#: A quaternion's coordinates change half as fast as it turns.
+METRIC = np.array([1.0] * 3 + [(2 * METRES_PER_RADIAN) ** 2] * 4)
+#: Second differences that the noise is the median of.
+MEMORY = 15
+#: Of white noise of variance v in six coordinates, the median of the squared second
+#: differences: 6 v times that of the chi-squared distribution.
+MEDIAN = 6 * 5.348
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFilter:
+    """A filtered pose for each robot of a batch.
+
+    Parameters
+    ----------
+    settings : OneEuro
+    pose : ndarray of shape (..., 7)
+        Position [m] and unit quaternion (w, x, y, z).
+    velocity : ndarray of shape (..., 7)
+        Filtered change of its coordinates [1/s].
+    change : ndarray of shape (..., 7)
+        From the pose before the last to the last that was seen.
+    last : ndarray of shape (..., 7)
+        The last one that was seen.
+    history : ndarray of shape (15, ...)
+        Squared second differences [m^2].
+    """
+
+    settings: OneEuro
+    pose: Floats
+    velocity: Floats
+    change: Floats
+    last: Floats
+    history: Floats
+
+    @classmethod
+    def of(cls, settings: OneEuro, pose: Floats) -> Self:
+        """Begin with a pose as it is."""
+        zero = np.zeros_like(pose)
+        return cls(settings, pose, zero, zero, pose, np.zeros((MEMORY, *pose.shape[:-1])))
+
+    def see(self, pose: Floats, dt: float) -> Self:
+        """What is known after one more ``pose``, ``dt`` seconds later.
+
+        Its quaternion may be on either side.
+        """
+        settings = self.settings
+        if math.isinf(settings.cutoff):
+            return self._with(pose=pose, last=pose)
+        if (pose == self.last).all() and not (self.change.any() or self.history.any()):
+            return self
+        side = np.einsum("...i,...i", pose[..., 3:], self.pose[..., 3:])
+        if not (side > 0).all():
+            turn = np.copysign(pose[..., 3:], side[..., None] * pose[..., 3:])
+            pose = np.concatenate((pose[..., :3], turn), -1)
+        change = pose - self.last
+        bend = np.square(change - self.change) @ METRIC
+        history = np.concatenate((self.history[1:], bend[None]))
+        variance = np.partition(history, MEMORY // 2, axis=0)[MEMORY // 2] / MEDIAN
+        velocity = self.velocity + _share(settings.speed_cutoff, dt) * (
+            change / dt - self.velocity
+        )
+        speed = np.sqrt(np.square(velocity) @ METRIC)
+        with np.errstate(divide="ignore"):
+            cutoff = settings.cutoff * (1 + settings.noise**2 / variance)
+        share = _share(cutoff + settings.slope * speed, dt)[..., None]
+        out = self.pose + share * (pose - self.pose)
+        turn = out[..., 3:]
+        out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
+        # what passes whole passes bit for bit
+        out = np.where(share == 1, pose, out)
+        return self._with(
+            pose=out, velocity=velocity, change=change, last=pose, history=history
+        )
+
+    def _with(self, **changes: Floats) -> Self:
+        """``dataclasses.replace`` without its checks, which take as long as the filter."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__, **changes)
+        return other
+
+
+def _share(cutoff: float | Floats, dt: float) -> Any:
+    """Of the new value, in a first-order low pass."""
+    return 1 / (1 + 1 / (2 * math.pi * cutoff * dt))
