@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.control.clocks import Clock, EvenClock, WaitingClock, parse_clock
+    from tpgmm_torch.control.clocks import (
+        Clock,
+        EvenClock,
+        LocalizingClock,
+        WaitingClock,
+        parse_clock,
+    )
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.data.affine import Affine
@@ -62,6 +68,7 @@ __all__ = [
     "Kinematics",
     "LinearDynamics",
     "Linearization",
+    "LocalizingClock",
     "MotionBounds",
     "OneEuro",
     "Operator",
@@ -85,7 +92,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.clocks": ("Clock", "EvenClock", "WaitingClock", "parse_clock"),
+    "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
     "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),

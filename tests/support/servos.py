@@ -85,3 +85,17 @@ class Run:
 def held(at: Tensor) -> Disturbance:
     """Somebody holds the robots."""
     return lambda passed, joints: at
+
+
+def between(begin: Tensor, end: Tensor, at: Tensor | None = None) -> Disturbance:
+    """From some times of their own on, robots are held: where they are, or elsewhere."""
+    places: list[Tensor] = [] if at is None else [at]
+
+    def disturbance(passed: float, joints: Tensor) -> Tensor:
+        if not places:
+            places.append(torch.full_like(joints, torch.nan))
+        inside = ((passed > begin) & (passed < end))[..., None]
+        places[0] = torch.where(inside & places[0].isnan(), joints, places[0])
+        return torch.where(inside, places[0], joints)
+
+    return disturbance

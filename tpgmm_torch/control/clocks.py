@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.control.localization import MODE, SPREAD, Likelihood, local_mode, move
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Estimate, Regression
@@ -26,6 +27,7 @@ from tpgmm_torch.regression.regression import Estimate, Regression
 __all__ = [
     "Clock",
     "EvenClock",
+    "LocalizingClock",
     "Observation",
     "Progress",
     "WaitingClock",
@@ -34,8 +36,29 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 #: From standing still, the rate of progress takes that long to be whole again [s].
 RESTART = 0.2
+#: What robots may be believed at the start of a skill.
+INITIAL = ("beginning", "anywhere")
+#: So many places may explain the start posture.
+CANDIDATES = 5
+#: Standard deviation of the time of robots that follow [s].
+WIDTH = 0.1
+#: Observations per second that are worth one by themselves: those between see the same.
+EVIDENCE = 1.25
+#: Robots that are brought elsewhere: mean distance on the skill [s].
+ELSEWHERE = 2.0
+#: Places that are less apart are no others [s].
+JUMP = 0.3
+#: For how long a robot is known to be elsewhere before time moves there [s].
+PATIENCE = 0.05
+#: A robot returns whose error falls below that share of itself between two corrections.
+RETURNING = 0.9
+#: So far behind the time a robot may be, beyond its lag [s]; twice, and time stands still.
+GRACE = 0.2
+#: The most that time hurries, in units of its speed.
+HURRY = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,9 +274,10 @@ class WaitingClock(Clock):
     ) -> WaitingProgress:
         """Start at the beginning; see :meth:`Clock.start`."""
         _check_span(begin, end)
-        batch = joints.shape[:-1]
+        one, error = np.ones(joints.shape[:-1]), np.zeros(joints.shape[:-1])
+        stand = _array(joints)
         return WaitingProgress(
-            self, regression, begin, end, np.full(batch, begin), np.ones(batch), _array(joints)
+            self, regression, begin, end, begin * one, one, stand, stand, error
         )
 
 
@@ -272,6 +296,10 @@ class WaitingProgress(Progress):
         Of the last tick, as a share of the clock's speed.
     expected : array of shape (..., n_joints)
         Where servos with the clock's lag would be now.
+    measured : array of shape (..., n_joints)
+        Where the robots are; where that is not known, what they were told.
+    error : array of shape (...)
+        The largest tracking error over what the servo lets one expect; 0 where none is known.
     """
 
     clock: WaitingClock
@@ -281,6 +309,8 @@ class WaitingProgress(Progress):
     now: Array
     rate: Array
     expected: Array
+    measured: Array
+    error: Array
 
     @property
     def time(self) -> Tensor:
@@ -291,57 +321,342 @@ class WaitingProgress(Progress):
         """Less than ``dt`` where a robot does not follow; see :meth:`Progress.advance`."""
         clock, passed = self.clock, _array(dt) if isinstance(dt, Tensor) else dt
         reference = _array(observation.reference)
-        expected = self._servo(reference, passed)
-        rate = np.ones_like(self.now)
+        # servos of first order, a tick after they were told the reference
+        left = np.exp(-np.asarray(passed) / clock.lag)[..., None]
+        expected = reference + left * (self.expected - reference)
+        rate, error = np.ones_like(self.now), np.zeros_like(self.now)
+        measured = reference
         if observation.joints is not None:
-            measured = self._like_reference(observation.joints, reference)
-            share = self.following(measured, reference, expected, observation.estimate)
-            rate = np.minimum(share, self.rate + passed / RESTART)
+            measured = self._measured(observation.joints, reference)
+            deviation = np.abs(measured - reference)
+            usual = np.abs(reference - expected) + clock.floor
+            error = (deviation / usual).max(-1)
+            if (late := error > clock.tolerance).any():
+                if observation.estimate is not None:
+                    usual = usual + _deviations(observation.estimate)
+                excess = np.clip((deviation / usual).max(-1) / clock.tolerance - 1, 0, 1)
+                rate = np.where(late, self._rate(1 - excess**2 * (3 - 2 * excess)), rate)
+            rate = np.minimum(rate, self.rate + passed / RESTART)
         step = clock.speed * passed * rate
         now = _until(self.end, self.now + step, step)
-        return replace(self, now=now, rate=rate, expected=expected)
+        return replace(
+            self, now=now, rate=rate, expected=expected, measured=measured, error=error
+        )
 
-    def following(
-        self, measured: Array, reference: Array, expected: Array, estimate: Estimate | None
-    ) -> Array:
-        """How well robots follow: 1 within the tolerance, 0 from twice of it on.
+    def _rate(self, following: Array) -> Array:
+        """Rate of robots that follow by a share: 1 within the tolerance, 0 from twice on."""
+        return following
 
-        Parameters
-        ----------
-        measured, reference, expected : array of shape (..., n_joints)
-        estimate : Estimate, optional
-
-        Returns
-        -------
-        array of shape (...)
-        """
-        usual = np.abs(reference - expected) + self.clock.floor
-        if estimate is not None:
-            variance = _array(estimate.covariance.diagonal(dim1=-2, dim2=-1))
-            usual += np.sqrt(variance)
-        # a coordinate that is not measured says nothing, and nor does a robot without any
-        ratio = np.fmax.reduce(np.abs(reference - measured) / usual, -1, initial=0.0)
-        excess = np.clip(ratio / self.clock.tolerance - 1, 0, 1)
-        return 1 - excess**2 * (3 - 2 * excess)
-
-    def _servo(self, reference: Array, passed: float | Array) -> Array:
-        """Where servos of first order are, a tick after they were told the reference."""
-        left = np.exp(-np.asarray(passed) / self.clock.lag)[..., None]
-        return reference + left * (self.expected - reference)
-
-    def _like_reference(self, joints: Tensor, reference: Array) -> Array:
-        """Measured joints, quaternions among them on the side of the reference's."""
+    def _measured(self, joints: Tensor, reference: Array) -> Array:
+        """Joints like the reference: where they are unknown, the same; quaternions' signs."""
         measured = _array(joints)
+        if (unknown := np.isnan(measured)).any():
+            measured = np.where(unknown, reference, measured)
         starts = self.regression.kinematics.quaternion_starts
         if starts:
             blocks = quaternions.quaternion_blocks(starts, measured.shape[-1]).numpy()
-            inner = np.nan_to_num(measured * reference) @ blocks.T
+            inner = (measured * reference) @ blocks.T
             measured = measured * (1 + (np.copysign(1.0, inner) - 1) @ blocks)
         return measured
 
 
+@dataclass(frozen=True)
+class LocalizingClock(WaitingClock):
+    """Time goes on from where the robot is.
+
+    Robots that follow, as :class:`WaitingClock` has it, run evenly. Of one that does not, a
+    belief over the instants of the skill says where it is: it begins at the present time less
+    the lag, moves on as time does, and is corrected by the likelihood of what is observed. As
+    long as a place nearby explains the observation, no other is believed, so that repeating
+    motions do not jump a period. A place explains it if the reference there, in the present
+    situation, is as near to the robot as :class:`WaitingClock` expects it to be.
+
+    Time waits for a robot that is behind, hurries after one that is ahead, and moves to where
+    a robot is that was brought to another place: :attr:`Progress.relocalized` says so. Where
+    no place explains what is observed, time waits.
+
+    Parameters
+    ----------
+    speed, tolerance, lag, floor : float
+        See :class:`WaitingClock`.
+    initial : {"beginning", "anywhere"}, default="beginning"
+        Where in the skill robots are believed to be at its start. With ``"anywhere"`` that is
+        the place which explains the start posture best; the beginning if none does.
+
+    Raises
+    ------
+    DataError
+        If a number is not positive, or the initial belief is none of these.
+
+    Examples
+    --------
+    >>> LocalizingClock(initial="anywhere").initial
+    'anywhere'
+    """
+
+    initial: str = "beginning"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.initial not in INITIAL:
+            raise DataError(
+                f"initial of LocalizingClock is one of {list(INITIAL)}, got {self.initial!r}"
+            )
+
+    def start(
+        self,
+        regression: Regression,
+        begin: float,
+        end: float,
+        joints: Tensor,
+        frames: Mapping[str, Frame],
+    ) -> LocalizingProgress:
+        """Start at the beginning, or where the robots are; see :meth:`Clock.start`."""
+        waiting = super().start(regression, begin, end, joints, frames)
+        likelihood, no = Likelihood(regression, begin, end), np.zeros(joints.shape[:-1], bool)
+        belief = np.zeros((*no.shape, len(likelihood.instants)))
+        progress = LocalizingProgress(
+            **{field.name: getattr(waiting, field.name) for field in fields(waiting)},
+            likelihood=likelihood,
+            frames=frames,
+            since=waiting.error,
+            before=waiting.now,
+            reached=waiting.now,
+            stood=waiting.expected,
+            strayed=waiting.error,
+            weights=belief,
+            localized=no,
+            lost=no,
+            place=waiting.now,
+            sure=waiting.error,
+            moved=no,
+        )
+        return progress.located(joints) if self.initial == "anywhere" else progress
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizingProgress(WaitingProgress):
+    """See :class:`LocalizingClock`.
+
+    Parameters
+    ----------
+    clock, regression, begin, end, now, rate, expected, measured, error
+        See :class:`WaitingProgress`.
+    likelihood : Likelihood
+    frames : mapping of str to Frame
+        Where objects were last seen.
+    since : array of shape (...)
+        Since when the belief has not been corrected [s].
+    before : array of shape (...)
+        The time at the last correction [s].
+    reached : array of shape (...)
+        The time when a robot last followed [s].
+    stood : array of shape (..., n_joints)
+        Where it stood then.
+    strayed : array of shape (...)
+        The error at the last correction.
+    weights : array of shape (..., G)
+        The belief of robots that do not follow.
+    localized : bool array of shape (...)
+        Those whose belief was corrected since.
+    lost : bool array of shape (...)
+        Robots among them whose place is not known.
+    place : array of shape (...)
+        The time that suits where a robot is, if it is known [s].
+    sure : array of shape (...)
+        For how long that has been another place than the present one [s].
+    moved : bool array of shape (...)
+        See :attr:`Progress.relocalized`.
+    """
+
+    likelihood: Likelihood
+    frames: Mapping[str, Frame]
+    since: Array
+    before: Array
+    reached: Array
+    stood: Array
+    strayed: Array
+    weights: Array
+    localized: Flags
+    lost: Flags
+    place: Array
+    sure: Array
+    moved: Flags
+
+    @property
+    def relocalized(self) -> Tensor:
+        """See :attr:`Progress.relocalized`."""
+        return torch.as_tensor(self.moved, device=self.regression.kinematics.lower.device)
+
+    @property
+    def belief(self) -> Tensor:
+        """Probability of each of the likelihood's instants (..., G): where the robots are."""
+        near = self._near(self.now)
+        belief = np.where(self.localized[..., None], self.weights, near)
+        return _tensor(belief, self.regression.kinematics.lower)
+
+    def advance(self, dt: float | Tensor, observation: Observation) -> Self:
+        """From where the robots are; see :meth:`Progress.advance`."""
+        went = super().advance(dt, observation)
+        since = self.since + (_array(dt) if isinstance(dt, Tensor) else dt)
+        due = since > (1 - 1e-6) * self.likelihood.step
+        went = replace(went, since=np.where(due, 0.0, since))
+        astray = went.error > self.clock.tolerance
+        if not (astray | self.localized).any():
+            return replace(
+                went,
+                frames={**self.frames, **observation.frames},
+                before=went.now,
+                reached=went.now,
+                stood=went.measured,
+            )
+        went = replace(
+            went,
+            frames={**self.frames, **observation.frames},
+            before=np.where(due | ~astray, went.now, self.before),
+            reached=np.where(astray, self.reached, went.now),
+            stood=np.where(astray[..., None], self.stood, went.measured),
+            strayed=np.where(due, went.error, self.strayed),
+            localized=self.localized & astray,
+            sure=np.where(astray, self.sure, 0.0),
+            moved=np.zeros_like(self.moved),
+        )
+        rows = due & astray
+        return self._corrected(went, rows, since, observation.frames) if rows.any() else went
+
+    def _rate(self, following: Array) -> Array:
+        """Behind the time, it waits for the robot; ahead of it, it hurries after the robot."""
+        ahead = self.place - self.now
+        behind = np.clip(2 + ahead / GRACE, 0, 1)
+        rate = np.maximum(np.minimum(following, behind), np.clip(2 * ahead / GRACE, 0, HURRY))
+        return np.where(self.localized & ~self.lost, rate, following)
+
+    def _near(self, now: Array) -> Array:
+        """The belief about robots that follow."""
+        lag = self.clock.lag * self.clock.speed
+        apart = (
+            self.likelihood.instants - np.maximum(now - lag, self.begin)[..., None]
+        ) / WIDTH
+        return _normalized(np.where(np.abs(apart) < 3, np.exp(-0.5 * apart**2), 0.0))
+
+    def _corrected(
+        self, went: Self, rows: Flags, since: Array, frames: Mapping[str, Frame]
+    ) -> Self:
+        """After a look at robots that do not follow; ``self`` is how it was before."""
+        clock, likelihood, measured = self.clock, self.likelihood, went.measured[rows]
+        now, before, passed = went.now[rows], self.before[rows], since[rows]
+        shift = np.maximum(now - before, 0.0) / likelihood.step
+        belief = move(self.weights[rows], shift, SPREAD * passed / likelihood.step**2)
+        localized, lost = self.localized[rows], (self.localized & self.lost)[rows]
+        belief = np.where(localized[:, None], belief, self._near(before))
+        # where no place nearby explains what is seen it is elsewhere, the nearer the sooner
+        apart = np.abs(likelihood.instants - now[:, None]) / ELSEWHERE
+        anywhere = _normalized(np.exp(-apart) + 0.01)
+        belief = np.where(lost[:, None], 0.9 * belief + 0.1 * anywhere, belief)
+        seen = {name: _rows(frame, rows) for name, frame in frames.items()}
+        evidence = EVIDENCE * passed[:, None] * likelihood(measured, seen)
+        belief = _posterior(belief, evidence)
+        place = local_mode(belief, likelihood.instants)
+        explained = self._explains(
+            place, measured, {n: _rows(f, rows) for n, f in went.frames.items()}
+        )
+        place = np.clip(place + clock.lag * clock.speed, self.begin, self.end)
+        # one that is held stands where it stood, and is nowhere that it has not been
+        distance = np.abs(measured - went.stood[rows]).max(-1)
+        moved = distance > 2 * clock.tolerance * clock.floor
+        place = np.where(moved, place, np.minimum(place, went.reached[rows]))
+        # a slow one is between where it was when it last followed and the present time
+        slow = (place > went.reached[rows] - JUMP) & (place < now + JUMP)
+        elsewhere = explained & moved & ~slow
+        error = went.error[rows]
+        elsewhere &= error > 2 * clock.tolerance
+        # one that was held, and is let go, returns to the reference: it goes nowhere else
+        known = localized & (self.sure[rows] == 0)
+        elsewhere &= ~(known & (error < RETURNING * self.strayed[rows]))
+        sure = np.where(elsewhere, self.sure[rows] + passed, 0.0)
+        moves = elsewhere & (self.sure[rows] > 0) & (sure > PATIENCE)
+        return replace(
+            went,
+            weights=_put(went.weights, rows, belief),
+            localized=went.localized | rows,
+            lost=_put(went.lost, rows, ~explained),
+            place=_put(went.place, rows, place),
+            sure=_put(went.sure, rows, np.where(moves, 0.0, sure)),
+            moved=_put(went.moved, rows, moves),
+            now=_put(went.now, rows, np.where(moves, place, now)),
+            before=_put(went.before, rows, np.where(moves, place, now)),
+            reached=_put(went.reached, rows, np.where(moves, place, went.reached[rows])),
+            stood=_put(went.stood, rows, np.where(moves[:, None], measured, went.stood[rows])),
+            expected=_put(
+                went.expected,
+                rows,
+                np.where(moves[:, None], measured, went.expected[rows]),
+            ),
+            rate=_put(went.rate, rows, np.where(moves, 0.0, went.rate[rows])),
+        )
+
+    def _explains(self, place: Array, measured: Array, frames: Mapping[str, Frame]) -> Flags:
+        """Whether the references at some times (B,) are where the robots are."""
+        time, joints = (_tensor(x, self.regression.kinematics.lower) for x in (place, measured))
+        if len(place) == 1:  # one robot is sooner computed without a batch
+            time, joints = time[0], joints[0]
+            frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
+        with torch.inference_mode():
+            estimate = self.regression.tick(time, joints, frames)
+        usual = self.clock.floor + _deviations(estimate)
+        ratio = np.abs(_array(estimate.joints) - _array(joints)) / usual
+        return np.atleast_1d(ratio.max(-1) <= self.clock.tolerance)
+
+    def located(self, joints: Tensor) -> Self:
+        """At the places that explain ``joints`` best."""
+        rows, instants = np.ones(self.now.shape, bool), self.likelihood.instants
+        measured = _array(joints)[rows]
+        frames = {name: _rows(frame, rows) for name, frame in self.frames.items()}
+        likelihood = self.likelihood(measured, frames)
+        now, known = self.now[rows], np.zeros(rows.sum(), bool)
+        for _ in range(CANDIDATES):
+            place = instants[likelihood.argmax(1)]
+            fits = ~known & self._explains(place, measured, frames)
+            now, known = np.where(fits, place, now), known | fits
+            if known.all():
+                break
+            near = np.abs(instants - place[:, None]) <= MODE
+            likelihood = np.where(near, -np.inf, likelihood)
+        now = now.reshape(self.now.shape)
+        return replace(self, now=now, before=now, reached=now, place=now)
+
+
 def _array(tensor: Tensor) -> Array:
     return tensor.numpy(force=True)
+
+
+def _deviations(estimate: Estimate) -> Array:
+    """Standard deviations (..., n_joints) of the references."""
+    return np.sqrt(_array(estimate.covariance.diagonal(dim1=-2, dim2=-1)))
+
+
+def _normalized(belief: Array) -> Array:
+    return belief / belief.sum(-1, keepdims=True)
+
+
+def _posterior(belief: Array, evidence: Array) -> Array:
+    """The belief times the exponential of the evidence, where that is too small for numbers."""
+    with np.errstate(divide="ignore"):
+        log_belief = np.log(belief) + evidence
+    return _normalized(np.exp(log_belief - log_belief.max(-1, keepdims=True)))
+
+
+def _put(array: NDArray[Any], rows: Flags, values: NDArray[Any]) -> NDArray[Any]:
+    array = np.array(array)
+    array[rows] = values
+    return array
+
+
+def _rows(frame: Frame, rows: Flags) -> Frame:
+    """Of some robots, as (B,); an object that all of them share stays as it is."""
+    if not frame.batch_shape:
+        return frame
+    return frame.expand(rows.shape)[torch.from_numpy(rows).to(frame.position.device)]
 
 
 def _tensor(array: Array, like: Tensor) -> Tensor:
@@ -371,6 +686,7 @@ def _check_span(begin: float, end: float) -> None:
 CLOCKS: Mapping[str, type[EvenClock] | type[WaitingClock]] = {
     "even": EvenClock,
     "waiting": WaitingClock,
+    "localizing": LocalizingClock,
 }
 
 
@@ -380,7 +696,8 @@ def parse_clock(text: str) -> Clock:
     Parameters
     ----------
     text : str
-        A kind, ``even`` or ``waiting``; with options behind a colon, separated by commas.
+        A kind, ``even``, ``waiting`` or ``localizing``; with options
+        behind a colon, separated by commas.
 
     Raises
     ------
@@ -413,7 +730,7 @@ def parse_clock(text: str) -> Clock:
                 "written as NAME=VALUE"
             )
         try:
-            settings[name] = float(value)
+            settings[name] = value if isinstance(known[name].default, str) else float(value)
         except ValueError:
             raise DataError(f"clock {text!r}: {name} is a number, got {value!r}") from None
     return clock(**settings)

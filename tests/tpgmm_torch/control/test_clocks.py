@@ -1,16 +1,20 @@
-"""Clocks: even, waiting; robots that lag, are held, are lost; their text forms."""
+"""Clocks: even, waiting, localising; robots that lag, are held, are lost; their text forms."""
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from tests.support.servos import Run, held
+from tests.support.motions import ease
+from tests.support.servos import Run, between, held
 from tests.support.skills import LAST, canonical, hands, new_handling, wave, waves
+from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.control.clocks import (
     Clock,
     EvenClock,
+    LocalizingClock,
     Observation,
     WaitingClock,
     format_clock,
@@ -20,7 +24,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Regression
 
 START = wave(torch.zeros(1, dtype=torch.float64))[0]
-WAITING = WaitingClock()
+WAITING, LOCALIZING = WaitingClock(), LocalizingClock()
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +65,7 @@ def test_a_robot_on_hold_has_a_time_of_its_own(regression):
     assert progress.finished.tolist() == [True, False]
 
 
-@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING, LOCALIZING], ids=format_clock)
 def test_the_end_is_reached_and_held(regression, clock):
     progress = clock.start(regression, 0.0, 0.3, START, {})
     steps = 0
@@ -72,14 +76,14 @@ def test_the_end_is_reached_and_held(regression, clock):
     assert float(progress.advance(0.1, seen(START)).time) == 0.3
 
 
-@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING, LOCALIZING], ids=format_clock)
 @pytest.mark.parametrize(("begin", "end"), [(1.0, 1.0), (0.0, math.nan), (0.0, math.inf)])
 def test_a_skill_without_a_span_is_refused(regression, clock, begin, end):
     with pytest.raises(DataError, match=r"ends after its beginning, got .* s to"):
         clock.start(regression, begin, end, START, {})
 
 
-@pytest.mark.parametrize("clock", [EvenClock(), WAITING], ids=format_clock)
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING, LOCALIZING], ids=format_clock)
 def test_looking_ahead_changes_nothing(regression, clock):
     run = begun(regression, clock)
     run.run(0.4)
@@ -92,7 +96,7 @@ def test_looking_ahead_changes_nothing(regression, clock):
 # Waiting
 
 
-@pytest.mark.parametrize("dt", [0.04, 0.01, 0.001])
+@pytest.mark.parametrize("dt", [0.04, 0.01, 0.002])
 @pytest.mark.parametrize("lag", [0.03, 0.1, 0.15])
 def test_an_ordinary_lag_does_not_slow_it(regression, dt, lag):
     run = begun(regression, WAITING, dt=dt, lag=lag)
@@ -104,7 +108,7 @@ def test_noise_does_not_slow_it(regression):
     assert run.finish() == pytest.approx(LAST, rel=0.02)
 
 
-@pytest.mark.parametrize("dt", [0.04, 0.01, 0.001])
+@pytest.mark.parametrize("dt", [0.04, 0.01, 0.002])
 def test_it_stands_still_while_the_robot_is_held_and_then_goes_on(regression, dt):
     run = begun(regression, WAITING, dt=dt)
     run.run(0.8)
@@ -134,23 +138,12 @@ def test_every_robot_has_its_own_time_whatever_its_batch(regression):
     """Robot b of 64 is held from 0.02 b s on for a second; each alone does the same."""
     since = 0.02 * torch.arange(64, dtype=torch.float64)
 
-    def disturbed(since: Tensor):
-        at = torch.full((*since.shape, 3), torch.nan, dtype=torch.float64)
-
-        def disturbance(passed: float, joints: Tensor) -> Tensor:
-            inside = ((passed > since) & (passed < since + 1.0))[..., None]
-            new = inside & at.isnan()
-            at[new] = joints[new]
-            return torch.where(inside, at, joints)
-
-        return disturbance
-
     together = begun(regression, WAITING, 64)
-    together.run(1.9, disturbed(since))
+    together.run(1.9, between(since, since + 1))
     assert together.progress.time.std() > 0.1
     for robot in (0, 17, 63):
         alone = begun(regression, WAITING)
-        alone.run(1.9, disturbed(since[robot]))
+        alone.run(1.9, between(since[robot], since[robot] + 1))
         assert alone.progress.time.shape == ()
         times = torch.stack(together.times)[:, robot]
         torch.testing.assert_close(torch.stack(alone.times), times, rtol=0, atol=1e-9)
@@ -193,6 +186,202 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
     assert float(progress.time) == pytest.approx(0.1)
 
 
+# Localising: a skill that reaches (to 5 s), holds (to 6), brings (to 10), shakes (to 16), rests
+
+
+END = 17.0
+
+
+@pytest.fixture(scope="module")
+def shaking() -> Regression:
+    """Five joints; no posture comes twice, but for the shaking and the pauses."""
+    time = np.arange(0, END + 1e-9, 0.1)
+    reach, bring = np.array([0.8, -0.5, 0, 0, 0.6]), np.array([0, 0.6, 0.7, -0.8, 0])
+    path = np.outer(ease(time, 0, 5), reach) + np.outer(ease(time, 6, 10), bring)
+    envelope = ease(time, 10, 10.6) * (1 - ease(time, 15.4, 16))
+    path[:, 2:4] += (0.4 * envelope * np.sin(np.pi * (time - 10)))[:, None]
+    shifts = np.random.default_rng(0).uniform(-0.03, 0.03, (5, 5))
+    demonstrations = [Demonstration(time, path + shift) for shift in shifts]
+    return TaskParameterizedGMM(34).fit(demonstrations).regression()
+
+
+def localizing(regression: Regression, *batch: int, **options) -> Run:
+    clock = options.pop("clock", LOCALIZING)
+    start = regression.tick(torch.zeros((), dtype=torch.float64), torch.zeros(5), {}).joints
+    options = {"joints": start.expand(*batch, 5), **options}
+    return Run(regression, clock, 0.0, END, **options)
+
+
+def posture(regression: Regression, time: float | Tensor) -> Tensor:
+    """Where a robot is that follows."""
+    time = torch.as_tensor(time, dtype=torch.float64)
+    return regression.tick(time, torch.zeros(*time.shape, 5, dtype=torch.float64), {}).joints
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005])
+@pytest.mark.parametrize("lag", [0.05, 0.1])
+def test_a_robot_that_follows_is_neither_slowed_nor_moved(shaking, lag, noise):
+    run = localizing(shaking, 8, lag=lag, noise=noise)
+    assert run.finish() == pytest.approx(END, rel=0.02)
+    assert torch.stack(run.times).diff(dim=0).min() >= 0
+    assert not torch.stack(run.relocalized).any()
+
+
+def test_robots_are_held_for_ten_seconds(shaking):
+    """At 24 instants, from the first second to the end of the shaking."""
+    since = torch.linspace(1.0, 15.5, 24, dtype=torch.float64)
+    run = localizing(shaking, 24, dt=0.05)
+    run.run(END + 15, between(since, since + 10))
+    times = torch.stack(run.times)
+    assert not torch.stack(run.relocalized).any()
+    assert times.diff(dim=0).min() >= 0
+    tick = torch.stack((since + 5, since + 9.9)) / run.dt
+    later, last = times.gather(0, tick.long())
+    assert torch.equal(later, last)
+    assert bool(run.progress.finished.all())
+    # time stops where the reference is further away than servos that lag let one expect: the
+    # slower the skill is, the later
+    away = (posture(shaking, last) - posture(shaking, since)).abs().amax(-1)
+    assert away.max() < 0.6  # the shaking has 1.3 rad/s
+
+
+@pytest.mark.parametrize("dt", [0.04, 0.01, 0.002])
+@pytest.mark.parametrize("shift", [-2.0, 2.0])
+def test_a_robot_that_is_pushed_goes_on_from_where_it_is(shaking, shift, dt):
+    run = localizing(shaking, dt=dt)
+    start = 3.8 if shift < 0 else 1.8
+    target = posture(shaking, start + shift)
+    run.run(start)
+    run.run(0.3, held(target))
+    assert sum(map(int, run.relocalized)) == 1
+    moved = run.relocalized.index(torch.tensor(True)) * dt
+    assert moved < start + 0.25
+    run.run(1.0)
+    # it set out when it was let go, or as soon as its place was known
+    assert start + shift + 0.9 < float(run.progress.time) < start + shift + 1.4
+    assert run.finish() == pytest.approx(END - shift, abs=0.4)
+    assert sum(map(int, run.relocalized)) == 1
+
+
+def test_robots_are_carried_to_any_other_place(shaking):
+    """While reaching, to where they will bring; and back."""
+    start = torch.tensor([1.5, 8.5, 2.0, 8.0], dtype=torch.float64)
+    place = torch.tensor([8.5, 1.5, 8.0, 2.0], dtype=torch.float64)
+    run = localizing(shaking, 4)
+    target = posture(shaking, place)
+    run.run(10.0, between(start, start + 0.5, target))
+    expected = place + 10.0 - start - 0.5
+    assert (run.progress.time - expected).abs().max() < 0.5
+    assert torch.stack(run.relocalized).sum(0).tolist() == [1, 1, 1, 1]
+
+
+def test_to_a_pause_they_may_come_anywhere_in_it(shaking):
+    run = localizing(shaking)
+    run.run(8.0)
+    run.run(0.5, held(posture(shaking, 5.5)))
+    assert 4.3 < float(run.progress.time) < 7.0
+    assert sum(map(int, run.relocalized)) == 1
+
+
+def test_shaking_does_not_jump_a_period(shaking):
+    """Neither robots that are noisy nor such as are held, late, or stopped again and again."""
+    since = torch.linspace(10.6, 13.4, 12, dtype=torch.float64)
+    run = localizing(shaking, 12, noise=0.005)
+    run.run(16.0, between(since, since + 1.5))
+    assert not torch.stack(run.relocalized).any()
+    # what the time gained while robots were held is less than half a period of 2 s
+    gained = run.progress.time - (16.0 - 1.5)
+    assert gained.max() < 0.8
+    assert gained.min() > -0.5
+
+
+def test_where_no_place_explains_it_time_waits(shaking):
+    run = localizing(shaking)
+    run.run(8.0)
+    aside = posture(shaking, 8.0) + torch.tensor([0, 0.8, 0, 0, -0.8], dtype=torch.float64)
+    run.run(5.0, held(aside))
+    assert float(run.progress.time) < 8.3
+    assert not torch.stack(run.relocalized).any()
+    assert run.finish() == pytest.approx(END + 5.0, abs=0.5)
+
+
+def test_one_reading_from_elsewhere_is_not_believed(shaking):
+    run = localizing(shaking)
+    run.run(8.0)
+    reading = seen(posture(shaking, 3.0), run.reference)
+    progress = run.progress.advance(0.04, reading)
+    assert not progress.relocalized
+    assert float(progress.time - run.progress.time) == pytest.approx(0.0, abs=0.04)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.5])
+def test_time_goes_with_a_robot_that_is_led(shaking, speed):
+    """Somebody leads the robot through the skill, slower or faster than it was shown."""
+    run = localizing(shaking, lag=1e-3)
+    start = 6.5
+    run.run(start)
+    seconds = 2.5 / speed
+    run.run(seconds, lambda passed, joints: posture(shaking, start + speed * (passed - start)))
+    assert float(run.progress.time) == pytest.approx(start + 2.5, abs=0.6)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_the_start_may_be_anywhere(shaking, batch):
+    clock = LocalizingClock(initial="anywhere")
+    for time in (1.0, 2.0, 3.5, 7.5, 8.5):
+        joints = posture(shaking, time).expand(*batch, 5)
+        run = localizing(shaking, clock=clock, joints=joints)
+        assert run.progress.time.shape == batch
+        assert (run.progress.time - time).abs().max() < 0.3
+        run.run(1.0)
+        assert (run.progress.time - time - 1.0).abs().max() < 0.3
+
+
+def test_a_start_that_no_place_explains_is_the_beginning(shaking):
+    clock = LocalizingClock(initial="anywhere")
+    joints = posture(shaking, 8.0) + torch.tensor([0, 0.8, 0, 0, -0.8], dtype=torch.float64)
+    assert float(localizing(shaking, clock=clock, joints=joints).progress.time) == 0.0
+
+
+def test_the_belief_is_where_the_robot_is(shaking):
+    run = localizing(shaking, 2)
+    run.run(8.0)
+    target = posture(shaking, torch.tensor([2.0, 8.0], dtype=torch.float64))
+    never = torch.tensor(99.0)
+    run.run(0.2, between(torch.stack((torch.tensor(8.0), never)), never, target))
+    belief, instants = run.progress.belief, torch.from_numpy(run.progress.likelihood.instants)
+    assert torch.allclose(belief.sum(-1), torch.ones(2, dtype=torch.float64))
+    assert (belief @ instants).tolist() == pytest.approx([2.0, 8.1], abs=0.2)
+
+
+def test_localised_robots_do_not_depend_on_their_batch(shaking):
+    """64 robots, half of them held, half pushed back, from different moments on."""
+    since = torch.linspace(2.5, 4.2, 64, dtype=torch.float64)
+    targets = posture(shaking, since - torch.where(torch.arange(64) % 2 == 0, 0.0, 2.0))
+    together = localizing(shaking, 64)
+    together.run(5.5, between(since, since + 0.4, targets))
+    assert torch.stack(together.relocalized).sum() > 25
+    times = torch.stack(together.times)
+    for robot in (0, 1, 31, 32, 63):
+        alone = localizing(shaking)
+        alone.run(5.5, between(since[robot], since[robot] + 0.4, targets[robot]))
+        torch.testing.assert_close(torch.stack(alone.times), times[:, robot], rtol=0, atol=1e-9)
+
+
+def test_robots_in_more_dimensions_and_on_hold(shaking):
+    run = localizing(shaking, 2, 3)
+    run.run(4.0)
+    step = torch.full((2, 3), 0.04, dtype=torch.float64)
+    step[1] = 0.0
+    before, progress = run.progress.time, run.progress
+    away = posture(shaking, torch.full((2, 3), 2.0))
+    for _ in range(4):
+        progress = progress.advance(step, seen(away, run.reference))
+    assert progress.relocalized.shape == (2, 3)
+    assert (progress.time[0] - before[0]).max() < -1.5
+    assert torch.equal(progress.time[1], before[1])
+
+
 # Texts
 
 
@@ -203,6 +392,11 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
         ("even:speed=0.5", EvenClock(0.5)),
         ("waiting", WaitingClock()),
         ("waiting:tolerance=3,lag=0.05", WaitingClock(tolerance=3, lag=0.05)),
+        ("localizing", LocalizingClock()),
+        (
+            "localizing:floor=0.01,initial=anywhere",
+            LocalizingClock(floor=0.01, initial="anywhere"),
+        ),
     ],
 )
 def test_texts_and_clocks_are_each_others_inverse(text, clock):
@@ -220,6 +414,7 @@ def test_texts_and_clocks_are_each_others_inverse(text, clock):
         ("waiting:lag=1,lag=2", r"'lag' is given twice"),
         ("waiting:lag=soon", r"lag is a number, got 'soon'"),
         ("waiting:lag=-1", r"lag of WaitingClock must be positive, got -1.0"),
+        ("localizing:initial=here", r"one of \['beginning', 'anywhere'\], got 'here'"),
         ("even:speed=nan", r"speed of EvenClock must be positive, got nan"),
     ],
 )

@@ -1,0 +1,184 @@
+"""The likelihood of a skill's instants, and beliefs over them, against plain formulas."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.mixtures import CASES, Case, Problem
+from tests.support.skills import few_bottles, handlings, hands, new_handling, small_bottle
+from tests.support.worlds import OBJECT
+from tpgmm_torch import Frame
+from tpgmm_torch.control import localization
+from tpgmm_torch.control.localization import Likelihood, local_mode, move
+from tpgmm_torch.regression.regression import Regression
+
+NAMES = ["the paper's", "poses in two frames", "canonical"]
+EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
+
+
+def dense(regression: Regression, joints, frames, instants) -> np.ndarray:
+    """Log-likelihood of each instant for one robot, straight from the formula."""
+    state = regression.kinematics.state(joints)
+    first = regression.conditionals[0]
+    result = []
+    for now in torch.from_numpy(instants):
+        times = torch.distributions.Normal(first.time_mean, first.time_variance.sqrt())
+        total = torch.log_softmax(regression.log_weights + times.log_prob(now), -1)
+        for operator, one in zip(regression.operators, regression.conditionals, strict=True):
+            local = operator.coordinates(state, frames)
+            mean, signs = one.at(now), torch.ones_like(one.mean)
+            for start in operator.quaternion_starts(regression.kinematics):
+                block = slice(start, start + 4)  # flipped to the side of the present one
+                centre = one.recentred(first.time_mean)[:, block]
+                signs[:, block] = torch.sign((centre * local[block]).sum(-1, keepdim=True))
+            covariance = signs[:, :, None] * one.covariance * signs[:, None, :]
+            given = torch.distributions.MultivariateNormal(signs * mean, covariance)
+            total = total + given.log_prob(local)
+        result.append(torch.logsumexp(total, -1))
+    values = torch.stack(result).numpy()
+    return values - values.max()
+
+
+@EVERY_WORLD
+def test_the_likelihood_is_the_mixtures_given_time(case: Case, monkeypatch):
+    monkeypatch.setattr(localization, "SLACK", 0.0)
+    monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
+    problem = Problem.of(case, 4, 3)
+    regression = problem.regression()
+    likelihood = Likelihood(regression, 0.0, 2.0)
+    joints = problem.state.joints
+    got = likelihood(joints.numpy(), problem.frames)
+    assert got.shape == (3, 51)
+    for robot in range(3):
+        frames = {name: frame[robot] for name, frame in problem.frames.items()}
+        expected = dense(regression, joints[robot], frames, likelihood.instants)
+        relative = got[robot] - got[robot].max()
+        np.testing.assert_allclose(relative, expected, rtol=1e-9, atol=1e-7)
+
+
+def test_instants_cover_the_skill_evenly():
+    regression = hands().regression()
+    likelihood = Likelihood(regression, 0.3, 1.7)
+    assert likelihood.instants[0] == 0.3
+    assert likelihood.instants[-1] == 1.7
+    np.testing.assert_allclose(np.diff(likelihood.instants), likelihood.step)
+    assert likelihood.step == pytest.approx(0.04)
+    assert len(Likelihood(regression, 0.0, 1e4).instants) == 4096
+
+
+def test_components_that_weigh_nothing_are_left_out(monkeypatch):
+    """At each instant few of 8 components count; the others change nothing that is likely."""
+    regression, demonstration = small_bottle().regression(), few_bottles()[0]
+    begin, end = demonstration.time[[0, -1]].tolist()
+    joints, frames = demonstration.joints.numpy(), dict(demonstration.frames)
+    fast = Likelihood(regression, begin, end)(joints, frames)
+    monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
+    every = Likelihood(regression, begin, end)(joints, frames)
+    likely = every > every.max(1, keepdims=True) - 10
+    np.testing.assert_allclose(fast[likely], every[likely], atol=0.01)
+
+
+def test_the_instant_of_a_demonstration_is_found():
+    """Of two tracked hands and a cup, any step of a motion never shown."""
+    situation, wanted = new_handling()
+    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    frames = {"cup": situation.frames["cup"]}
+    found = likelihood.instants[likelihood(wanted.numpy(), frames).argmax(1)]
+    assert np.abs(found - situation.time.numpy()).max() < 0.1
+
+
+def test_quaternions_of_the_other_sign_are_the_same_rotation():
+    situation, wanted = new_handling()
+    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    flipped = wanted.clone()
+    flipped[:, 3:7] *= -1
+    cup = situation.frames["cup"]
+    one = likelihood(wanted.numpy(), {"cup": cup})
+    other = likelihood(flipped.numpy(), {"cup": Frame(cup.position, -cup.orientation)})
+    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7)
+
+
+def test_a_frame_that_is_not_there_says_nothing_others_do():
+    """The right hand seen from the left one needs no cup."""
+    _, wanted = new_handling()
+    regression = hands().regression()
+    likelihood = Likelihood(regression, 0.0, 2.0)
+    without = likelihood(wanted.numpy(), {})
+    alone = Regression(
+        regression.kinematics,
+        regression.operators[1:],
+        regression.conditionals[1:],
+        regression.log_weights,
+    )
+    # each operator has learned the components' times a little differently, by rounding
+    expected = Likelihood(alone, 0.0, 2.0)(wanted.numpy(), {})
+    np.testing.assert_allclose(without, expected, rtol=1e-4, atol=0.02)
+    assert np.ptp(without, 1).min() > 1  # it does say something
+
+
+def test_where_nothing_is_known_every_instant_is_alike():
+    regression = small_bottle().regression()
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    likelihood = Likelihood(regression, 0.0, 5.0)
+    joints = problem.state.joints.numpy().copy()
+    joints[1, 3] = np.nan
+    got = likelihood(joints, {"bottle": Frame([0.45, 0.0, 0.15])})
+    assert np.isfinite(got).all()
+    assert np.ptp(got[1]) == 0
+    assert np.ptp(got[0]) > 1
+
+
+@EVERY_WORLD
+def test_robots_of_a_batch_are_what_they_are_alone(case: Case):
+    problem = Problem.of(case, 4, 5)
+    likelihood = Likelihood(problem.regression(), 0.0, 2.0)
+    together = likelihood(problem.state.joints.numpy(), problem.frames)
+    for robot in range(5):
+        frames = {OBJECT: problem.frames[OBJECT][robot]}
+        alone = likelihood(problem.state.joints[robot : robot + 1].numpy(), frames)
+        np.testing.assert_allclose(together[robot], alone[0], rtol=1e-10, atol=1e-8)
+
+
+# Beliefs
+
+
+def test_a_belief_moves_and_widens_as_it_is_told():
+    instants = np.arange(41.0)
+    belief = np.zeros((3, 41))
+    belief[:, 10] = 1.0
+    shift, spread = np.array([0.0, 1.3, 2.0]), np.array([0.4, 0.2, 0.0])
+    moved = move(belief, shift, spread)
+    mean = moved @ instants
+    variance = moved @ instants**2 - mean**2
+    np.testing.assert_allclose(moved.sum(1), 1.0)
+    np.testing.assert_allclose(mean, 10 + shift)
+    # between two instants, both are believed
+    np.testing.assert_allclose(variance, spread + np.array([0.0, 0.3 * 0.7, 0.0]), atol=1e-12)
+    assert (belief[:, 10] == 1).all()
+
+
+def test_what_leaves_at_the_ends_stays_there():
+    belief = np.zeros((2, 9))
+    belief[0, 0] = belief[1, 7] = 1.0
+    for _ in range(20):
+        belief = move(belief, np.array([0.0, 3.0]), np.array([0.0, 0.4]))
+    np.testing.assert_allclose(belief.sum(1), 1.0)
+    assert belief[0, 0] == 1
+    assert belief[1, -1] > 0.7
+
+
+def test_the_mode_is_the_highest_place_not_the_mean_of_two():
+    instants = np.linspace(0, 10, 251)
+    belief = np.exp(-0.5 * ((instants - 2.01) / 0.1) ** 2)
+    belief += 0.5 * np.exp(-0.5 * ((instants - 8) / 0.1) ** 2)
+    assert local_mode(belief[None], instants) == pytest.approx(2.01, abs=0.01)
+
+
+def test_demonstrations_are_what_the_likelihood_was_learned_from():
+    """Median error of the time of single postures, of all steps of four demonstrations."""
+    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    errors = []
+    for demonstration in handlings():
+        got = likelihood(demonstration.joints.numpy(), dict(demonstration.frames))
+        errors.append(likelihood.instants[got.argmax(1)] - demonstration.time.numpy())
+    assert np.median(np.abs(errors)) < 0.03
