@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.control.localization import MODE, SPREAD, Likelihood, local_mode, move
+from tpgmm_torch.control.localization import MODE, SPREAD, Localizer, Look, local_mode, move
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Estimate, Regression
@@ -47,6 +47,8 @@ CANDIDATES = 5
 WIDTH = 0.1
 #: Observations per second that are worth one by themselves: those between see the same.
 EVIDENCE = 1.25
+#: Logarithm of a probability that is none, beside the most likely one's.
+NOTHING = -30.0
 #: Robots that are brought elsewhere: mean distance on the skill [s].
 ELSEWHERE = 2.0
 #: Places that are less apart are no others [s].
@@ -319,6 +321,10 @@ class WaitingProgress(Progress):
 
     def advance(self, dt: float | Tensor, observation: Observation) -> Self:
         """Less than ``dt`` where a robot does not follow; see :meth:`Progress.advance`."""
+        return replace(self, **self._went(dt, observation))
+
+    def _went(self, dt: float | Tensor, observation: Observation) -> dict[str, Any]:
+        """What is new after some time."""
         clock, passed = self.clock, _array(dt) if isinstance(dt, Tensor) else dt
         reference = _array(observation.reference)
         # servos of first order, a tick after they were told the reference
@@ -339,9 +345,13 @@ class WaitingProgress(Progress):
             rate = np.minimum(rate, self.rate + passed / RESTART)
         step = clock.speed * passed * rate
         now = _until(self.end, self.now + step, step)
-        return replace(
-            self, now=now, rate=rate, expected=expected, measured=measured, error=error
-        )
+        return {
+            "now": now,
+            "rate": rate,
+            "expected": expected,
+            "measured": measured,
+            "error": error,
+        }
 
     def _rate(self, following: Array) -> Array:
         """Rate of robots that follow by a share: 1 within the tolerance, 0 from twice on."""
@@ -413,25 +423,23 @@ class LocalizingClock(WaitingClock):
     ) -> LocalizingProgress:
         """Start at the beginning, or where the robots are; see :meth:`Clock.start`."""
         waiting = super().start(regression, begin, end, joints, frames)
-        likelihood, no = Likelihood(regression, begin, end), np.zeros(joints.shape[:-1], bool)
-        belief = np.zeros((*no.shape, len(likelihood.instants)))
+        localizer, no = Localizer(regression, begin, end), np.zeros(joints.shape[:-1], bool)
         progress = LocalizingProgress(
             **{field.name: getattr(waiting, field.name) for field in fields(waiting)},
-            likelihood=likelihood,
-            frames=frames,
+            localizer=localizer,
             since=waiting.error,
             before=waiting.now,
             reached=waiting.now,
             stood=waiting.expected,
             strayed=waiting.error,
-            weights=belief,
+            weights=np.zeros((*no.shape, len(localizer.instants))),
             localized=no,
             lost=no,
             place=waiting.now,
             sure=waiting.error,
             moved=no,
         )
-        return progress.located(joints) if self.initial == "anywhere" else progress
+        return progress.located(frames) if self.initial == "anywhere" else progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,9 +450,7 @@ class LocalizingProgress(WaitingProgress):
     ----------
     clock, regression, begin, end, now, rate, expected, measured, error
         See :class:`WaitingProgress`.
-    likelihood : Likelihood
-    frames : mapping of str to Frame
-        Where objects were last seen.
+    localizer : Localizer
     since : array of shape (...)
         Since when the belief has not been corrected [s].
     before : array of shape (...)
@@ -469,8 +475,7 @@ class LocalizingProgress(WaitingProgress):
         See :attr:`Progress.relocalized`.
     """
 
-    likelihood: Likelihood
-    frames: Mapping[str, Frame]
+    localizer: Localizer
     since: Array
     before: Array
     reached: Array
@@ -490,33 +495,27 @@ class LocalizingProgress(WaitingProgress):
 
     @property
     def belief(self) -> Tensor:
-        """Probability of each of the likelihood's instants (..., G): where the robots are."""
+        """Probability of each of the localizer's instants (..., G): where the robots are."""
         near = self._near(self.now)
         belief = np.where(self.localized[..., None], self.weights, near)
         return _tensor(belief, self.regression.kinematics.lower)
 
     def advance(self, dt: float | Tensor, observation: Observation) -> Self:
         """From where the robots are; see :meth:`Progress.advance`."""
-        went = super().advance(dt, observation)
+        new = self._went(dt, observation)
+        now, measured, astray = new["now"], new["measured"], new["error"] > self.clock.tolerance
         since = self.since + (_array(dt) if isinstance(dt, Tensor) else dt)
-        due = since > (1 - 1e-6) * self.likelihood.step
-        went = replace(went, since=np.where(due, 0.0, since))
-        astray = went.error > self.clock.tolerance
+        due = since > (1 - 1e-6) * self.localizer.step
+        new["since"] = np.where(due, 0.0, since)
         if not (astray | self.localized).any():
-            return replace(
-                went,
-                frames={**self.frames, **observation.frames},
-                before=went.now,
-                reached=went.now,
-                stood=went.measured,
-            )
+            return replace(self, **new, before=now, reached=now, stood=measured)
         went = replace(
-            went,
-            frames={**self.frames, **observation.frames},
-            before=np.where(due | ~astray, went.now, self.before),
-            reached=np.where(astray, self.reached, went.now),
-            stood=np.where(astray[..., None], self.stood, went.measured),
-            strayed=np.where(due, went.error, self.strayed),
+            self,
+            **new,
+            before=np.where(due | ~astray, now, self.before),
+            reached=np.where(astray, self.reached, now),
+            stood=np.where(astray[..., None], self.stood, measured),
+            strayed=np.where(due, new["error"], self.strayed),
             localized=self.localized & astray,
             sure=np.where(astray, self.sure, 0.0),
             moved=np.zeros_like(self.moved),
@@ -534,32 +533,30 @@ class LocalizingProgress(WaitingProgress):
     def _near(self, now: Array) -> Array:
         """The belief about robots that follow."""
         lag = self.clock.lag * self.clock.speed
-        apart = (
-            self.likelihood.instants - np.maximum(now - lag, self.begin)[..., None]
-        ) / WIDTH
+        apart = (self.localizer.instants - np.maximum(now - lag, self.begin)[..., None]) / WIDTH
         return _normalized(np.where(np.abs(apart) < 3, np.exp(-0.5 * apart**2), 0.0))
 
     def _corrected(
         self, went: Self, rows: Flags, since: Array, frames: Mapping[str, Frame]
     ) -> Self:
         """After a look at robots that do not follow; ``self`` is how it was before."""
-        clock, likelihood, measured = self.clock, self.likelihood, went.measured[rows]
+        clock, localizer, measured = self.clock, self.localizer, went.measured[rows]
         now, before, passed = went.now[rows], self.before[rows], since[rows]
-        shift = np.maximum(now - before, 0.0) / likelihood.step
-        belief = move(self.weights[rows], shift, SPREAD * passed / likelihood.step**2)
+        shift = np.maximum(now - before, 0.0) / localizer.step
+        belief = move(self.weights[rows], shift, SPREAD * passed / localizer.step**2)
         localized, lost = self.localized[rows], (self.localized & self.lost)[rows]
         belief = np.where(localized[:, None], belief, self._near(before))
         # where no place nearby explains what is seen it is elsewhere, the nearer the sooner
-        apart = np.abs(likelihood.instants - now[:, None]) / ELSEWHERE
+        apart = np.abs(localizer.instants - now[:, None]) / ELSEWHERE
         anywhere = _normalized(np.exp(-apart) + 0.01)
         belief = np.where(lost[:, None], 0.9 * belief + 0.1 * anywhere, belief)
-        seen = {name: _rows(frame, rows) for name, frame in frames.items()}
-        evidence = EVIDENCE * passed[:, None] * likelihood(measured, seen)
-        belief = _posterior(belief, evidence)
-        place = local_mode(belief, likelihood.instants)
-        explained = self._explains(
-            place, measured, {n: _rows(f, rows) for n, f in went.frames.items()}
-        )
+        look = localizer.look(measured, {name: _rows(f, rows) for name, f in frames.items()})
+        [inside] = np.nonzero(belief.any(0))
+        window = slice(inside[0], inside[-1] + 1)
+        evidence = EVIDENCE * passed[:, None] * look.log_likelihood(window)
+        belief[:, window] = _posterior(belief[:, window], evidence)
+        place = local_mode(belief, localizer.instants)
+        explained = self._explains(place, measured, look)
         place = np.clip(place + clock.lag * clock.speed, self.begin, self.end)
         # one that is held stands where it stood, and is nowhere that it has not been
         distance = np.abs(measured - went.stood[rows]).max(-1)
@@ -595,28 +592,25 @@ class LocalizingProgress(WaitingProgress):
             rate=_put(went.rate, rows, np.where(moves, 0.0, went.rate[rows])),
         )
 
-    def _explains(self, place: Array, measured: Array, frames: Mapping[str, Frame]) -> Flags:
+    def _explains(self, place: Array, measured: Array, look: Look) -> Flags:
         """Whether the references at some times (B,) are where the robots are."""
-        time, joints = (_tensor(x, self.regression.kinematics.lower) for x in (place, measured))
-        if len(place) == 1:  # one robot is sooner computed without a batch
-            time, joints = time[0], joints[0]
-            frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
-        with torch.inference_mode():
-            estimate = self.regression.tick(time, joints, frames)
+        estimate = look.reference(place)
+        if estimate is None:
+            return np.zeros(len(place), bool)
         usual = self.clock.floor + _deviations(estimate)
-        ratio = np.abs(_array(estimate.joints) - _array(joints)) / usual
-        return np.atleast_1d(ratio.max(-1) <= self.clock.tolerance)
+        ratio = np.abs(_array(estimate.joints) - measured) / usual
+        return np.asarray(np.atleast_2d(ratio).max(-1) <= self.clock.tolerance)
 
-    def located(self, joints: Tensor) -> Self:
-        """At the places that explain ``joints`` best."""
-        rows, instants = np.ones(self.now.shape, bool), self.likelihood.instants
-        measured = _array(joints)[rows]
-        frames = {name: _rows(frame, rows) for name, frame in self.frames.items()}
-        likelihood = self.likelihood(measured, frames)
+    def located(self, frames: Mapping[str, Frame]) -> Self:
+        """At the places that explain best where the robots are."""
+        rows, instants = np.ones(self.now.shape, bool), self.localizer.instants
+        measured = self.measured[rows]
+        look = self.localizer.look(measured, {n: _rows(f, rows) for n, f in frames.items()})
+        likelihood = look.log_likelihood()
         now, known = self.now[rows], np.zeros(rows.sum(), bool)
         for _ in range(CANDIDATES):
             place = instants[likelihood.argmax(1)]
-            fits = ~known & self._explains(place, measured, frames)
+            fits = ~known & self._explains(place, measured, look)
             now, known = np.where(fits, place, now), known | fits
             if known.all():
                 break
@@ -640,10 +634,11 @@ def _normalized(belief: Array) -> Array:
 
 
 def _posterior(belief: Array, evidence: Array) -> Array:
-    """The belief times the exponential of the evidence, where that is too small for numbers."""
+    """The belief times the exponential of the evidence, without what is next to nothing."""
     with np.errstate(divide="ignore"):
         log_belief = np.log(belief) + evidence
-    return _normalized(np.exp(log_belief - log_belief.max(-1, keepdims=True)))
+    log_belief -= log_belief.max(-1, keepdims=True)
+    return _normalized(np.where(log_belief > NOTHING, np.exp(log_belief), 0.0))
 
 
 def _put(array: NDArray[Any], rows: Flags, values: NDArray[Any]) -> NDArray[Any]:
@@ -656,7 +651,7 @@ def _rows(frame: Frame, rows: Flags) -> Frame:
     """Of some robots, as (B,); an object that all of them share stays as it is."""
     if not frame.batch_shape:
         return frame
-    return frame.expand(rows.shape)[torch.from_numpy(rows).to(frame.position.device)]
+    return frame.expand(rows.shape)[torch.from_numpy(rows)]
 
 
 def _tensor(array: Array, like: Tensor) -> Tensor:

@@ -11,7 +11,8 @@ three numbers of each component.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
@@ -19,12 +20,12 @@ from numpy.typing import NDArray
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.operators import Canonical, Operator, Stack
+from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
-from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Likelihood", "local_mode", "move"]
+__all__ = ["Localizer", "Look", "local_mode", "move"]
 
 Array = NDArray[np.float64]
 #: Seconds between instants, at least: below, neighbours look alike.
@@ -42,8 +43,8 @@ MODE = 0.3
 SPREAD = 0.016
 
 
-class Likelihood:
-    """The likelihood of a skill's instants.
+class Localizer:
+    """The instants of a skill, and what the mixture says of observations there.
 
     Parameters
     ----------
@@ -65,34 +66,63 @@ class Likelihood:
         count = min(MOST, max(2, round((end - begin) / STEP) + 1))
         self.instants = np.linspace(begin, end, count, dtype=np.float64)
         self.step = float(self.instants[1] - self.instants[0])
-        self._by_names: dict[frozenset[str], _Observed] = {}
+        self._by_names: dict[frozenset[str], _Instants] = {}
 
-    def __call__(self, joints: Array, frames: Mapping[str, Frame]) -> Array:
-        """Log-likelihood of all instants (B, G), up to a constant of each robot.
-
-        Operators say nothing whose frames or links are not there; nothing is said of robots of
-        which something else is not a number.
+    def look(self, joints: Array, frames: Mapping[str, Frame]) -> Look:
+        """See robots; operators say nothing whose frames or links are not there.
 
         Parameters
         ----------
         joints : array of shape (B, n_joints)
-            Where the robots stand.
+            Where they stand.
         frames : mapping of str to Frame
             Of shapes () or (B,).
         """
         names = frozenset(frames)
         if names not in self._by_names:
             with torch.inference_mode(False):
-                self._by_names[names] = _Observed(self._regression, names, self.instants)
-        return self._by_names[names](joints, frames)
+                self._by_names[names] = _Instants(self._regression, names, self.instants)
+        return Look(self._by_names[names], joints, frames)
 
 
-class _Observed:
-    """The likelihood given certain frames."""
+class Look:
+    """Robots as they are seen at a moment; made by :meth:`Localizer.look`."""
+
+    def __init__(self, instants: _Instants, joints: Array, frames: Mapping[str, Frame]) -> None:
+        self._instants, self._count = instants, len(joints)
+        kinematics = instants.kinematics
+        if len(joints) == 1:  # one robot is sooner computed without a batch
+            joints = joints[0]
+            frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
+        self._frames = frames
+        with torch.inference_mode():
+            self._state = kinematics.state(torch.as_tensor(joints).to(kinematics.lower))
+
+    def log_likelihood(self, window: slice = slice(None)) -> Array:
+        """Of instants (B, G), up to a constant of each robot: of all, or in a window.
+
+        Nothing is said of robots of which an observation is not a number.
+        """
+        with torch.inference_mode():
+            terms = self._instants.exponents(self._state, self._frames)
+        return self._instants.log_likelihood(*terms, window)
+
+    def reference(self, time: Array) -> Estimate | None:
+        """What the skill would tell the robots at times (B,) [s]; None if it says nothing."""
+        regression, state = self._instants.regression, self._state
+        if regression is None:
+            return None
+        with torch.inference_mode():
+            times = torch.as_tensor(time).to(state.joints).view(state.joints.shape[:-1])
+            return regression.step(times, state, self._frames)
+
+
+class _Instants:
+    """The mixture at all instants, as far as certain frames are concerned."""
 
     def __init__(self, regression: Regression, frames: frozenset[str], instants: Array) -> None:
-        kinematics = regression.kinematics
-        self._kinematics = kinematics
+        self.kinematics = kinematics = regression.kinematics
+        links = set(kinematics.links)
         first = regression.conditionals[0]
         marginals = TimeMarginals.of(
             regression.log_weights, first.time_mean, first.time_variance
@@ -106,51 +136,55 @@ class _Observed:
         self._log_h: Array = np.take_along_axis(log_h, self._heaviest, 1)
         centre = first.time_mean.numpy(force=True).astype(np.float64)
         self._elapsed = instants[:, None] - centre[self._heaviest]
-        tasks: list[Operator] = []
-        parts: list[_Coordinates] = []
-        canonical: list[_Coordinates] = []
+        operators: list[Operator] = []
+        conditionals: list[Conditionals] = []
+        self._parts: list[_Coordinates] = []
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
             leaves = operator.leaves if isinstance(operator, Stack) else (operator,)
             sizes = [leaf.dimension(kinematics) for leaf in leaves]
             there = [
-                set(leaf.links()) <= set(kinematics.links)
-                and set(leaf.references()) <= frames | set(kinematics.links)
+                set(leaf.links()) <= links and set(leaf.references()) <= frames | links
                 for leaf in leaves
             ]
-            columns = np.repeat(there, sizes)
-            groups = np.repeat(np.arange(len(leaves)), sizes)[columns]
             seen = [leaf for leaf, known in zip(leaves, there, strict=True) if known]
             if not seen:
                 continue
-            starts = Stack(*seen).quaternion_starts(kinematics)
-            coordinates = _Coordinates(one, weights, columns, groups, starts, first)
-            if all(type(leaf) is Canonical for leaf in seen):
-                canonical.append(coordinates)
-            else:
-                tasks += seen
-                parts.append(coordinates)
-        self._task = Stack(*tasks) if tasks else None
-        self._parts, self._canonical = parts, canonical
-        self._constant = sum((part.constant for part in [*parts, *canonical]), np.zeros(1))
-        self._curvature = sum((part.curvature for part in [*parts, *canonical]), np.zeros(1))
+            if len(seen) < len(leaves):
+                operator = Stack(*seen)
+                columns = torch.from_numpy(np.flatnonzero(np.repeat(there, sizes)))
+                one = one.marginal(columns)
+            operators.append(operator)
+            conditionals.append(one)
+            starts = operator.quaternion_starts(kinematics)
+            sizes = [leaf.dimension(kinematics) for leaf in seen]
+            self._parts.append(_Coordinates(one, weights, sizes, starts, first))
+        self._operators = operators
+        self.regression: Regression | None = regression
+        if operators != list(regression.operators):
+            settings = {f.name: getattr(regression, f.name) for f in fields(Regression)}
+            settings |= {"operators": operators, "conditionals": conditionals}
+            self.regression = Regression(**settings) if operators else None
+        nothing = np.zeros(len(centre))
+        self._constant = sum((part.constant for part in self._parts), nothing)
+        self._curvature = sum((part.curvature for part in self._parts), nothing)
 
-    def __call__(self, joints: Array, frames: Mapping[str, Frame]) -> Array:
-        terms = [part(joints) for part in self._canonical]
-        if self._task is not None:
-            known = np.isfinite(joints).all(-1, keepdims=True)
-            state = self._kinematics.state(np.where(known, joints, 0.0))
-            local = np.where(known, _local(self._task, state, frames), np.nan)
-            column = 0
-            for part in self._parts:
-                terms.append(part(local[..., column : column + part.size]))
-                column += part.size
-        if not terms:
-            return np.zeros((len(joints), len(self._elapsed)))
-        square, slope = (sum(each) for each in zip(*terms, strict=True))
+    def exponents(self, state: RobotState, frames: Mapping[str, Frame]) -> tuple[Array, Array]:
+        """``|W (x - mu)|^2`` and its slope over time, summed over the operators, (B, K)."""
+        square: Array = np.zeros((1, len(self._constant)))
+        slope = square
+        for operator, part in zip(self._operators, self._parts, strict=True):
+            local = np.atleast_2d(_local(operator, state, frames))
+            one, other = part(local)
+            square, slope = square + one.T, slope + other.T
+        return square, slope
+
+    def log_likelihood(self, square: Array, slope: Array, window: slice) -> Array:
+        """``log p(x | t)`` at the instants of a window, (B, G), up to a constant."""
         # -0.5 |W (x - mu(t))|^2 as a polynomial of the time since the component's mean
-        index, elapsed = self._heaviest, self._elapsed
-        base = self._log_h + (self._constant[index] - 0.5 * elapsed**2 * self._curvature[index])
-        exponent = base - 0.5 * square.T[:, index] + elapsed * slope.T[:, index]
+        index, elapsed = self._heaviest[window], self._elapsed[window]
+        base = self._log_h[window] + self._constant[index]
+        base -= 0.5 * elapsed**2 * self._curvature[index]
+        exponent = base - 0.5 * square[:, index] + elapsed * slope[:, index]
         most = exponent.max(-1)
         total = most + np.log(np.exp(exponent - most[..., None]).sum(-1))
         return np.where(np.isfinite(most).all(-1, keepdims=True), total, 0.0)
@@ -163,8 +197,7 @@ class _Coordinates:
         self,
         one: Conditionals,
         weights: Array,
-        columns: NDArray[np.bool_],
-        groups: NDArray[np.int_],
+        sizes: Sequence[int],
         starts: Iterable[int],
         first: Conditionals,
     ) -> None:
@@ -172,8 +205,7 @@ class _Coordinates:
             tensor.numpy(force=True).astype(np.float64)
             for tensor in (one.recentred(first.time_mean), one.gain, one.covariance)
         )
-        mean, gain = mean[:, columns], gain[:, columns]
-        covariance = covariance[:, columns][:, :, columns]
+        groups = np.repeat(np.arange(len(sizes)), sizes)
         # how far coordinates move in the skill, alike for those of one leaf
         moved = (weights @ mean).var(0)
         slack = SLACK**2 * np.array([moved[groups == group].mean() for group in groups])
@@ -196,13 +228,15 @@ class _Coordinates:
         return (white**2).sum(1), (self._rate[:, :, None] * white).sum(1)
 
 
-def _local(task: Stack, state: RobotState, frames: Mapping[str, Frame]) -> Array:
-    """Local coordinates (B, D): ``M^T (x - c)`` is sooner computed than by each operator."""
-    at = task.linearize(state, frames)
-    if at.present is None or at.matrix is None:
-        return task.coordinates(state, frames).numpy(force=True)
-    moved = (at.matrix.mT @ at.displacement.unsqueeze(-1)).squeeze(-1)
-    return (at.present - moved).numpy(force=True)
+def _local(operator: Operator, state: RobotState, frames: Mapping[str, Frame]) -> Array:
+    """Local coordinates (..., D); of a stack of poses they are sooner had from its map."""
+    if isinstance(operator, Stack):
+        at = operator.linearize(state, frames)
+        if at.present is not None and at.matrix is not None:
+            # R^T (x - p), which is -M^T c, and the present quaternions, whose c is zero
+            moved = (at.matrix.mT @ at.displacement.unsqueeze(-1)).squeeze(-1)
+            return (at.present - moved).numpy(force=True)
+    return operator.coordinates(state, frames).numpy(force=True)
 
 
 def move(belief: Array, shift: Array, spread: Array) -> Array:

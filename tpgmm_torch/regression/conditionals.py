@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -116,6 +116,16 @@ class Conditionals(_OfComponents):
         gain, _ = gaussians.product(gains, covariances)
         mean, covariance = gaussians.product(means, covariances)
         return cls(mean.to(like), gain.to(like), covariance.to(like), *time)
+
+    def marginal(self, coordinates: Tensor) -> Conditionals:
+        """Of some of the coordinates, by their indices."""
+        covariance = self.covariance[:, coordinates][:, :, coordinates]
+        return replace(
+            self,
+            mean=self.mean[:, coordinates],
+            gain=self.gain[:, coordinates],
+            covariance=covariance,
+        )
 
     def recentred(self, time_mean: Tensor) -> Tensor:
         """Conditional means at a time of each component's own: shapes (K,) and (K, D)."""

@@ -349,7 +349,7 @@ def test_the_belief_is_where_the_robot_is(shaking):
     target = posture(shaking, torch.tensor([2.0, 8.0], dtype=torch.float64))
     never = torch.tensor(99.0)
     run.run(0.2, between(torch.stack((torch.tensor(8.0), never)), never, target))
-    belief, instants = run.progress.belief, torch.from_numpy(run.progress.likelihood.instants)
+    belief, instants = run.progress.belief, torch.from_numpy(run.progress.localizer.instants)
     assert torch.allclose(belief.sum(-1), torch.ones(2, dtype=torch.float64))
     assert (belief @ instants).tolist() == pytest.approx([2.0, 8.1], abs=0.2)
 

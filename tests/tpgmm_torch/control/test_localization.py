@@ -1,15 +1,31 @@
 """The likelihood of a skill's instants, and beliefs over them, against plain formulas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from tests.support.mixtures import CASES, Case, Problem
-from tests.support.skills import few_bottles, handlings, hands, new_handling, small_bottle
+from tests.support.skills import (
+    HANDS,
+    few_bottles,
+    handlings,
+    hands,
+    new_handling,
+    small_bottle,
+)
 from tests.support.worlds import OBJECT
-from tpgmm_torch import Frame
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    RelativePosition,
+    Stack,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.control import localization
-from tpgmm_torch.control.localization import Likelihood, local_mode, move
+from tpgmm_torch.control.localization import Localizer, local_mode, move
 from tpgmm_torch.regression.regression import Regression
 
 NAMES = ["the paper's", "poses in two frames", "canonical"]
@@ -45,25 +61,25 @@ def test_the_likelihood_is_the_mixtures_given_time(case: Case, monkeypatch):
     monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
     problem = Problem.of(case, 4, 3)
     regression = problem.regression()
-    likelihood = Likelihood(regression, 0.0, 2.0)
+    localizer = Localizer(regression, 0.0, 2.0)
     joints = problem.state.joints
-    got = likelihood(joints.numpy(), problem.frames)
+    got = localizer.look(joints.numpy(), problem.frames).log_likelihood()
     assert got.shape == (3, 51)
     for robot in range(3):
         frames = {name: frame[robot] for name, frame in problem.frames.items()}
-        expected = dense(regression, joints[robot], frames, likelihood.instants)
+        expected = dense(regression, joints[robot], frames, localizer.instants)
         relative = got[robot] - got[robot].max()
         np.testing.assert_allclose(relative, expected, rtol=1e-9, atol=1e-7)
 
 
 def test_instants_cover_the_skill_evenly():
     regression = hands().regression()
-    likelihood = Likelihood(regression, 0.3, 1.7)
-    assert likelihood.instants[0] == 0.3
-    assert likelihood.instants[-1] == 1.7
-    np.testing.assert_allclose(np.diff(likelihood.instants), likelihood.step)
-    assert likelihood.step == pytest.approx(0.04)
-    assert len(Likelihood(regression, 0.0, 1e4).instants) == 4096
+    localizer = Localizer(regression, 0.3, 1.7)
+    assert localizer.instants[0] == 0.3
+    assert localizer.instants[-1] == 1.7
+    np.testing.assert_allclose(np.diff(localizer.instants), localizer.step)
+    assert localizer.step == pytest.approx(0.04)
+    assert len(Localizer(regression, 0.0, 1e4).instants) == 4096
 
 
 def test_components_that_weigh_nothing_are_left_out(monkeypatch):
@@ -71,9 +87,9 @@ def test_components_that_weigh_nothing_are_left_out(monkeypatch):
     regression, demonstration = small_bottle().regression(), few_bottles()[0]
     begin, end = demonstration.time[[0, -1]].tolist()
     joints, frames = demonstration.joints.numpy(), dict(demonstration.frames)
-    fast = Likelihood(regression, begin, end)(joints, frames)
+    fast = Localizer(regression, begin, end).look(joints, frames).log_likelihood()
     monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
-    every = Likelihood(regression, begin, end)(joints, frames)
+    every = Localizer(regression, begin, end).look(joints, frames).log_likelihood()
     likely = every > every.max(1, keepdims=True) - 10
     np.testing.assert_allclose(fast[likely], every[likely], atol=0.01)
 
@@ -81,20 +97,24 @@ def test_components_that_weigh_nothing_are_left_out(monkeypatch):
 def test_the_instant_of_a_demonstration_is_found():
     """Of two tracked hands and a cup, any step of a motion never shown."""
     situation, wanted = new_handling()
-    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    localizer = Localizer(hands().regression(), 0.0, 2.0)
     frames = {"cup": situation.frames["cup"]}
-    found = likelihood.instants[likelihood(wanted.numpy(), frames).argmax(1)]
+    found = localizer.instants[
+        localizer.look(wanted.numpy(), frames).log_likelihood().argmax(1)
+    ]
     assert np.abs(found - situation.time.numpy()).max() < 0.1
 
 
 def test_quaternions_of_the_other_sign_are_the_same_rotation():
     situation, wanted = new_handling()
-    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    localizer = Localizer(hands().regression(), 0.0, 2.0)
     flipped = wanted.clone()
     flipped[:, 3:7] *= -1
     cup = situation.frames["cup"]
-    one = likelihood(wanted.numpy(), {"cup": cup})
-    other = likelihood(flipped.numpy(), {"cup": Frame(cup.position, -cup.orientation)})
+    one = localizer.look(wanted.numpy(), {"cup": cup}).log_likelihood()
+    other = localizer.look(
+        flipped.numpy(), {"cup": Frame(cup.position, -cup.orientation)}
+    ).log_likelihood()
     np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7)
 
 
@@ -102,8 +122,8 @@ def test_a_frame_that_is_not_there_says_nothing_others_do():
     """The right hand seen from the left one needs no cup."""
     _, wanted = new_handling()
     regression = hands().regression()
-    likelihood = Likelihood(regression, 0.0, 2.0)
-    without = likelihood(wanted.numpy(), {})
+    localizer = Localizer(regression, 0.0, 2.0)
+    without = localizer.look(wanted.numpy(), {}).log_likelihood()
     alone = Regression(
         regression.kinematics,
         regression.operators[1:],
@@ -111,31 +131,71 @@ def test_a_frame_that_is_not_there_says_nothing_others_do():
         regression.log_weights,
     )
     # each operator has learned the components' times a little differently, by rounding
-    expected = Likelihood(alone, 0.0, 2.0)(wanted.numpy(), {})
+    expected = Localizer(alone, 0.0, 2.0).look(wanted.numpy(), {}).log_likelihood()
     np.testing.assert_allclose(without, expected, rtol=1e-4, atol=0.02)
     assert np.ptp(without, 1).min() > 1  # it does say something
 
 
 def test_where_nothing_is_known_every_instant_is_alike():
     regression = small_bottle().regression()
-    problem = Problem.of(CASES["the paper's"], 3, 2)
-    likelihood = Likelihood(regression, 0.0, 5.0)
-    joints = problem.state.joints.numpy().copy()
-    joints[1, 3] = np.nan
-    got = likelihood(joints, {"bottle": Frame([0.45, 0.0, 0.15])})
+    joints = few_bottles()[0].joints[:2].numpy()
+    position = torch.tensor([[0.45, 0.0, 0.15], [0.45, torch.nan, 0.15]], dtype=torch.float64)
+    bottle = Frame([[0.0, 0.0, 0.0]] * 2)
+    object.__setattr__(bottle, "position", position)
+    got = Localizer(regression, 0.0, 5.0).look(joints, {"bottle": bottle}).log_likelihood()
     assert np.isfinite(got).all()
     assert np.ptp(got[1]) == 0
     assert np.ptp(got[0]) > 1
 
 
+def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
+    """One stack over two objects, of which one is not there: its marginal."""
+    situation, wanted = new_handling()
+    both = Stack(*(RelativePosition(hand, name) for hand in ("left", "right") for name in "ab"))
+    time = situation.time
+    demonstrations = [
+        Demonstration(d.time, d.joints, {"a": d.frames["cup"], "b": Frame([0.1 * k, 0, 0])})
+        for k, d in enumerate(handlings())
+    ]
+    settings = {"n_components": 6, "robot": HANDS, "blend": 0.0}
+    model = TaskParameterizedGMM(operators=[both, Canonical()], **settings).fit(demonstrations)
+    localizer = Localizer(model.regression(), 0.0, 2.0)
+    a = {"a": situation.frames["cup"]}
+    look = localizer.look(wanted.numpy(), a)
+    [first, canonical] = model.regression().conditionals
+    columns = torch.tensor([0, 1, 2, 6, 7, 8])
+    only = Stack(RelativePosition("left", "a"), RelativePosition("right", "a"))
+    alone = replace(
+        model.regression(),
+        operators=[only, Canonical()],
+        conditionals=[first.marginal(columns), canonical],
+    )
+    expected = Localizer(alone, 0.0, 2.0).look(wanted.numpy(), a)
+    np.testing.assert_allclose(look.log_likelihood(), expected.log_likelihood(), atol=1e-6)
+    reference = look.reference(time.numpy())
+    step = alone.step(time, HANDS.state(wanted), a)
+    assert reference is not None
+    assert torch.equal(reference.joints, step.joints)
+    cup_only = replace(
+        hands().regression(),
+        operators=hands().regression().operators[:1],
+        conditionals=hands().regression().conditionals[:1],
+    )
+    blind = Localizer(cup_only, 0.0, 2.0).look(wanted.numpy(), {})
+    assert blind.reference(time.numpy()) is None
+    assert np.ptp(blind.log_likelihood()) < 1e-9
+
+
 @EVERY_WORLD
 def test_robots_of_a_batch_are_what_they_are_alone(case: Case):
     problem = Problem.of(case, 4, 5)
-    likelihood = Likelihood(problem.regression(), 0.0, 2.0)
-    together = likelihood(problem.state.joints.numpy(), problem.frames)
+    localizer = Localizer(problem.regression(), 0.0, 2.0)
+    together = localizer.look(problem.state.joints.numpy(), problem.frames).log_likelihood()
     for robot in range(5):
         frames = {OBJECT: problem.frames[OBJECT][robot]}
-        alone = likelihood(problem.state.joints[robot : robot + 1].numpy(), frames)
+        alone = localizer.look(
+            problem.state.joints[robot : robot + 1].numpy(), frames
+        ).log_likelihood()
         np.testing.assert_allclose(together[robot], alone[0], rtol=1e-10, atol=1e-8)
 
 
@@ -176,9 +236,11 @@ def test_the_mode_is_the_highest_place_not_the_mean_of_two():
 
 def test_demonstrations_are_what_the_likelihood_was_learned_from():
     """Median error of the time of single postures, of all steps of four demonstrations."""
-    likelihood = Likelihood(hands().regression(), 0.0, 2.0)
+    localizer = Localizer(hands().regression(), 0.0, 2.0)
     errors = []
     for demonstration in handlings():
-        got = likelihood(demonstration.joints.numpy(), dict(demonstration.frames))
-        errors.append(likelihood.instants[got.argmax(1)] - demonstration.time.numpy())
+        got = localizer.look(
+            demonstration.joints.numpy(), dict(demonstration.frames)
+        ).log_likelihood()
+        errors.append(localizer.instants[got.argmax(1)] - demonstration.time.numpy())
     assert np.median(np.abs(errors)) < 0.03
