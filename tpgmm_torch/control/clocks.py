@@ -246,25 +246,38 @@ class WaitingClock(Clock):
         Time constant of the robot's servos [s].
     floor : float, default=0.02
         Error that means nothing: noise, friction, gravity [rad or m].
+    arrivals : tuple of float, default=()
+        Times in the skill that are not passed before each joint has come to its reference, but
+        for ``floor`` [s]: for a gripper to close when the hand is there, not when it is time.
 
     Raises
     ------
     DataError
-        If one of them is not positive.
+        If a number is not positive, or an arrival no number.
 
     Examples
     --------
     >>> WaitingClock(tolerance=3)
-    WaitingClock(speed=1.0, tolerance=3.0, lag=0.1, floor=0.02)
+    WaitingClock(speed=1.0, tolerance=3.0, lag=0.1, floor=0.02, arrivals=())
     """
 
     speed: float = 1.0
     tolerance: float = 2.0
     lag: float = 0.1
     floor: float = 0.02
+    arrivals: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         _check_positive(self, "speed", "tolerance", "lag", "floor")
+        try:
+            arrivals = tuple(sorted(map(float, self.arrivals)))
+        except (TypeError, ValueError):
+            arrivals = (math.nan,)
+        if not all(map(math.isfinite, arrivals)):
+            raise DataError(
+                f"arrivals of {type(self).__name__} are times in seconds, got {self.arrivals!r}"
+            )
+        object.__setattr__(self, "arrivals", arrivals)
 
     def start(
         self,
@@ -345,6 +358,10 @@ class WaitingProgress(Progress):
             rate = np.minimum(rate, self.rate + passed / RESTART)
         step = clock.speed * passed * rate
         now = _until(self.end, self.now + step, step)
+        if clock.arrivals and observation.joints is not None:
+            late = np.abs(measured - reference).max(-1) > clock.floor
+            stops = np.array([*clock.arrivals, math.inf])
+            now = np.where(late, np.minimum(now, stops[stops.searchsorted(self.now)]), now)
         return {
             "now": now,
             "rate": rate,
@@ -387,7 +404,7 @@ class LocalizingClock(WaitingClock):
 
     Parameters
     ----------
-    speed, tolerance, lag, floor : float
+    speed, tolerance, lag, floor, arrivals : float or tuple of float
         See :class:`WaitingClock`.
     initial : {"beginning", "anywhere"}, default="beginning"
         Where in the skill robots are believed to be at its start. With ``"anywhere"`` that is
@@ -724,10 +741,15 @@ def parse_clock(text: str) -> Clock:
                 f"clock {text!r}: {name!r} {problem}; {kind.strip()!r} has {list(known)}, each "
                 "written as NAME=VALUE"
             )
+        default = known[name].default
         try:
-            settings[name] = value if isinstance(known[name].default, str) else float(value)
+            if isinstance(default, tuple):
+                settings[name] = tuple(map(float, value.split("/")))
+            else:
+                settings[name] = value if isinstance(default, str) else float(value)
         except ValueError:
-            raise DataError(f"clock {text!r}: {name} is a number, got {value!r}") from None
+            form = "numbers joined by '/'" if isinstance(default, tuple) else "a number"
+            raise DataError(f"clock {text!r}: {name} takes {form}, got {value!r}") from None
     return clock(**settings)
 
 
@@ -747,9 +769,17 @@ def format_clock(clock: Clock) -> str:
     for kind, known in CLOCKS.items():
         if type(clock) is known:
             changed = [
-                f"{field.name}={str(value).removesuffix('.0')}"
+                f"{field.name}={_text(value)}"
                 for field in fields(known)
                 if (value := getattr(clock, field.name)) != field.default
             ]
             return ":".join([kind, ",".join(changed)] if changed else [kind])
     return repr(clock)
+
+
+def _text(value: Any) -> str:
+    return (
+        "/".join(map(_text, value))
+        if isinstance(value, tuple)
+        else str(value).removesuffix(".0")
+    )

@@ -186,6 +186,30 @@ def test_a_quaternion_and_its_negative_are_one_rotation():
     assert float(progress.time) == pytest.approx(0.1)
 
 
+@pytest.mark.parametrize("dt", [0.04, 0.01])
+def test_what_waits_for_arrival_happens_when_the_robot_is_there(regression, dt):
+    """At 1 s the robot is held short of its place for a while: time does not pass 1 s."""
+    run = begun(regression, WaitingClock(floor=0.05, arrivals=(1.5, 1.0)), dt=dt)
+    run.run(0.92)
+    short = run.joints + 0.06 * torch.sign(run.joints - run.reference)
+    run.run(1.0, held(short))
+    assert float(run.progress.time) == 1.0
+    run.run(0.32)
+    assert float(run.progress.time) > 1.0
+    run.finish()
+    for stop in (1.0, 1.5):
+        after = next(k for k, time in enumerate(run.times) if time > stop)
+        # it was there when time went on: what is measured is the last reference's
+        reached = run.measured[after] - run.references[after - 1]
+        assert reached.abs().max() <= 0.05
+
+
+def test_without_measurements_nothing_is_waited_for(regression):
+    run = begun(regression, WaitingClock(arrivals=(1.0,)))
+    run.run(1.2, seen=False)
+    assert float(run.progress.time) == pytest.approx(1.2)
+
+
 # Localising: a skill that reaches (to 5 s), holds (to 6), brings (to 10), shakes (to 16), rests
 
 
@@ -392,6 +416,7 @@ def test_robots_in_more_dimensions_and_on_hold(shaking):
         ("even:speed=0.5", EvenClock(0.5)),
         ("waiting", WaitingClock()),
         ("waiting:tolerance=3,lag=0.05", WaitingClock(tolerance=3, lag=0.05)),
+        ("waiting:arrivals=4.5/7", WaitingClock(arrivals=(7, 4.5))),
         ("localizing", LocalizingClock()),
         (
             "localizing:floor=0.01,initial=anywhere",
@@ -412,7 +437,13 @@ def test_texts_and_clocks_are_each_others_inverse(text, clock):
         ("even:tolerance=3", r"'tolerance' is no option; 'even' has \['speed'\].*NAME=VALUE"),
         ("waiting:", r"'' is no option; 'waiting' has \['speed', 'tolerance'"),
         ("waiting:lag=1,lag=2", r"'lag' is given twice"),
-        ("waiting:lag=soon", r"lag is a number, got 'soon'"),
+        ("waiting:arrivals=4,5", r"'5' is no option"),
+        ("waiting:arrivals=4/x", r"arrivals takes numbers joined by '/', got '4/x'"),
+        (
+            "waiting:arrivals=nan",
+            r"arrivals of WaitingClock are times in seconds, got \(nan,\)",
+        ),
+        ("waiting:lag=soon", r"lag takes a number, got 'soon'"),
         ("waiting:lag=-1", r"lag of WaitingClock must be positive, got -1.0"),
         ("localizing:initial=here", r"one of \['beginning', 'anywhere'\], got 'here'"),
         ("even:speed=nan", r"speed of EvenClock must be positive, got nan"),
