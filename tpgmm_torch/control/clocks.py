@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
 
@@ -23,6 +23,7 @@ from tpgmm_torch.control.localization import MODE, SPREAD, Localizer, Look, loca
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = [
     "Clock",
@@ -80,6 +81,8 @@ class Observation:
         Present poses of the objects.
     estimate : Estimate, optional
         What the reference was made from.
+    attach : callable, optional
+        Adds what robots carry to their state: :meth:`Holding.state`.
     """
 
     joints: Tensor | None
@@ -87,6 +90,7 @@ class Observation:
     velocity: Tensor | None
     frames: Mapping[str, Frame]
     estimate: Estimate | None = None
+    attach: Callable[[RobotState], RobotState] | None = None
 
 
 class Progress(ABC):
@@ -538,7 +542,7 @@ class LocalizingProgress(WaitingProgress):
             moved=np.zeros_like(self.moved),
         )
         rows = due & astray
-        return self._corrected(went, rows, since, observation.frames) if rows.any() else went
+        return self._corrected(went, rows, since, observation) if rows.any() else went
 
     def _rate(self, following: Array) -> Array:
         """Behind the time, it waits for the robot; ahead of it, it hurries after the robot."""
@@ -554,7 +558,7 @@ class LocalizingProgress(WaitingProgress):
         return _normalized(np.where(np.abs(apart) < 3, np.exp(-0.5 * apart**2), 0.0))
 
     def _corrected(
-        self, went: Self, rows: Flags, since: Array, frames: Mapping[str, Frame]
+        self, went: Self, rows: Flags, since: Array, observation: Observation
     ) -> Self:
         """After a look at robots that do not follow; ``self`` is how it was before."""
         clock, localizer, measured = self.clock, self.localizer, went.measured[rows]
@@ -567,7 +571,7 @@ class LocalizingProgress(WaitingProgress):
         apart = np.abs(localizer.instants - now[:, None]) / ELSEWHERE
         anywhere = _normalized(np.exp(-apart) + 0.01)
         belief = np.where(lost[:, None], 0.9 * belief + 0.1 * anywhere, belief)
-        look = localizer.look(measured, {name: _rows(f, rows) for name, f in frames.items()})
+        look = went._look(rows, observation.frames, observation.attach)
         [inside] = np.nonzero(belief.any(0))
         window = slice(inside[0], inside[-1] + 1)
         evidence = EVIDENCE * passed[:, None] * look.log_likelihood(window)
@@ -609,6 +613,26 @@ class LocalizingProgress(WaitingProgress):
             rate=_put(went.rate, rows, np.where(moves, 0.0, went.rate[rows])),
         )
 
+    def _look(
+        self,
+        rows: Flags,
+        frames: Mapping[str, Frame],
+        attach: Callable[[RobotState], RobotState] | None = None,
+    ) -> Look:
+        """What is seen of some robots."""
+        kinematics, mask = self.regression.kinematics, torch.from_numpy(np.asarray(rows))
+        with torch.inference_mode():
+            if attach is None:
+                state = kinematics.state(_tensor(self.measured[rows], kinematics.lower))
+            else:  # of all robots: what they carry is
+                state = attach(kinematics.state(_tensor(self.measured, kinematics.lower)))
+                state = state[mask]
+            shared = {
+                name: frame.expand(rows.shape)[mask] if frame.batch_shape else frame
+                for name, frame in frames.items()
+            }
+        return self.localizer.look(state, shared)
+
     def _explains(self, place: Array, measured: Array, look: Look) -> Flags:
         """Whether the references at some times (B,) are where the robots are."""
         estimate = look.reference(place)
@@ -622,7 +646,7 @@ class LocalizingProgress(WaitingProgress):
         """At the places that explain best where the robots are."""
         rows, instants = np.ones(self.now.shape, bool), self.localizer.instants
         measured = self.measured[rows]
-        look = self.localizer.look(measured, {n: _rows(f, rows) for n, f in frames.items()})
+        look = self._look(rows, frames)
         likelihood = look.log_likelihood()
         now, known = self.now[rows], np.zeros(rows.sum(), bool)
         for _ in range(CANDIDATES):
@@ -662,13 +686,6 @@ def _put(array: NDArray[Any], rows: Flags, values: NDArray[Any]) -> NDArray[Any]
     array = np.array(array)
     array[rows] = values
     return array
-
-
-def _rows(frame: Frame, rows: Flags) -> Frame:
-    """Of some robots, as (B,); an object that all of them share stays as it is."""
-    if not frame.batch_shape:
-        return frame
-    return frame.expand(rows.shape)[torch.from_numpy(rows)]
 
 
 def _tensor(array: Array, like: Tensor) -> Tensor:

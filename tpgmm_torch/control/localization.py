@@ -68,35 +68,42 @@ class Localizer:
         self.step = float(self.instants[1] - self.instants[0])
         self._by_names: dict[frozenset[str], _Instants] = {}
 
-    def look(self, joints: Array, frames: Mapping[str, Frame]) -> Look:
+    def look(self, state: RobotState, frames: Mapping[str, Frame]) -> Look:
         """See robots; operators say nothing whose frames or links are not there.
 
         Parameters
         ----------
-        joints : array of shape (B, n_joints)
-            Where they stand.
+        state : RobotState
+            Of B robots, with what they carry.
         frames : mapping of str to Frame
             Of shapes () or (B,).
         """
-        names = frozenset(frames)
+        if len(state.joints) == 1:  # one robot is sooner computed without a batch
+            state = state[0]
+            frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
+        names = frozenset((*frames, *state.links))
         if names not in self._by_names:
             with torch.inference_mode(False):
                 self._by_names[names] = _Instants(self._regression, names, self.instants)
-        return Look(self._by_names[names], joints, frames)
+        return Look(self._by_names[names], state, frames)
 
 
 class Look:
-    """Robots as they are seen at a moment; made by :meth:`Localizer.look`."""
+    """Robots as they are seen at a moment; made by :meth:`Localizer.look`.
 
-    def __init__(self, instants: _Instants, joints: Array, frames: Mapping[str, Frame]) -> None:
-        self._instants, self._count = instants, len(joints)
-        kinematics = instants.kinematics
-        if len(joints) == 1:  # one robot is sooner computed without a batch
-            joints = joints[0]
-            frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
-        self._frames = frames
-        with torch.inference_mode():
-            self._state = kinematics.state(torch.as_tensor(joints).to(kinematics.lower))
+    Parameters
+    ----------
+    instants : object
+        What the mixture says of them, given the frames and links that are there.
+    state : RobotState
+        Of B robots, or one without a batch.
+    frames : mapping of str to Frame
+    """
+
+    def __init__(
+        self, instants: _Instants, state: RobotState, frames: Mapping[str, Frame]
+    ) -> None:
+        self._instants, self._state, self._frames = instants, state, frames
 
     def log_likelihood(self, window: slice = slice(None)) -> Array:
         """Of instants (B, G), up to a constant of each robot: of all, or in a window.
@@ -118,11 +125,10 @@ class Look:
 
 
 class _Instants:
-    """The mixture at all instants, as far as certain frames are concerned."""
+    """The mixture at all instants, as far as certain frames and links are concerned."""
 
-    def __init__(self, regression: Regression, frames: frozenset[str], instants: Array) -> None:
-        self.kinematics = kinematics = regression.kinematics
-        links = set(kinematics.links)
+    def __init__(self, regression: Regression, names: frozenset[str], instants: Array) -> None:
+        kinematics = regression.kinematics
         first = regression.conditionals[0]
         marginals = TimeMarginals.of(
             regression.log_weights, first.time_mean, first.time_variance
@@ -142,10 +148,7 @@ class _Instants:
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
             leaves = operator.leaves if isinstance(operator, Stack) else (operator,)
             sizes = [leaf.dimension(kinematics) for leaf in leaves]
-            there = [
-                set(leaf.links()) <= links and set(leaf.references()) <= frames | links
-                for leaf in leaves
-            ]
+            there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in leaves]
             seen = [leaf for leaf, known in zip(leaves, there, strict=True) if known]
             if not seen:
                 continue

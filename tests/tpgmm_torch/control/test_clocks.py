@@ -7,9 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.support.carrying import HELD, carrying_model, scenes
 from tests.support.motions import ease
 from tests.support.servos import Run, between, held
 from tests.support.skills import LAST, canonical, hands, new_handling, wave, waves
+from tests.support.worlds import upper_body
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.control.clocks import (
     Clock,
@@ -20,6 +22,7 @@ from tpgmm_torch.control.clocks import (
     format_clock,
     parse_clock,
 )
+from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Regression
 
@@ -390,6 +393,32 @@ def test_localised_robots_do_not_depend_on_their_batch(shaking):
         alone = localizing(shaking)
         alone.run(5.5, between(since[robot], since[robot] + 0.4, targets[robot]))
         torch.testing.assert_close(torch.stack(alone.times), times[:, robot], rtol=0, atol=1e-9)
+
+
+def test_a_robot_that_carries_something_is_localised_with_it():
+    """On its way to the tray it is pushed back by a second; the bottle stays in the hand."""
+    scene, model = scenes(1, seed=7)[0], carrying_model()
+    regression, time = model.regression(), model.time_
+    holding = Holding.start(upper_body(), regression.operators, [HELD], scene.frames)
+    joints = scene.start
+    progress = LOCALIZING.start(regression, 0.0, float(time[-1]), joints, scene.frames)
+    passed, pushed, estimate, moves = [joints], 0, None, 0
+    while progress.time < 5.0:
+        reference = passed[-1] if estimate is None else estimate.joints
+        holding = holding.advance(progress.time, reference)
+        state = holding.state(upper_body().state(reference))
+        estimate = regression.tick(progress.time, state, holding.frames)
+        joints = estimate.joints + 0.5 * (joints - estimate.joints)
+        if progress.time > 4.0 or 0 < pushed < 8:
+            joints, pushed = (passed[75], pushed + 1) if pushed < 8 else (joints, pushed)
+        passed.append(joints)
+        told = (joints, estimate.joints, None, holding.frames, estimate, holding.state)
+        progress = progress.advance(0.04, Observation(*told))
+        if progress.relocalized:
+            moves += 1
+            assert float(progress.time) == pytest.approx(3.1, abs=0.2)
+    assert moves == 1
+    assert len(passed) == pytest.approx((5.0 + 1.0) / 0.04, abs=15)
 
 
 def test_robots_in_more_dimensions_and_on_hold(shaking):

@@ -63,7 +63,7 @@ def test_the_likelihood_is_the_mixtures_given_time(case: Case, monkeypatch):
     regression = problem.regression()
     localizer = Localizer(regression, 0.0, 2.0)
     joints = problem.state.joints
-    got = localizer.look(joints.numpy(), problem.frames).log_likelihood()
+    got = localizer.look(problem.state, problem.frames).log_likelihood()
     assert got.shape == (3, 51)
     for robot in range(3):
         frames = {name: frame[robot] for name, frame in problem.frames.items()}
@@ -86,10 +86,11 @@ def test_components_that_weigh_nothing_are_left_out(monkeypatch):
     """At each instant few of 8 components count; the others change nothing that is likely."""
     regression, demonstration = small_bottle().regression(), few_bottles()[0]
     begin, end = demonstration.time[[0, -1]].tolist()
-    joints, frames = demonstration.joints.numpy(), dict(demonstration.frames)
-    fast = Localizer(regression, begin, end).look(joints, frames).log_likelihood()
+    state = regression.kinematics.state(demonstration.joints)
+    frames = dict(demonstration.frames)
+    fast = Localizer(regression, begin, end).look(state, frames).log_likelihood()
     monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
-    every = Localizer(regression, begin, end).look(joints, frames).log_likelihood()
+    every = Localizer(regression, begin, end).look(state, frames).log_likelihood()
     likely = every > every.max(1, keepdims=True) - 10
     np.testing.assert_allclose(fast[likely], every[likely], atol=0.01)
 
@@ -100,7 +101,7 @@ def test_the_instant_of_a_demonstration_is_found():
     localizer = Localizer(hands().regression(), 0.0, 2.0)
     frames = {"cup": situation.frames["cup"]}
     found = localizer.instants[
-        localizer.look(wanted.numpy(), frames).log_likelihood().argmax(1)
+        localizer.look(HANDS.state(wanted), frames).log_likelihood().argmax(1)
     ]
     assert np.abs(found - situation.time.numpy()).max() < 0.1
 
@@ -111,9 +112,9 @@ def test_quaternions_of_the_other_sign_are_the_same_rotation():
     flipped = wanted.clone()
     flipped[:, 3:7] *= -1
     cup = situation.frames["cup"]
-    one = localizer.look(wanted.numpy(), {"cup": cup}).log_likelihood()
+    one = localizer.look(HANDS.state(wanted), {"cup": cup}).log_likelihood()
     other = localizer.look(
-        flipped.numpy(), {"cup": Frame(cup.position, -cup.orientation)}
+        HANDS.state(flipped), {"cup": Frame(cup.position, -cup.orientation)}
     ).log_likelihood()
     np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-7)
 
@@ -123,7 +124,7 @@ def test_a_frame_that_is_not_there_says_nothing_others_do():
     _, wanted = new_handling()
     regression = hands().regression()
     localizer = Localizer(regression, 0.0, 2.0)
-    without = localizer.look(wanted.numpy(), {}).log_likelihood()
+    without = localizer.look(HANDS.state(wanted), {}).log_likelihood()
     alone = Regression(
         regression.kinematics,
         regression.operators[1:],
@@ -131,18 +132,18 @@ def test_a_frame_that_is_not_there_says_nothing_others_do():
         regression.log_weights,
     )
     # each operator has learned the components' times a little differently, by rounding
-    expected = Localizer(alone, 0.0, 2.0).look(wanted.numpy(), {}).log_likelihood()
+    expected = Localizer(alone, 0.0, 2.0).look(HANDS.state(wanted), {}).log_likelihood()
     np.testing.assert_allclose(without, expected, rtol=1e-4, atol=0.02)
     assert np.ptp(without, 1).min() > 1  # it does say something
 
 
 def test_where_nothing_is_known_every_instant_is_alike():
     regression = small_bottle().regression()
-    joints = few_bottles()[0].joints[:2].numpy()
+    state = regression.kinematics.state(few_bottles()[0].joints[:2])
     position = torch.tensor([[0.45, 0.0, 0.15], [0.45, torch.nan, 0.15]], dtype=torch.float64)
     bottle = Frame([[0.0, 0.0, 0.0]] * 2)
     object.__setattr__(bottle, "position", position)
-    got = Localizer(regression, 0.0, 5.0).look(joints, {"bottle": bottle}).log_likelihood()
+    got = Localizer(regression, 0.0, 5.0).look(state, {"bottle": bottle}).log_likelihood()
     assert np.isfinite(got).all()
     assert np.ptp(got[1]) == 0
     assert np.ptp(got[0]) > 1
@@ -161,7 +162,7 @@ def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
     model = TaskParameterizedGMM(operators=[both, Canonical()], **settings).fit(demonstrations)
     localizer = Localizer(model.regression(), 0.0, 2.0)
     a = {"a": situation.frames["cup"]}
-    look = localizer.look(wanted.numpy(), a)
+    look = localizer.look(HANDS.state(wanted), a)
     [first, canonical] = model.regression().conditionals
     columns = torch.tensor([0, 1, 2, 6, 7, 8])
     only = Stack(RelativePosition("left", "a"), RelativePosition("right", "a"))
@@ -170,7 +171,7 @@ def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
         operators=[only, Canonical()],
         conditionals=[first.marginal(columns), canonical],
     )
-    expected = Localizer(alone, 0.0, 2.0).look(wanted.numpy(), a)
+    expected = Localizer(alone, 0.0, 2.0).look(HANDS.state(wanted), a)
     np.testing.assert_allclose(look.log_likelihood(), expected.log_likelihood(), atol=1e-6)
     reference = look.reference(time.numpy())
     step = alone.step(time, HANDS.state(wanted), a)
@@ -181,7 +182,7 @@ def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
         operators=hands().regression().operators[:1],
         conditionals=hands().regression().conditionals[:1],
     )
-    blind = Localizer(cup_only, 0.0, 2.0).look(wanted.numpy(), {})
+    blind = Localizer(cup_only, 0.0, 2.0).look(HANDS.state(wanted), {})
     assert blind.reference(time.numpy()) is None
     assert np.ptp(blind.log_likelihood()) < 1e-9
 
@@ -190,12 +191,10 @@ def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
 def test_robots_of_a_batch_are_what_they_are_alone(case: Case):
     problem = Problem.of(case, 4, 5)
     localizer = Localizer(problem.regression(), 0.0, 2.0)
-    together = localizer.look(problem.state.joints.numpy(), problem.frames).log_likelihood()
+    together = localizer.look(problem.state, problem.frames).log_likelihood()
     for robot in range(5):
         frames = {OBJECT: problem.frames[OBJECT][robot]}
-        alone = localizer.look(
-            problem.state.joints[robot : robot + 1].numpy(), frames
-        ).log_likelihood()
+        alone = localizer.look(problem.state[robot : robot + 1], frames).log_likelihood()
         np.testing.assert_allclose(together[robot], alone[0], rtol=1e-10, atol=1e-8)
 
 
@@ -240,7 +239,7 @@ def test_demonstrations_are_what_the_likelihood_was_learned_from():
     errors = []
     for demonstration in handlings():
         got = localizer.look(
-            demonstration.joints.numpy(), dict(demonstration.frames)
+            HANDS.state(demonstration.joints), dict(demonstration.frames)
         ).log_likelihood()
         errors.append(localizer.instants[got.argmax(1)] - demonstration.time.numpy())
     assert np.median(np.abs(errors)) < 0.03
