@@ -40,6 +40,11 @@ from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
+from tpgmm_torch.plausibility.check import learning_report, summarize, summarized
+from tpgmm_torch.plausibility.findings import PLAUSIBILITY
+from tpgmm_torch.plausibility.shown import Shown
+from tpgmm_torch.plausibility.situations import situations_report, tick_report
+from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
@@ -134,6 +139,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         (:func:`~tpgmm_torch.training.hold_detection.find_holds`); what was recorded once, or
         never moves, is never held. While an object is held, its frame as a place is where it
         was last free, for learning and for reproducing alike.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        What is done about recordings and situations that are unlikely to be what they are
+        taken for (units, order, clock, places far from those shown): one
+        :class:`~tpgmm_torch.exceptions.PlausibilityWarning` for each call, an error, or
+        nothing. What cannot be is an error unless ignored.
     random_state : int, RandomState instance or None, default=None
     warm_start : bool, default=False
         Start EM from the previous solution.
@@ -167,6 +177,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Mean log-likelihood per time step at the end of EM.
     mixture_ : BlockGaussianMixture
         Of the local data of all operators side by side.
+    shown_ : Shown or None
+        What the demonstrations showed: ranges of start postures and frames. None for a model
+        that was made from parameters.
 
     References
     ----------
@@ -206,6 +219,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "blend": [Interval(Real, 0, None, closed="left")],
         "keep_limits": ["boolean"],
         "holds": [StrOptions({"auto"}), "array-like", tuple, None],
+        "plausibility": [StrOptions(set(PLAUSIBILITY))],
         "random_state": ["random_state"],
         "warm_start": ["boolean"],
         "dtype": [StrOptions({"float64", "float32"})],
@@ -213,11 +227,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "verbose": ["verbose"],
     }
 
+    shown_: Shown | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
 
     #: What compiles; None until :meth:`compile` is called.
     _backend: str | None = None
+    #: Whether no tick of :meth:`step` was looked at since the model was fitted.
+    _untried = True
 
     def __init__(
         self,
@@ -240,6 +257,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         blend: float = 1.0,
         keep_limits: bool = True,
         holds: str | Sequence[Hold] | None = "auto",
+        plausibility: str = "warn",
         random_state: int | np.random.RandomState | None = None,
         warm_start: bool = False,
         dtype: str = "float64",
@@ -264,6 +282,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.blend = blend
         self.keep_limits = keep_limits
         self.holds = holds
+        self.plausibility = plausibility
         self.random_state = random_state
         self.warm_start = warm_start
         self.dtype = dtype
@@ -313,6 +332,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ------
         DataError, ShapeError, UnknownNameError
             If demonstrations do not fit together, or with the operators and the robot.
+        PlausibilityError
+            If they cannot be what they are taken for, see ``plausibility``.
         ModelFileError
             If the checkpoint is damaged, or of other data or settings.
         DistributedError
@@ -324,6 +345,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
             kinematics = self._kinematics_for(known, operators)
+            shown = self._examine(summarize(known, kinematics), operators, kinematics)
             holds = holds_for(self.holds, known, operators, kinematics)
             gathered = rows_in_memory(
                 known,
@@ -333,6 +355,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 holds=holds,
             )
             self._learn(gathered, operators, kinematics, checkpoint, holds)
+            self.shown_ = shown
             peaks = demonstrated_peaks(known, kinematics.joint_names)
             return self._set_peaks(*peaks)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -343,12 +366,17 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         # the first batch of all says it for those that have not been read yet
         holds = processes.gather(holds_for(self.holds, head, operators, kinematics))[0]
         seen = DemonstratedPeaks(kinematics.joint_names)
+        episodes: list[EpisodeSummary] = []
         with RowFile() as file:
             gathered = gather_rows(
-                seen.watch(chain([head], walk)), operators, kinematics, file, processes,
+                summarized(seen.watch(chain([head], walk)), kinematics, episodes),
+                operators, kinematics, file, processes,
                 responsibilities=self.responsibilities, holds=holds,
             )  # fmt: skip
+            everyone = list(chain.from_iterable(processes.gather(episodes)))
+            shown = self._examine(everyone, operators, kinematics, processes.rank)
             self._learn(gathered, operators, kinematics, checkpoint, holds)
+            self.shown_ = shown
         return self._set_peaks(*seen.result(processes))
 
     def predict(
@@ -385,6 +413,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         # what has no limit of speed is no robot that could be asked too much
         limited = self.keep_limits and bool(self.kinematics_.velocity.isfinite().any())
         bounds = self.motion_bounds() if limited else None
+        situations_report(situations, self.shown_, self.time_, self.kinematics_).act(
+            self.plausibility
+        )
         return rollout(
             self.regression(),
             situations,
@@ -439,6 +470,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         like = kinematics.lower
         known = {name: frame.to(like) for name, frame in (frames or {}).items()}
         now = as_tensor(time, "time").to(like)
+        if self._untried:  # wrong units are there from the first tick on: others cost nothing
+            self._untried = False
+            joints = state.joints if isinstance(state, RobotState) else state
+            self._examine_tick(now, joints, known)
         limits = (like, kinematics.upper) if self.keep_limits else None
         if not candidates and not isinstance(state, RobotState):
             joints = state if isinstance(state, Tensor) else kinematics.joint_tensor(state)
@@ -480,6 +515,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._check_fitted()
         check_compiler(backend)
         previous, self._backend = self._backend, backend
+        untried, self._untried = self._untried, False
         try:
             batch = () if n_robots == 1 else (n_robots,)
             like = self.time_
@@ -489,6 +525,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         except BaseException:
             self._backend = previous
             raise
+        finally:
+            self._untried = untried
         return self
 
     def controller(
@@ -542,6 +580,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             operator.check(self.kinematics_, frames or {})
         if not isinstance(bounds, MotionBounds):
             bounds = self.motion_bounds(**(bounds or {}))
+        self._examine_tick(self.time_[0], joints, frames or {})
         return Controller(
             self.regression(),
             joints,
@@ -756,6 +795,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_iter_ = getattr(mixture, "n_iter_", 0)
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
+        self.shown_ = None
+        self._untried = True
         return self
 
     @classmethod
@@ -845,6 +886,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             "n_iter": self.n_iter_,
             "converged": bool(self.converged_),
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
+            "shown": None if self.shown_ is None else self.shown_.config(),
         }
         if self.acceleration_ is not None and self.jerk_ is not None:
             config["peaks"] = [self.acceleration_.tolist(), self.jerk_.tolist()]
@@ -913,6 +955,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             if "peaks" in config:
                 acceleration, jerk = (as_tensor(x, "peaks") for x in config["peaks"])
                 model._set_peaks(acceleration, jerk)
+            if config.get("shown") is not None:
+                model.shown_ = Shown.from_config(config["shown"])
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, ModelFileError):
                 raise
@@ -965,6 +1009,27 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             processes=learning.processes,
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
+
+    def _examine(
+        self,
+        episodes: Sequence[EpisodeSummary],
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+        rank: int = 0,
+    ) -> Shown:
+        """Act on what is implausible about demonstrations; what they showed."""
+        report = learning_report(episodes, operators, kinematics, self.covariance_type)
+        if rank == 0 or report.errors() or self.plausibility == "error":
+            report.act(self.plausibility, stacklevel=3)
+        return Shown.of(episodes, kinematics)
+
+    def _examine_tick(self, now: Tensor, joints: Any, frames: Mapping[str, Frame]) -> None:
+        """Act on what is implausible about a control tick, on behalf of who asks for it."""
+        joints = self.kinematics_.joint_tensor(joints)
+        known = {name: frame for name, frame in frames.items() if name in self.frame_names_}
+        tick_report(now, joints, known, self.shown_, self.time_, self.kinematics_).act(
+            self.plausibility, stacklevel=3
+        )
 
     def _kinematics_for(
         self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]

@@ -18,6 +18,8 @@ __all__ = [
     "MissingLimitsWarning",
     "ModelFileError",
     "NotFittedError",
+    "PlausibilityError",
+    "PlausibilityWarning",
     "ShapeError",
     "TPGMMError",
     "UnknownNameError",
@@ -34,6 +36,10 @@ class DataError(TPGMMError, ValueError):
 
 class ShapeError(DataError):
     """An array has another shape than the one that is needed."""
+
+
+class PlausibilityError(DataError):
+    """Recordings or situations cannot be what they are taken for: units, order, clock."""
 
 
 class UnknownNameError(TPGMMError, KeyError):
@@ -91,3 +97,11 @@ class DegenerateComponentWarning(UserWarning):
 
 class MissingLimitsWarning(UserWarning):
     """A robot is described without limits that its motions could keep within."""
+
+
+class PlausibilityWarning(UserWarning):
+    """Recordings or situations are unlikely to be what they are taken for.
+
+    One for each call, with all that was found; each finding says what to do. Make errors of
+    them by ``strict=True`` or ``plausibility="error"``.
+    """

@@ -24,6 +24,8 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import fit_subsets
+from tpgmm_torch.plausibility.check import learning_report, summarize
+from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.training_rows import rows_in_memory, share_one_grid, typical_time
@@ -141,6 +143,9 @@ def fit_folds(
     )
     if twice or mixed or len(holds) != 1:
         return [model.fit(own) for model, own in zip(models, shown, strict=True)]
+    episodes = summarize(demonstrations, kinematics)
+    report = learning_report(episodes, operators, kinematics, estimator.covariance_type)
+    report.act(estimator.plausibility)
     [held] = holds
     learning = rows_in_memory(
         demonstrations,
@@ -163,9 +168,10 @@ def fit_folds(
         for model, fold, known in zip(models, chosen, moments, strict=True)
     ]
     fit_subsets(mixtures, rows, members, size, moments)
-    for model, mixture, own in zip(models, mixtures, shown, strict=True):
+    for model, mixture, own, fold in zip(models, mixtures, shown, chosen, strict=True):
         time = typical_time(own).to(learning.time)
         model.set_mixture(mixture, operators, kinematics, time, held)
+        model.shown_ = Shown.of([episodes[index] for index in fold], kinematics)
     return models
 
 

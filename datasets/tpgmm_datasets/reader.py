@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
@@ -18,6 +18,9 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.units import Unit, Units
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.plausibility.check import episodes_report, summarize
+from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Report
+from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 
@@ -34,11 +37,14 @@ class Recording:
         What a demonstration is made of.
     relax : collection of str
         Checks whose problems leave an episode out, and are warned of.
+    plausibility : {"warn", "error", "ignore"}
+        What is done about what is implausible.
     """
 
     episodes: tuple[Episode, ...]
     assembly: Assembly
     relax: Collection[str]
+    plausibility: str = "warn"
 
     def demonstrations(self) -> Iterator[Demonstration]:
         """Read the wanted episodes, one when it is asked for.
@@ -63,6 +69,23 @@ class Recording:
         finally:
             policy.warn()
 
+    def examine(self, demonstrations: Iterable[Demonstration]) -> Report:
+        """What is implausible about them; values that were declared raw may have any unit.
+
+        Parameters
+        ----------
+        demonstrations : iterable of Demonstration
+            Of this recording, at least one; none is kept.
+        """
+        robot = self.assembly.robot
+        known = robot if isinstance(robot, Kinematics) else None
+        episodes = [episode for d in demonstrations for episode in summarize([d], known)]
+        report = episodes_report(episodes, known)
+        joints = self.assembly.joints
+        raw = {n for n, u in zip(joints.names or (), joints.units, strict=False) if u == "raw"}
+        units = [f for f in report if f.check == "units" and set(f.names) <= raw]
+        return Report.of([f for f in report if f not in units], report.subject)
+
 
 def open_recording(
     path: str | Path,
@@ -78,6 +101,7 @@ def open_recording(
     rate: float | None = None,
     trim: float | None = None,
     relax: Collection[str] = (),
+    plausibility: str = "warn",
 ) -> Recording:
     """Check the metadata of a data set, and find out how to read it.
 
@@ -87,12 +111,16 @@ def open_recording(
         As for :func:`load_lerobot`.
     rate, trim, relax
         As for :func:`load_lerobot`.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        As for :func:`load_lerobot`.
 
     Raises
     ------
     DatasetError
         As :func:`load_lerobot`.
     """
+    if plausibility not in PLAUSIBILITY:
+        raise DatasetError(f"plausibility is one of {PLAUSIBILITY}, got {plausibility!r}")
     policy = Relaxed(relax)
     layout = open_layout(local_folder(path))
     for problem in layout.problems:
@@ -110,7 +138,8 @@ def open_recording(
         rate,
         trim,
     )
-    return Recording(tuple(select_episodes(layout, episodes)), assembly, policy.names)
+    chosen = tuple(select_episodes(layout, episodes))
+    return Recording(chosen, assembly, policy.names, plausibility)
 
 
 def _calibrated(
@@ -241,6 +270,10 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     relax : collection of str, default=()
         Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
         left out with a :class:`DatasetWarning`, those for one reason together.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        What is done about recordings that are unlikely to be what they are taken for
+        (:func:`tpgmm_torch.plausibility.check.check`): one warning, an error, or nothing.
+        What cannot be is an error unless ignored.
 
     Returns
     -------
@@ -252,6 +285,8 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     DatasetError
         With file, episode and column, if the set is incomplete or contradicts itself or the
         arguments.
+    PlausibilityError
+        If values cannot be what they are taken for.
 
     Examples
     --------
@@ -264,7 +299,10 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     >>> again.joint_names, again.joints[:, 0].tolist()
     (('elbow',), [0.0, 0.5, 1.0])
     """
-    return list(recording.demonstrations())
+    demonstrations = list(recording.demonstrations())
+    if demonstrations and recording.plausibility != "ignore":
+        recording.examine(demonstrations).act(recording.plausibility, stacklevel=3)
+    return demonstrations
 
 
 @opened_by(open_recording)
@@ -279,6 +317,8 @@ def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
         As for :func:`load_lerobot`.
     rate, trim, relax
         As for :func:`load_lerobot`.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        Of no effect here: ``fit`` looks at the episodes as they come.
 
     Yields
     ------

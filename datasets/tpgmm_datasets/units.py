@@ -12,6 +12,7 @@ import numpy as np
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.plausibility.joints import LARGEST_ANGLE, is_gripper
 
 __all__ = [
     "POSE_UNITS",
@@ -108,9 +109,6 @@ POSE_UNITS = ("m", "m", "m", "1", "1", "1", "1")
 Unit = str | Scale
 Units = Unit | Mapping[str, Unit]
 
-#: No joint is turned further than this [rad], and hardly any recording in degrees or
-#: normalised units stays below.
-LARGEST_ANGLE = 4 * math.pi
 #: Values that are normalised end at 100 up to this.
 ROUNDING = 0.5
 
@@ -187,15 +185,27 @@ def convert(
 def _check_angles(
     values: Array, names: Sequence[str], units: Sequence[Unit], column: str, where: Any
 ) -> None:
+    """Refuse "auto" where a value cannot be radians: the joints of a feature have one unit.
+
+    Grippers are of any unit, and say nothing of the others.
+    """
     low, high = values.min(axis=0), values.max(axis=0)
-    unsure = [
-        f"{name!r} (from {low[i]:.4g} to {high[i]:.4g}: {guess_unit(low[i], high[i])}?)"
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
-        if unit == "auto" and max(abs(low[i]), abs(high[i])) > LARGEST_ANGLE
+    auto = [i for i, unit in enumerate(units) if unit == "auto"]
+    large = [i for i in auto if max(abs(low[i]), abs(high[i])) > LARGEST_ANGLE]
+    others = [
+        f"{name!r} is said to be in {unit!r}"
+        for name, unit in zip(names, units, strict=True)
+        if not is_gripper(name)
+        and ((isinstance(unit, Scale) and unit.factor != 1) or unit == "deg")
     ]
+    told = [f"{names[i]!r} (from {low[i]:.4g} to {high[i]:.4g}" for i in range(len(names))]
+    unsure = [f"{told[i]}: {guess_unit(low[i], high[i])}?)" for i in large]
+    if others or not all(is_gripper(names[i]) for i in large):
+        unsure += [f"{told[i]}: not either)" for i in auto if i not in large]
     if unsure:
+        because = f", because {others[0]} and joints have one unit" if others else ""
         raise DatasetError(
-            f"these values are not radians: {', '.join(unsure)}. Say what they are, "
+            f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
             "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...}; "
             "'raw' takes them as they are",
             column=column,

@@ -31,7 +31,7 @@ __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 HYPERPARAMETERS = (
     "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
     "responsibilities", "fusion", "activation", "epsilon", "prior_std", "negligible", "blend",
-    "keep_limits", "random_state", "dtype",
+    "keep_limits", "plausibility", "random_state", "dtype",
 )  # fmt: skip
 
 CHOICES = {
@@ -110,6 +110,8 @@ class TPGMMConfig(StatePolicyConfig):
         with commas: ``"left_*,waist_yaw"``.
     n_steps : int, default=0
         T, the length of the time grid that was learned; 0 before a fit.
+    shown : dict, optional
+        What the demonstrations showed: a :class:`tpgmm_torch.plausibility.Shown` as JSON.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -188,6 +190,7 @@ class TPGMMConfig(StatePolicyConfig):
     negligible: float = 1e-9
     blend: float = 1.0
     keep_limits: bool = True
+    plausibility: str = "warn"
     random_state: int | None = None
     dtype: str = "float64"
 
@@ -198,6 +201,7 @@ class TPGMMConfig(StatePolicyConfig):
     joints: list[str] | str | None = None
     coordinates: list[str] = field(default_factory=list)
     n_steps: int = 0
+    shown: dict[str, Any] | None = None
 
     state_names: list[str] | None = None
     action_names: list[str] | None = None

@@ -30,6 +30,7 @@ from tpgmm_torch import Controller, TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.plausibility import Shown
 
 __all__ = ["TPGMMPolicy"]
 
@@ -185,6 +186,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
         )
         config.n_steps = len(time)
+        config.shown = None if model.shown_ is None else model.shown_.config()
         config.state_names = list(state_names or kinematics.joint_names)
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
@@ -205,7 +207,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         kinematics = self.kinematics.to(device=device)
         model = self.config.estimator(kinematics, list(self.operators))
         model.device = str(device)
-        return self.mixture.to_estimator(model)
+        model = self.mixture.to_estimator(model)
+        if self.config.shown is not None:
+            model.shown_ = Shown.from_config(self.config.shown)
+        return model
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""

@@ -104,7 +104,7 @@ def test_calibrated_values_are_angles_from_the_zero(zero, per_turn, stored):
 def test_units_have_names(unit, factor):
     assert as_scale(unit, "c") == Scale(factor)
     stored = np.array([[0.5, -2.0]])
-    converted = convert(stored, ("a", "b"), (unit, Scale(3.0, 1.0)), "c")
+    converted = convert(stored, ("a", "gripper"), (unit, Scale(3.0, 1.0)), "c")
     assert converted == pytest.approx(np.array([[0.5 * factor, -5.0]]))
 
 

@@ -60,7 +60,7 @@ def test_identity_over_lengths_names_and_rates(
     ]
     root = tmp_path_factory.mktemp("sets") / "set"
     save_lerobot(written, root, fps=fps, task="x", dtype="float64", file_megabytes=0.002)
-    for found, expected in zip(load_lerobot(root), written, strict=True):
+    for found, expected in zip(load_lerobot(root, plausibility="ignore"), written, strict=True):
         assert_same(found, expected, 1e-12)
 
 

@@ -92,6 +92,7 @@ def test_without_operators_and_robot_it_learns_the_joints():
     assert apart(trajectory.joints, wave(trajectory.time)) < 0.08  # 0.057 measured
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_grid_is_that_of_the_demonstration_of_median_duration():
     short, middle, long = (
         Demonstration(torch.linspace(0, end, 20), torch.rand(20, 1)) for end in (1.0, 2.0, 5.0)
@@ -133,6 +134,7 @@ def test_a_bottle_never_seen_is_grasped():
         assert float(turn) < np.radians(1)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_one_demonstration_has_the_responsibilities_of_its_points():
     one = waves(1)
     models = [canonical(responsibilities=r).fit(one) for r in ("auto", "instant", "point")]
@@ -359,6 +361,7 @@ def test_other_joint_names_are_refused():
     refused(lambda: model.predict(others[2:]), UnknownNameError, "joint 'c'", "'z'")
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_nameless_demonstrations_are_trusted_and_never_hide_an_order():
     nameless, [first] = waves(2, names=None), waves(1)
     turned = replace(first, joints=first.joints[:, [2, 1, 0]], joint_names=("c", "b", "a"))
@@ -456,6 +459,7 @@ BAD = {
     "blend": [-0.1],
     "keep_limits": ["yes", 2],
     "holds": ["often", 3],
+    "plausibility": ["loud", True],
     "random_state": ["seed", -1],
     "warm_start": ["no"],
     "dtype": ["float16", torch.float32],
@@ -477,6 +481,7 @@ def test_bad_parameters_are_refused_when_fitting(name, value):
 # Too little data
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_fewer_points_than_components_are_refused():
     few = [Demonstration(TIME[:5], wave(TIME[:5]))]
     refused(lambda: joints_only(n_components=6).fit(few), DataError, "6", "5")
@@ -490,6 +495,7 @@ def test_more_components_than_instants_are_reported_or_refused():
             joints_only(n_components=9).fit(few)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_one_instant_is_not_enough():
     one = [Demonstration(TIME[:1], wave(TIME[:1]))]
     with pytest.raises(ValueError, match="1 sample"):
@@ -558,6 +564,7 @@ def test_a_demonstration_s_own_time_is_not_taken_along():
     torch.testing.assert_close(found.joints, expected.joints, rtol=0, atol=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_what_lies_beyond_the_skill_is_held():
     longer = torch.cat((hands().time_, LAST + torch.tensor([0.1, 1.0, 10.0]).double()))
     [shown] = handlings(1)
@@ -659,6 +666,7 @@ SETTINGS = {
     "blend": 0.5,
     "keep_limits": False,
     "holds": None,
+    "plausibility": "error",
     "random_state": 1,
     "warm_start": True,
     "dtype": "float32",
@@ -742,6 +750,7 @@ def test_a_new_fit_replaces_the_old_model():
     assert torch.equal(a.joints, b.joints)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_number_of_components_is_searched():
     found = search({"n_components": np.arange(2, 7, 2)}).fit(handlings())
     scores = found.cv_results_["mean_test_score"]
@@ -750,6 +759,7 @@ def test_the_number_of_components_is_searched():
     assert len(found.best_estimator_.weights_) == found.best_params_["n_components"]
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_operators_are_searched_by_the_error_of_reproduction():
     choices = [[HANDLING[0], HANDLING[1]], [Canonical()]]
     found = search({"operators": choices}, scoring=reproduction_scorer).fit(handlings())
@@ -760,6 +770,7 @@ def test_operators_are_searched_by_the_error_of_reproduction():
 
 
 @pytest.mark.parametrize("scoring", [None, reproduction_scorer])
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_demonstrations_are_left_out_one_by_one(scoring):
     scores = cross_val_score(
         hands_model(), handlings(), cv=LeaveOneOut(), scoring=scoring, error_score="raise"
@@ -877,6 +888,7 @@ def test_a_start_elsewhere_blends_in_without_a_jump():
     torch.testing.assert_close(soft.joints[26:], hard.joints[26:])
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_references_keep_limits_of_position_and_speed():
     robot = JointSpace(skills.JOINT_NAMES)
     robot.lower, robot.upper = torch.tensor([-0.3] * 3), torch.tensor([0.8] * 3)
@@ -1078,6 +1090,7 @@ def test_holds_are_kept_and_models_of_before_have_none(tmp_path):
     assert before.holds_ == () and before.holds == "auto"
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_batches_are_held_like_the_first():
     whole = carrying_model()
     batches = [carries()[:5], carries()[5:]]

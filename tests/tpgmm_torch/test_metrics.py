@@ -209,6 +209,7 @@ def test_a_pose_scorer_is_minus_the_mean_error():
     assert clone(every, safe=False) == every
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_pose_scorer_serves_scikit_learn():
     shown = [replace(d, events={"close": 1.0}) for d in handlings(4)]
     scorer = make_scorer("right", "close")
@@ -224,6 +225,7 @@ def test_a_pose_scorer_serves_scikit_learn():
     )
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_scorers_of_a_pipeline_align_what_is_held_out():
     """The same skill at other speeds: apart on their own clocks, alike on the common one."""
     shown = [

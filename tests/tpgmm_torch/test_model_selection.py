@@ -83,6 +83,7 @@ def test_folds_of_two_hands(covariance_type):
     assert_as_alone(model, shown, trains(LEFT_OUT, shown))
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_folds_of_demonstrations_that_are_not_aligned():
     shown = unequal()
     model = canonical(n_components=4, random_state=0)
@@ -96,6 +97,7 @@ def test_several_starts_and_kmeans():
     assert_as_alone(model, shown, trains(KFold(2), shown))
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_they_are_learned_together(never_alone):
     for shown in (waves(4), unequal(4)):
         models = fit_folds(canonical(n_components=3), shown, trains(LEFT_OUT, shown))
@@ -109,12 +111,14 @@ def test_folds_of_which_only_one_shares_a_time_grid_are_as_alone():
     assert [model.mixture_.group_size for model in models] == [3, 1]
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_demonstration_that_counts_twice_does_so():
     shown = waves(4)
     models = assert_as_alone(canonical(random_state=0), shown, [[0, 1, 1], [0, 1, 2]])
     assert float((models[0].means_[0] - models[1].means_[0]).abs().max()) > 1e-3
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_one_demonstration_in_a_fold():
     shown = waves(3)
     assert_as_alone(canonical(n_components=3, random_state=0), shown, [[1], [0, 2]])
@@ -174,6 +178,7 @@ def test_folds_that_are_none_are_refused(fold, message):
         fit_folds(canonical(), waves(3), [[0, 1], fold])
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_errors_are_those_of_fit():
     with pytest.raises(DataError, match="operators is empty"):
         fit_folds(canonical(operators=[]), waves(3), [[0, 1]])

@@ -57,6 +57,7 @@ def fit(
     units: options.Units = None,
     joints: options.Joints = None,
     rate: options.Rate = None,
+    plausibility: options.Plausibility = "warn",
     alignment: options.AlignmentMethod = "dtw",
     batch_episodes: Annotated[
         int | None,
@@ -160,7 +161,9 @@ def fit(
     operators = [parse_operator(text) for text in operator or ()]
     given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
-    recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
+    recordings = options.recordings(
+        dataset, kinematics, frame, episodes, units, joints, rate, plausibility
+    )
     links = kinematics.links if kinematics is not None else ()
     state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)
     kept = 0 if state is None else state.n_iter()
@@ -183,6 +186,7 @@ def fit(
             activation=activation,
             epsilon=epsilon,
             blend=blend,
+            plausibility=plausibility,
         ).fit(data.source, checkpoint=state, processes=processes)
         durations, steps = data.summary(processes)
         if processes.rank > 0:

@@ -71,6 +71,13 @@ Joints = Annotated[
     ),
 ]
 Rate = Annotated[float | None, of_data("Resample to so many steps per second.", min=1e-3)]
+Plausibility = Annotated[
+    Literal["warn", "error", "ignore"],
+    of_data(
+        "What is done about recordings that are unlikely to be what they are taken for: "
+        "units, order, clock, outliers."
+    ),
+]
 AlignmentMethod = Annotated[
     Literal["dtw", "barycenter", "linear", "none"],
     of_data(
@@ -111,6 +118,7 @@ def recordings(
     units: Sequence[str] | None,
     joints: str | None,
     rate: float | None,
+    plausibility: str = "warn",
 ) -> plugins.Recordings:
     """The ``dataset`` of which the options say the rest, not yet read.
 
@@ -120,11 +128,12 @@ def recordings(
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, episodes, units, joints, rate
+    frames, episodes, units, joints, rate, plausibility
         The options as they were given.
     """
     reader = plugins.required(plugins.READERS, "lerobot")
-    opened: plugins.Recordings = reader(dataset, robot, frames, episodes, units, joints, rate)
+    given = frames, episodes, units, joints, rate, plausibility
+    opened: plugins.Recordings = reader(dataset, robot, *given)
     return opened
 
 

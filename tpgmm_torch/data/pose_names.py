@@ -44,7 +44,7 @@ def _groups(names: Sequence[str] | None, parts: tuple[str, ...]) -> dict[str, tu
     positions: Mapping[str, int] = {name: i for i, name in enumerate(names or ())}
     groups = {}
     for name in positions:
-        match = re.fullmatch(rf"(.*)([._]){parts[0]}", name)
+        match = re.fullmatch(rf"(.*)([._]){parts[0]}", name, re.DOTALL)
         if match:
             stem = match[1] + match[2]
             if all(stem + part in positions for part in parts):

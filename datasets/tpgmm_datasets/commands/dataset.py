@@ -51,11 +51,29 @@ def info(path: options.Dataset) -> None:
         typer.echo(f"problem: {problem}")
 
 
-@app.command(epilog="Example: tpgmm dataset check out/demo/dataset && tpgmm fit ...")
-def check(path: options.Dataset) -> None:
-    """List all problems of a data set; the exit code is 1 if there are any."""
+@app.command(epilog="Example: tpgmm dataset check arm --robot arm.urdf && tpgmm fit ...")
+def check(
+    path: options.Dataset,
+    robot: options.RobotFile = None,
+    link: options.Links = None,
+    robot_joint: options.RobotJoints = None,
+    coordinate: options.Coordinates = None,
+    frame: options.Frames = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Fail for what is only unlikely, too.")
+    ] = False,
+) -> None:
+    """List all problems of a data set, and what is implausible in it.
+
+    The exit code is 1 if there are problems or something cannot be: values beyond any limit of
+    the robot, for example. What is unlikely is listed; with --strict it fails too.
+    """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import summed_up
+    from tpgmm_datasets.errors import DatasetError, summed_up
+    from tpgmm_datasets.reader import open_recording
 
     description = describe_lerobot(path)
     for problem in summed_up(description.problems):
@@ -65,6 +83,18 @@ def check(path: options.Dataset) -> None:
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
+    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
+    recordings = Recordings(path, kinematics, frame, episodes, units, joints, None)
+    recording = open_recording(path, **recordings.options)
+    try:
+        report = recording.examine(recording.demonstrations())
+    except DatasetError as error:  # units that nobody said are no fault of the set
+        typer.echo(f"cannot say whether it is plausible: {error}")
+        raise typer.Exit(1 if strict else 0) from error
+    for finding in report:
+        typer.echo(f"{finding.severity}: {finding}")
+    if report.errors() or (strict and len(report)):
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: tpgmm dataset plot out/demo/dataset --out out/dataset.png")

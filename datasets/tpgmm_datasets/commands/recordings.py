@@ -36,7 +36,7 @@ class Recordings(plugins.Recordings):
     frames, episodes, units
         What :func:`parse_frames`, :func:`parse_episodes` and :func:`parse_units` take, or
         None.
-    joints, rate
+    joints, rate, plausibility
         As for :func:`tpgmm_datasets.load_lerobot`.
 
     Raises
@@ -54,6 +54,7 @@ class Recordings(plugins.Recordings):
         units: Sequence[str] | None,
         joints: str | None,
         rate: float | None,
+        plausibility: str = "warn",
     ) -> None:
         self.dataset = dataset
         self.options: dict[str, Any] = {
@@ -63,6 +64,7 @@ class Recordings(plugins.Recordings):
             **parse_units(units or ()),
             "joints": joints,
             "rate": rate,
+            "plausibility": plausibility,
         }
 
     def demonstrations(self) -> list[Demonstration]:

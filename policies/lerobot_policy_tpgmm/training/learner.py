@@ -178,6 +178,7 @@ class Learner:
             model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
             config.n_steps = len(mixture.time)
+            config.shown = None if model.shown_ is None else model.shown_.config()
             log.info(
                 "%d components fitted by %d steps of EM: the policy is trained",
                 config.n_components,

@@ -37,6 +37,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
         ("none", None),
     ],
 )
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_an_epoch_of_batches_is_what_the_estimator_learns(waves, alignment, aligner):
     demonstrations = load_lerobot(waves.root)
     if aligner is not None:
@@ -84,6 +85,7 @@ def said(caplog, data, n_epochs, **options):
     return losses, [record.getMessage() for record in caplog.records]
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplog, waves):
     losses, lines = said(caplog, waves, 2)
     frames = len(waves)
@@ -96,6 +98,7 @@ def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplo
     assert frames % 41 == 0 and np.mean(losses[3:]) == pytest.approx(float(printed), abs=2e-3)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_log_says_once_when_more_steps_are_of_little_use(caplog, waves):
     _, lines = said(caplog, waves, 5)
     [line] = [line for line in lines if "of little use" in line]
@@ -188,6 +191,7 @@ def test_too_few_steps_are_refused_with_the_number_needed(waves, tmp_path):
 # What is refused
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_frames_in_order_are_refused(waves):
     policy = fresh(waves, **WAVES)
     rows = torch.utils.data.default_collate([waves[i] for i in range(28)])

@@ -64,6 +64,7 @@ def test_gradients_equal_finite_differences(handlings, loss, fusion):
 # EM's solution
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_solution_of_em_is_stationary(waves, monkeypatch):
     options = {**WAVES, "alignment": "none", "responsibilities": "point"}
     policy = trained(waves, tol=1e-13, max_iter=5000, **options).train()
@@ -105,6 +106,7 @@ def train(policy, batches: list[dict], steps: int) -> list[float]:
     return values
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_likelihood_rises_where_em_stopped_early(waves):
     options = {**WAVES, "alignment": "none", "responsibilities": "point"}
     policy = fresh(waves, tol=10.0, optimizer_lr=1e-2, **options)

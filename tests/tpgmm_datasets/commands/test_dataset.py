@@ -9,11 +9,14 @@ import pytest
 
 from tests.support.command_line import output, refusal, run
 from tests.support.lerobot_sets import (
+    DATA,
     FPS,
     assert_equal,
     change_info,
+    change_table,
     in_data,
     joints_of,
+    set_column,
     to_v21,
     undeclared,
     write,
@@ -239,6 +242,28 @@ def test_check_lists_all_problems_and_fails(tmp_path):
     assert "episode 0" in line and "observation.state" in line
     assert line.endswith("(and 1 more like it: episode 1)")
     assert "problem: " in output("dataset", "info", tmp_path / "b")
+
+
+def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, generated):
+    robot = ("--robot", "upper_body", "--link", "l_hand")
+    text = output("dataset", "check", generated, *robot, "--strict")
+    assert text.splitlines() == ["no problems in 2 episodes, 261 rows"]
+    time = np.arange(10) / 10
+    shown = [Demonstration(time, np.sin(time + n)[:, None]) for n in range(3)]
+    root = save_lerobot([*shown, shown[0]], tmp_path / "copies", fps=10, task="t")
+    assert "unlikely: copies: " in output("dataset", "check", root)
+    assert run("dataset", "check", root, "--strict").exit_code == 1
+    undeclared(write_degrees(tmp_path / "degrees"), 1.0)
+    text = output("dataset", "check", tmp_path / "degrees")
+    assert "cannot say whether it is plausible: " in text and "not radians" in text
+    result = run("dataset", "check", tmp_path / "degrees", "--units", "rad", *robot)
+    assert result.exit_code == 2 and "is none of the values" in result.stderr
+
+
+def write_degrees(folder):
+    write(folder)
+    change_table(folder, DATA, lambda t: set_column(t, "observation.state", lambda x: 600 * x))
+    return folder
 
 
 def bad_set(folder, wrong):

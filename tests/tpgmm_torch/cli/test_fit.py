@@ -10,6 +10,9 @@ from tpgmm_torch import Demonstration, Hold, Poses, TaskParameterizedGMM
 from tpgmm_torch.cli.fit import fit as fit_command
 from tpgmm_torch.operators.text import default_operators, format_operator
 
+#: For two episodes, or episodes that are not aligned: no word about it.
+CALMLY = ("--plausibility", "ignore")
+
 
 def test_fit_saves_a_model_and_says_what_it_learned(fitted):
     folder, text = fitted
@@ -27,7 +30,7 @@ def test_fit_saves_a_model_and_says_what_it_learned(fitted):
 def test_fit_takes_operators_as_text(dataset, tmp_path):
     operators = ["position:l_hand@bottle + orientation:r_hand@l_hand", "canonical"]
     chosen = [word for text in operators for word in ("--operator", text)]
-    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear")
+    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear", *CALMLY)
     output("fit", dataset, *UPPER_BODY, *chosen, *few, "--out", tmp_path / "model")
     model = TaskParameterizedGMM.load(tmp_path / "model")
     assert [format_operator(operator) for operator in model.operators_] == operators
@@ -61,7 +64,7 @@ def test_fit_takes_holds_as_text(dataset, tmp_path):
 
 
 def test_fit_without_a_robot_learns_joints(dataset, tmp_path):
-    few = ("--n-components", 3, "--alignment", "none", "--rate", 5)
+    few = ("--n-components", 3, "--alignment", "none", "--rate", 5, *CALMLY)
     output("fit", dataset, *few, "--out", tmp_path / "model")
     model = TaskParameterizedGMM.load(tmp_path / "model")
     assert list(map(format_operator, model.operators_)) == ["canonical"]
@@ -103,9 +106,15 @@ def test_only_chosen_joints_move(dataset, tmp_path):
     assert "joint 'left_*' is not in the movable joints of the URDF" in line
 
 
+def test_implausible_recordings_are_refused_where_that_is_asked_for(dataset, tmp_path):
+    strictly = ("--plausibility", "error", "--alignment", "none", "--rate", 5)
+    line = refusal("fit", dataset, *strictly, "--n-components", 2, "--out", tmp_path / "model")
+    assert "alignment: the demonstrations last from 10." in line
+
+
 def test_a_file_in_the_way_is_left_alone(dataset, tmp_path):
     (tmp_path / "file").write_text("")
-    options = ("--n-components", 2, "--rate", 5, "--alignment", "none")
+    options = ("--n-components", 2, "--rate", 5, "--alignment", "none", *CALMLY)
     line = refusal("fit", dataset, *options, "--out", tmp_path / "file")
     assert "exists and is not a saved model" in line
 

@@ -57,6 +57,7 @@ def predicted(unit: float, **options: object) -> torch.Tensor:
     return trajectory.joints * unit
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_same_motion_in_millimetres_gives_the_same_prediction():
     torch.testing.assert_close(predicted(1e-3), predicted(1.0), rtol=0, atol=1e-9)
     # what is given joint by joint is in the joint's unit

@@ -49,6 +49,7 @@ def test_batches_give_the_model_of_the_list(responsibilities):
     assert one == pytest.approx(other, rel=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_uneven_demonstrations_are_learned_point_by_point_in_batches():
     parts = hands_model().fit(Batches(uneven()))
     assert parts.mixture_.group_size == 1
@@ -62,6 +63,7 @@ def test_joints_alone_and_float32_in_batches(dtype):
     assert_same(parts.fit(Batches(waves(), 1)), whole, 1e-9 if dtype == "float64" else 1e-4)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_signs_of_quaternions_follow_the_first_demonstration_of_all():
     flipped = [
         replace(d, frames={n: Frame(f.position, -f.orientation) for n, f in d.frames.items()})
@@ -71,6 +73,7 @@ def test_signs_of_quaternions_follow_the_first_demonstration_of_all():
     assert_same(hands_model().fit(Batches(mixed, 1)), hands_model().fit(mixed))
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_batches_are_read_once_and_may_come_from_a_generator():
     source = Batches(uneven())
     model = hands_model().fit(source)

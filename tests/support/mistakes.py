@@ -1,0 +1,807 @@
+"""Mistakes that people make with recordings and situations: a table to run through.
+
+Each is a function that does what they do, and a pattern of what they have to be told. The base
+is the paper's skill: aligned demonstrations, the upper body, and one bottle.
+"""
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tests.support import lerobot_sets as sets
+from tests.support.robot_zoo import G1_PATH
+from tests.support.skills import bottle_demonstrations, bottle_model, thinned
+from tests.support.worlds import upper_body
+from tpgmm_datasets import FramePose, LinkPose, Scale, load_lerobot, save_lerobot
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    Poses,
+    RelativePosition,
+    Robot,
+    Situation,
+    TaskParameterizedGMM,
+    quaternions,
+)
+
+__all__ = ["MISTAKES", "Mistake"]
+
+DEGREES = 180 / math.pi
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What people do, what kind of mistake it is, and what they are told."""
+
+    group: str
+    name: str
+    told: str
+    make: Callable[[Path], object]
+
+    def __str__(self) -> str:
+        return f"{self.group}-{self.name}"
+
+
+MISTAKES: list[Mistake] = []
+
+
+def mistake(group: str, told: str) -> Callable[[Callable[[Path], object]], object]:
+    """Enter a function into the table under its own name."""
+
+    def enter(function: Callable[[Path], object]) -> object:
+        MISTAKES.append(Mistake(group, function.__name__, told, function))
+        return function
+
+    return enter
+
+
+@cache
+def shown() -> tuple[Demonstration, ...]:
+    """Eight aligned demonstrations, at 5 steps a second."""
+    return tuple(
+        replace(thinned(item, 4), joint_names=upper_body().joint_names)
+        for item in bottle_demonstrations()[:8]
+    )
+
+
+@cache
+def fine() -> tuple[Demonstration, ...]:
+    """The same at 20 steps a second."""
+    names = upper_body().joint_names
+    return tuple(replace(item, joint_names=names) for item in bottle_demonstrations()[:8])
+
+
+def learn(demonstrations, operators=None, robot=None, **options):
+    robot = upper_body() if robot is None else robot
+    operators = bottle_operators() if operators is None else operators
+    model = TaskParameterizedGMM(2, operators, robot, tol=1e6, **options)
+    return model.fit(demonstrations)
+
+
+@cache
+def learned() -> TaskParameterizedGMM:
+    return bottle_model(4, tol=1e6, blend=0.5).fit(shown())
+
+
+def usual() -> Situation:
+    """A situation like those shown."""
+    return Situation(shown()[0].joints[0], shown()[1].frames)
+
+
+def predict(situation):
+    learned().set_params(blend=0.5)
+    return learned().predict([situation], candidates=False)
+
+
+def each(change, demonstrations=None):
+    return [change(item) for item in demonstrations or shown()]
+
+
+def one(change, index=2, demonstrations=None):
+    """Change one of them."""
+    items = list(demonstrations or shown())
+    items[index] = change(items[index])
+    return items
+
+
+def joints(factor=1.0, columns=slice(None), add=0.0):
+    def change(item):
+        values = item.joints.clone()
+        values[:, columns] = values[:, columns] * factor + add
+        return replace(item, joints=values)
+
+    return change
+
+
+def bottles(change):
+    """Change the frame of a demonstration or situation."""
+    return lambda item: replace(item, frames={"bottle": change(item.frames["bottle"])})
+
+
+def scaled(factor):
+    return bottles(lambda frame: Frame(frame.position * factor, frame.orientation))
+
+
+def moved(*shift):
+    shift = torch.tensor(shift, dtype=torch.float64)
+    return bottles(lambda frame: Frame(frame.position + shift, frame.orientation))
+
+
+def as_xyzw(frame):
+    return Frame(frame.position, frame.orientation.roll(-1, dims=-1))
+
+
+def timed(change):
+    return lambda item: replace(item, time=change(item.time))
+
+
+def unnamed(order):
+    return lambda item: replace(item, joints=item.joints[:, order], joint_names=None)
+
+
+def stored(folder, **options):
+    """A small LeRobot set, of which the units are not declared."""
+    root = folder / "set"
+    sets.write(root, **options)
+    sets.undeclared(root, 1.0)
+    return root
+
+
+def multiplied(root, factors):
+    change = lambda values: values * factors  # noqa: E731
+    sets.change_table(
+        root, sets.DATA, lambda t: sets.set_column(t, "observation.state", change)
+    )
+    return root
+
+
+# -- units ---------------------------------------------------------------------------------
+
+
+@mistake("units", r"units: .*cannot be.*degrees")
+def all_joints_in_degrees(_):
+    learn(each(joints(DEGREES)))
+
+
+@mistake("units", r"units: .*cannot be.*degrees")
+def one_joint_in_degrees(_):
+    learn(each(joints(DEGREES, 6)))
+
+
+@mistake("units", r"units: .*hardly are.*degrees")
+def degrees_without_a_robot(_):
+    TaskParameterizedGMM(2, [Canonical()], tol=1e6).fit(each(joints(DEGREES)))
+
+
+@mistake("units", r"units: .*cannot be")
+def joints_normalised_to_a_hundred(_):
+    learn(each(joints(60.0)))
+
+
+@mistake("units", r"units: .*cannot be")
+def joints_in_ticks(_):
+    learn(each(joints(4096 / math.tau, add=2048.0)))
+
+
+@mistake("units", r"units: .*'bottle'.*millimetres")
+def bottle_in_millimetres(_):
+    learn(each(scaled(1000.0)))
+
+
+@mistake("units", r"units: .*'bottle'.*centimetres")
+def bottle_in_centimetres(_):
+    learn(each(scaled(100.0)))
+
+
+@mistake("units", r"units: .*millimetres")
+def hands_in_millimetres(_):
+    poses = Poses(("hand",))
+    time = np.linspace(0, 2, 40)
+    items = []
+    for n in range(5):
+        path = np.stack((300 + 90 * np.sin(time + n), 200 * time, 100 + 0 * time), axis=1)
+        turn = np.tile([1.0, 0, 0, 0], (40, 1))
+        frame = {"cup": Frame([0.3, 0.1 * n, 0.1])}
+        items.append(Demonstration(time, np.hstack((path, turn)), frame, poses.joint_names))
+    learn(items, [RelativePosition("hand", "cup")], poses)
+
+
+@mistake("units", r"limits: .*beyond")
+def offsets_of_six_radians(_):
+    learn(each(joints(add=4.0, columns=4)))
+
+
+@mistake("units", r"units: .*start posture.*degrees")
+def start_posture_in_degrees(_):
+    predict(replace(usual(), joints=usual().joints * DEGREES))
+
+
+@mistake("units", r"place: bottle: x = \d+\.?\d* m, shown")
+def new_bottle_in_millimetres(_):
+    predict(scaled(1000.0)(usual()))
+
+
+@mistake("units", r"place: bottle: x = \d+\.?\d* m, shown")
+def new_bottle_in_centimetres(_):
+    predict(scaled(100.0)(usual()))
+
+
+@mistake("units", r"not radians: .*'left_elbow'.*'right_elbow'")
+def a_set_in_degrees(folder):
+    load_lerobot(multiplied(stored(folder), 600.0))
+
+
+@mistake("units", r"(not radians|undecided).*right_elbow")
+def a_set_in_degrees_of_which_one_joint_is_quiet(folder):
+    root = multiplied(stored(folder), [100.0, 1.0, 1.0])
+    load_lerobot(root, units={"left_elbow": "deg"})
+
+
+@mistake("units", r"(not radians|undecided).*right_elbow")
+def a_calibrated_set_of_which_one_joint_is_quiet(folder):
+    root = multiplied(stored(folder), [100.0, 1.0, 1.0])
+    load_lerobot(root, units={"left_elbow": Scale.calibrated(1000, 3000)})
+
+
+@mistake("units", r"unit 'degree' is unknown")
+def a_misspelt_unit(folder):
+    load_lerobot(stored(folder), units="degree")
+
+
+@mistake("units", r"units: .*millimetres")
+def a_set_with_its_bottle_in_millimetres(folder):
+    demonstrations = [
+        replace(sets.demonstration(n, 12), frames={"bottle": Frame([300.0 + 20 * n, 90, 40])})
+        for n in range(4)
+    ]
+    save_lerobot(demonstrations, folder / "set", fps=50, task="reach")
+    load_lerobot(folder / "set")
+
+
+# -- time ----------------------------------------------------------------------------------
+
+
+@mistake("time", r"time: .*milliseconds")
+def time_in_milliseconds(_):
+    learn(each(timed(lambda time: 1000 * time)))
+
+
+@mistake("time", r"time: .*numbers of frames")
+def frame_numbers_for_time(_):
+    learn(each(timed(lambda time: torch.arange(len(time), dtype=torch.float64))))
+
+
+@mistake("time", r"time: .*another unit")
+def time_in_days(_):
+    learn(each(lambda item: replace(item, time=item.time / 86400, events={}), fine()))
+
+
+@mistake("time", r"speed: .*faster than the robot")
+def time_in_minutes(_):
+    learn(each(timed(lambda time: time / 60)))
+
+
+@mistake("time", r"(time|durations|alignment): ")
+def one_recording_in_milliseconds(_):
+    learn(one(timed(lambda time: 1000 * time)))
+
+
+@mistake("time", r"alignment: .*begin at different times")
+def clocks_that_do_not_begin_together(_):
+    learn([timed(lambda t, n=n: t + 30.0 * n)(item) for n, item in enumerate(shown())])
+
+
+@mistake("time", r"time must increase strictly")
+def time_that_goes_back(_):
+    one(timed(lambda time: time.flip(0)))
+
+
+@mistake("time", r"time must increase strictly")
+def a_time_twice(_):
+    one(timed(lambda time: torch.cat((time[:5], time[4:-1]))))
+
+
+@mistake("time", r"gaps: nothing was recorded for")
+def a_hole_in_a_recording(_):
+    def cut(item):
+        keep = torch.cat((torch.arange(20), torch.arange(120, len(item))))
+        return replace(item, time=item.time[keep], joints=item.joints[keep])
+
+    learn(one(cut, demonstrations=fine()))
+
+
+@mistake("time", r"(time|place|.*)references are wanted")
+def a_new_situation_in_milliseconds(_):
+    predict(replace(usual(), time=1000 * shown()[0].time))
+
+
+@mistake("time", r"time: references are wanted from 4000")
+def a_tick_in_milliseconds(_):
+    model = bottle_model(4, tol=1e6).fit(shown())
+    model.step(4000.0, usual().joints, usual().frames)
+
+
+@mistake("time", r"outside the demonstration")
+def an_event_in_milliseconds(_):
+    replace(shown()[0], events={"grasp": 4200.0})
+
+
+# -- lengths -------------------------------------------------------------------------------
+
+
+@mistake("lengths", r"alignment: .*last from")
+def unequal_lengths_without_alignment(_):
+    learn([timed(lambda t, n=n: t * (1 + n / 20))(d) for n, d in enumerate(shown())])
+
+
+@mistake("lengths", r"freedom: one demonstration")
+def a_single_demonstration(_):
+    learn(shown()[:1])
+
+
+@mistake("lengths", r"freedom: two demonstrations")
+def two_demonstrations(_):
+    learn(shown()[:2])
+
+
+@mistake("lengths", r"copies: .*demonstration 1 is a copy of 0")
+def copies_of_one_demonstration(_):
+    learn([shown()[0], *shown()])
+
+
+@mistake("lengths", r"durations: .*demonstration 2")
+def a_recording_that_ran_on(_):
+    learn(one(timed(lambda time: 4 * time)))
+
+
+@mistake("lengths", r"joints has shape \(T, n_joints\) with T")
+def fewer_times_than_postures(_):
+    Demonstration(shown()[0].time[:-1], shown()[0].joints)
+
+
+@mistake("lengths", r"frame 'bottle' has leading shape")
+def fewer_poses_than_postures(_):
+    bottles(lambda frame: frame.expand((7,)))(shown()[0])
+
+
+@mistake("lengths", r"at least one demonstration")
+def no_demonstrations(_):
+    learn([])
+
+
+@mistake("lengths", r"expected a list of demonstrations, got one")
+def a_demonstration_that_is_no_list(_):
+    learn(shown()[0])
+
+
+# -- order ---------------------------------------------------------------------------------
+
+
+@mistake("order", r"order: the joints are unnamed.*limits")
+def unnamed_joints_arms_exchanged(_):
+    order = [0, 1, 2, *range(10, 17), *range(3, 10)]
+    learn(each(unnamed(order)))
+
+
+@mistake("order", r"(order|limits): .*limits")
+def unnamed_joints_reversed(_):
+    learn(each(unnamed(list(range(16, -1, -1)))))
+
+
+@mistake("order", r"(order|limits|episodes): ")
+def two_columns_exchanged_in_one_demonstration(_):
+    order = list(range(17))
+    order[4], order[6] = 6, 4
+    learn(one(lambda d: replace(d, joints=d.joints[:, order])))
+
+
+@mistake("order", r"(order|limits|start): ")
+def start_posture_in_another_order(_):
+    predict(replace(usual(), joints=usual().joints.flip(0)))
+
+
+@mistake("order", r"joints has shape|joint_names needs")
+def joints_transposed(_):
+    Demonstration(shown()[0].time, shown()[0].joints.T)
+
+
+@mistake("order", r"frames: frame 'bottle'.*demonstration 2")
+def x_and_z_exchanged_in_one_demonstration(_):
+    flip = bottles(lambda f: Frame(f.position.flip(0) + f.position.new_tensor([0, 0, 0]), None))
+    learn(one(lambda d: flip(moved(0.0, 0.0, 0.0)(scaled(3.0)(d)))))
+
+
+@mistake("order", r"place: bottle")
+def x_and_y_exchanged_in_a_situation(_):
+    predict(bottles(lambda f: Frame(f.position[[1, 0, 2]], f.orientation))(usual()))
+
+
+@mistake("order", r"place: (cup|plate)")
+def frames_exchanged_in_a_situation(_):
+    frames = {"cup": Frame([0.6, 0, 0]), "plate": Frame([0, 0, 0])}
+    start = torch.tensor([0, 0, 0, 1.0, 0, 0, 0], dtype=torch.float64)
+    two_frames().predict([Situation(start, frames)], candidates=False)
+
+
+@mistake("order", r"frames: .*demonstration 3")
+def frames_exchanged_in_one_demonstration(_):
+    items = list(two_frame_demonstrations())
+    frames = items[3].frames
+    items[3] = replace(items[3], frames={"cup": frames["plate"], "plate": frames["cup"]})
+    learn(items, FROM_TWO_FRAMES, Poses(("hand",)))
+
+
+FROM_TWO_FRAMES = [RelativePosition("hand", "cup"), RelativePosition("hand", "plate")]
+
+
+def two_frame_demonstrations():
+    """A hand goes from the cup to the plate."""
+    time = np.linspace(0, 2, 40)
+    rng = np.random.default_rng(0)
+    for _ in range(6):
+        cup = rng.uniform(-0.05, 0.05, 3)
+        plate = rng.uniform([0.55, -0.05, -0.05], [0.65, 0.05, 0.05])
+        share = (1 - np.cos(np.pi * time / 2))[:, None] / 2
+        path = np.hstack((cup + share * (plate - cup), np.tile([1.0, 0, 0, 0], (40, 1))))
+        names = Poses(("hand",)).joint_names
+        yield Demonstration(time, path, {"cup": Frame(cup), "plate": Frame(plate)}, names)
+
+
+@cache
+def two_frames():
+    return learn(list(two_frame_demonstrations()), FROM_TWO_FRAMES, Poses(("hand",)))
+
+
+# -- names ---------------------------------------------------------------------------------
+
+
+@mistake("names", r"'cup' .*\['bottle'\]")
+def an_operator_on_a_frame_that_is_not_there(_):
+    learn(shown(), [RelativePosition("l_hand", "cup")])
+
+
+@mistake("names", r"'left_hand' .*l_hand")
+def an_operator_on_a_link_that_is_not_there(_):
+    learn(shown(), [RelativePosition("left_hand", "bottle")])
+
+
+@mistake("names", r"'bottle'.*\['flask'\]")
+def a_situation_with_another_name(_):
+    predict(replace(usual(), frames={"flask": usual().frames["bottle"]}))
+
+
+@mistake("names", r"joint .* is not in the demonstration")
+def joints_of_another_robot(_):
+    names = tuple(f"j{n}" for n in range(17))
+    learn(each(lambda item: replace(item, joint_names=names)))
+
+
+@mistake("names", r"joint_names needs 17 different names")
+def a_joint_named_twice(_):
+    names = upper_body().joint_names
+    replace(shown()[0], joint_names=(names[0], *names[:-1]))
+
+
+@mistake("names", r"demonstration 2 has frames \['cup'\]")
+def another_frame_in_one_demonstration(_):
+    learn(one(lambda d: replace(d, frames={"cup": d.frames["bottle"]})))
+
+
+@mistake("names", r"link 'hand' is not in the URDF")
+def a_robot_without_that_link(_):
+    Robot.from_urdf(G1_PATH, ["hand"])
+
+
+@mistake("names", r"event 'close' is not in the demonstration")
+def a_frame_at_an_event_that_is_not_there(folder):
+    root = folder / "set"
+    items = [replace(sets.demonstration(0, 12), events={})]
+    save_lerobot(items, root, fps=50, task="reach")
+    robot = sets.Arm("left_elbow", "right_elbow")
+    load_lerobot(root, robot=robot, frames={"cup": LinkPose("hand", "close")})
+
+
+# -- quaternions ---------------------------------------------------------------------------
+
+
+@mistake("quaternions", r"quaternions: .*\(x, y, z, w\)")
+def quaternions_with_w_last(_):
+    learn(each(bottles(as_xyzw)))
+
+
+@mistake("quaternions", r"frames: .*turned.*demonstration 2.*\(w, x, y, z\)")
+def quaternions_with_w_last_in_one_demonstration(_):
+    learn(one(bottles(as_xyzw)))
+
+
+@mistake("quaternions", r"turn: bottle: .*Read as \(x, y, z, w\)")
+def quaternion_of_a_situation_with_w_last(_):
+    predict(bottles(as_xyzw)(usual()))
+
+
+@mistake("quaternions", r"unit quaternion")
+def a_quaternion_of_zeros(_):
+    Frame([0.3, 0, 0.1], [0, 0, 0, 0])
+
+
+@mistake("quaternions", r"unit quaternion")
+def a_quaternion_that_is_no_unit(_):
+    Frame([0.3, 0, 0.1], [0.9, 0.3, 0.3, 0.3])
+
+
+@mistake("quaternions", r"orientation\s+of shape")
+def euler_angles_for_a_quaternion(_):
+    Frame([0.3, 0, 0.1], [0.1, 0.2, 0.3])
+
+
+@mistake("quaternions", r"orientation\s+of shape")
+def a_matrix_for_a_quaternion(_):
+    Frame([0.3, 0, 0.1], np.eye(3))
+
+
+@mistake("quaternions", r"turn: bottle: turned by 90 deg")
+def a_bottle_lying_down(_):
+    half = quaternions.exp(torch.tensor([math.pi / 2, 0, 0], dtype=torch.float64))
+    predict(bottles(lambda f: Frame(f.position, half))(usual()))
+
+
+@mistake("quaternions", r"norm of a quaternion is off")
+def columns_of_a_pose_one_off(folder):
+    root = folder / "set"
+    sets.write(root)
+    pose = FramePose("observation.environment_state", columns=[1, 2, 3, 4, 5, 6, 0])
+    load_lerobot(root, frames={"bottle": pose})
+
+
+# -- frames --------------------------------------------------------------------------------
+
+
+@mistake("frames", r"frames: .*demonstration 2 \(0, 0, 0\)")
+def a_tracker_that_lost_the_bottle(_):
+    learn(one(scaled(0.0)))
+
+
+@mistake("frames", r"frames: .*demonstration 2")
+def another_base_in_one_demonstration(_):
+    learn(one(moved(0.0, 0.8, 0.0)))
+
+
+@mistake("frames", r"frames: frame 'bottle' jumps .*demonstration 2")
+def a_tracker_that_jumps(_):
+    def jumping(item):
+        frame = item.frames["bottle"].expand((len(item),))
+        position = frame.position.clone()
+        position[100:103] += 0.5
+        return replace(item, frames={"bottle": Frame(position, frame.orientation)})
+
+    learn(one(jumping, demonstrations=fine()))
+
+
+@mistake("frames", r"place: bottle: z = 0\.35 m, shown 0\.1")
+def a_bottle_far_above_those_shown(_):
+    position = [*usual().frames["bottle"].position[:2].tolist(), 0.35]
+    predict(bottles(lambda f: Frame(position, f.orientation))(usual()))
+
+
+@mistake("frames", r"place: bottle: x = -0\.28")
+def a_bottle_behind_the_robot(_):
+    position = [-0.28, 0.0, 0.15]
+    predict(bottles(lambda f: Frame(position, f.orientation))(usual()))
+
+
+@mistake("frames", r"NaN or infinite")
+def a_bottle_that_is_nowhere(_):
+    Frame([0.3, math.nan, 0.1])
+
+
+@mistake("frames", r"place: bottle: y = 1")
+def a_tick_with_the_bottle_elsewhere(_):
+    model = bottle_model(4, tol=1e6).fit(shown())
+    model.step(1.0, usual().joints, moved(0.0, 1.0, 0.0)(usual()).frames)
+
+
+# -- values --------------------------------------------------------------------------------
+
+
+@mistake("values", r"wraps: .*whole turn.*demonstration 2")
+def angles_that_wrap(_):
+    def wrap(item):
+        values = item.joints.clone()
+        values[120:, 3] -= math.tau
+        return replace(item, joints=values)
+
+    learn(one(wrap, demonstrations=fine()))
+
+
+@mistake("values", r"jumps: .*demonstration 2")
+def a_value_that_was_lost(_):
+    def spoil(item):
+        values = item.joints.clone()
+        values[130, 5] += 0.6
+        return replace(item, joints=values)
+
+    learn(one(spoil, demonstrations=fine()))
+
+
+@mistake("values", r"clipped: .*stop dead")
+def values_that_were_clipped(_):
+    def clip(item):
+        values = item.joints.clone()
+        for joint in (3, 10):
+            high = torch.quantile(values[:, joint], 0.85)
+            values[:, joint] = values[:, joint].clamp(max=float(high))
+        return replace(item, joints=values)
+
+    learn(each(clip, fine()))
+
+
+@mistake("values", r"stuck: .*demonstration 2")
+def a_sensor_that_is_stuck(_):
+    learn(one(lambda d: joints(0.0, 3, float(d.joints[0, 3]))(d), demonstrations=fine()))
+
+
+@mistake("values", r"stuck: .*demonstration 2")
+def a_sensor_that_freezes_half_way(_):
+    def freeze(item):
+        values = item.joints.clone()
+        values[80:200, 3] = values[80, 3]
+        return replace(item, joints=values)
+
+    learn(one(freeze, demonstrations=fine()))
+
+
+@mistake("values", r"episodes: .*demonstration 2")
+def another_skill_among_them(_):
+    learn(one(lambda d: replace(d, joints=d.joints.flip(0) + 0.9 * torch.sin(d.time)[:, None])))
+
+
+@mistake("values", r"start: start posture: .*shown")
+def a_start_far_from_those_shown(_):
+    start = usual().joints.clone()
+    start[4] += 1.5
+    predict(replace(usual(), joints=start))
+
+
+@mistake("values", r"NaN or infinite")
+def a_posture_that_is_not_a_number(_):
+    joints(float("nan"))(shown()[0])
+
+
+@mistake("values", r"events: .*'grasp' at 0%.*demonstration")
+def events_at_the_beginning(_):
+    items = [replace(d, events={"grasp": 4.0 + 0.1 * n}) for n, d in enumerate(shown())]
+    learn(one(lambda d: replace(d, events={"grasp": float(d.time[0])}), demonstrations=items))
+
+
+@mistake("values", r"events: .*'grasp' at .*demonstration 2, usually")
+def an_event_that_is_not_like_the_others(_):
+    items = [replace(d, events={"grasp": 4.0 + 0.1 * n}) for n, d in enumerate(shown())]
+    learn(one(lambda d: replace(d, events={"grasp": 11.0}), demonstrations=items))
+
+
+@mistake("values", r"events: .*'grasp' comes before 'lift'.*2")
+def events_in_another_order(_):
+    items = [replace(d, events={"grasp": 4.0, "lift": 4.5}) for d in shown()]
+    learn(one(lambda d: replace(d, events={"grasp": 4.5, "lift": 4.0}), demonstrations=items))
+
+
+@mistake("values", r"events: .*'grasp' missing in 2")
+def an_event_that_is_missing(_):
+    items = [replace(d, events={"grasp": 4.0}) for d in shown()]
+    learn(one(lambda d: replace(d, events={}), demonstrations=items))
+
+
+# -- shapes --------------------------------------------------------------------------------
+
+
+@mistake("shapes", r"joints has shape \(T, n_joints\)")
+def a_flat_list_of_joints(_):
+    Demonstration([0.0, 0.1], [0.0, 1.0])
+
+
+@mistake("shapes", r"position has shape \(\.\.\., 3\)")
+def a_position_in_the_plane(_):
+    Frame([0.3, 0.1])
+
+
+@mistake("shapes", r"has shape \(n_joints,\)")
+def a_path_for_a_start(_):
+    Situation(shown()[0].joints)
+
+
+@mistake("shapes", r"has 16 joints, the model has 17")
+def a_start_without_one_joint(_):
+    predict(replace(usual(), joints=usual().joints[:-1]))
+
+
+@mistake("shapes", r"expected a list of Demonstration, item 0 is ndarray")
+def arrays_for_demonstrations(_):
+    learn([d.joints.numpy() for d in shown()])
+
+
+@mistake("shapes", r"demonstration 2 has 16 joints")
+def one_demonstration_without_a_joint(_):
+    learn(one(lambda d: Demonstration(d.time, d.joints[:, :-1], d.frames)))
+
+
+@mistake("shapes", r"predict takes .*Situation")
+def frames_for_situations(_):
+    learned().predict([usual().frames["bottle"]])
+
+
+# -- files ---------------------------------------------------------------------------------
+
+
+@mistake("files", r"info\.json")
+def a_folder_that_is_no_set(folder):
+    (folder / "set").mkdir()
+    load_lerobot(folder / "set")
+
+
+@mistake("files", r"file-000\.parquet")
+def a_file_that_is_cut_off(folder):
+    root = stored(folder)
+    path = root / sets.DATA
+    path.write_bytes(path.read_bytes()[:-500])
+    load_lerobot(root)
+
+
+@mistake("files", r"file-000\.parquet.*(missing|absent|not there|does not exist)")
+def a_file_that_is_missing(folder):
+    root = stored(folder)
+    (root / sets.DATA).unlink()
+    load_lerobot(root)
+
+
+@mistake("files", r"NaN")
+def a_column_with_holes(folder):
+    root = stored(folder)
+    sets.in_data("observation.state", sets.spoil(4, 1, math.nan))(root)
+    load_lerobot(root)
+
+
+@mistake("files", r"increase|time")
+def rows_of_one_time(folder):
+    root = stored(folder)
+    sets.in_data("timestamp", sets.stuck)(root)
+    load_lerobot(root)
+
+
+@mistake("files", r"joints=")
+def a_set_without_a_state(folder):
+    root = stored(folder)
+
+    def rename(info):
+        info["features"]["poses"] = info["features"].pop("observation.state")
+        info["features"].pop("action", None)
+
+    sets.change_info(root, rename)
+    load_lerobot(root)
+
+
+@mistake("files", r"is missing|not a saved")
+def a_model_that_is_not_there(folder):
+    TaskParameterizedGMM.load(folder / "model")
+
+
+@mistake("files", r"changed after it was saved")
+def a_model_that_was_edited(folder):
+    learned().save(folder / "model")
+    path = folder / "model" / "config.json"
+    config = json.loads(path.read_text())
+    config["parameters"]["blend"] = 3.0
+    path.write_text(json.dumps(config))
+    TaskParameterizedGMM.load(folder / "model")
+
+
+@mistake("files", r"robot\.urdf")
+def a_robot_that_is_not_there(folder):
+    Robot.from_urdf(folder / "robot.urdf", ["hand"])

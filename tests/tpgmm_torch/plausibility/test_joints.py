@@ -1,0 +1,78 @@
+"""Units, order and limits of joint vectors, with the names and numbers that are said."""
+
+import numpy as np
+import pytest
+import torch
+
+from tpgmm_torch import Demonstration
+from tpgmm_torch.plausibility.check import summarize
+from tpgmm_torch.plausibility.joints import check_joints, is_gripper
+from tpgmm_torch.robots.joint_space import JointSpace
+
+TIME = np.arange(100) / 50
+
+
+def bounded(*limits, names=None, velocity=3.0):
+    """Joints alone, with these limits."""
+    robot = JointSpace(names or tuple(f"j{i}" for i in range(len(limits))))
+    robot.lower, robot.upper = torch.tensor(limits, dtype=torch.float64).T
+    robot.velocity = torch.full((len(limits),), velocity, dtype=torch.float64)
+    return robot
+
+
+def found(robot, *scales, names=None, offset=0.0):
+    path = np.sin(np.pi * TIME / 2)[:, None] * np.array(scales) + offset
+    items = [Demonstration(TIME, path + 0.01 * n, joint_names=names) for n in range(4)]
+    return list(check_joints(summarize(items, robot), robot))
+
+
+def test_joints_within_their_limits_are_plausible():
+    assert found(bounded((-1, 1), (-0.1, 2)), 0.9, 1.5) == []
+    assert found(None, 0.9, 12.0) == []
+
+
+def test_one_joint_in_degrees_condemns_the_feature():
+    [finding] = found(bounded((-1, 1), (-1, 1)), 50.0, 0.5)
+    assert (finding.check, finding.severity, finding.names) == ("units", "error", ("j0",))
+    assert (
+        finding.value == pytest.approx(49, abs=0.1) and "whole joint vector" in finding.remedy
+    )
+
+
+def test_a_little_beyond_is_nothing_and_more_is_named():
+    robot = bounded((-1, 1), (-1, 1))
+    assert found(robot, 0.99, 0.5) == []
+    [finding] = found(robot, 1.4, 0.5)
+    assert (finding.check, finding.severity) == ("limits", "unlikely")
+    assert "'j0' from 0 to 1.43, limits -1 to 1" in finding.message
+
+
+def test_an_order_that_fits_is_named_only_for_joints_without_names():
+    robot = bounded((-0.1, 0.5), (-0.1, 2.0))
+    [finding] = found(robot, 1.5, 0.3)
+    assert finding.check == "order" and "the columns [1, 0]" in finding.message
+    [finding] = found(robot, 1.5, 0.3, names=robot.joint_names)
+    assert finding.check == "limits"
+
+
+def test_speeds_beyond_the_robot_are_named_with_the_limit():
+    [finding] = found(bounded((-2, 2), velocity=0.5), 1.5)
+    assert finding.check == "speed" and finding.episodes == (0, 1, 2, 3)
+    assert finding.value == pytest.approx(1.5 * np.pi / 2 / 0.5, rel=1e-2)
+
+
+def test_grippers_may_be_in_any_unit():
+    assert found(None, 0.9, 100.0, names=("elbow", "gripper.pos")) == []
+    [finding] = found(None, 0.9, 100.0, names=("elbow", "wrist.pos"))
+    assert finding.names == ("wrist.pos",)
+    assert is_gripper("kLeftHandPinky") and is_gripper("left_finger_1")
+    assert not is_gripper("left_hand_yaw") and not is_gripper("shoulder_pan.pos")
+
+
+def test_what_is_stuck_needs_others_that_move():
+    path = np.sin(TIME)[:, None]
+    items = [Demonstration(TIME, np.hstack((path, path * (n != 2)))) for n in range(5)]
+    [finding] = check_joints(summarize(items, None), None)
+    assert (finding.check, finding.episodes, finding.names) == ("stuck", (2,), ("joint 1",))
+    idle = [Demonstration(TIME, np.hstack((path, 0 * path))) for _ in range(5)]
+    assert list(check_joints(summarize(idle, None), None)) == []

@@ -1,0 +1,116 @@
+"""Whether demonstrations are of one skill, each its own, and enough for what is learned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.plausibility.findings import Finding, listed
+from tpgmm_torch.plausibility.outliers import outliers
+from tpgmm_torch.plausibility.summaries import EpisodeSummary
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["check_freedom", "check_likeness"]
+
+#: Paths that differ by less of the joints' ranges, on average, are like each other.
+LIKE = 0.5
+#: Joints that hardly move are compared by this range [rad or m].
+SMALLEST_RANGE = 0.2
+
+
+def check_likeness(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
+    """Copies, and episodes whose path is not like the others.
+
+    Parameters
+    ----------
+    episodes : sequence of EpisodeSummary
+
+    Yields
+    ------
+    Finding
+    """
+    first: dict[str, int] = {}
+    pairs = []
+    for index, episode in enumerate(episodes):
+        if index != first.setdefault(episode.digest, index) and np.ptp(episode.path) > 0:
+            pairs.append((index, first[episode.digest]))
+    if pairs:
+        places = [f"demonstration {b} is a copy of {a}" for b, a in pairs]
+        yield Finding(
+            "copies",
+            "unlikely",
+            f"some were recorded once and counted twice: {listed(places)}",
+            "Leave the copies out: they make the model more certain than it may be",
+            episodes=tuple(b for b, _ in pairs),
+        )
+    if len(episodes) < 5:
+        return
+    paths = np.stack([e.path for e in episodes])
+    middle = np.median(paths, axis=0)
+    scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
+    distances = np.sqrt((((paths - middle) / scale) ** 2).mean(axis=(1, 2)))
+    odd = [i for i in outliers(distances, floor=LIKE) if distances[i] > np.median(distances)]
+    if odd:
+        joints = np.sqrt((((paths - middle) / scale) ** 2).mean(axis=1))
+        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
+        places = [
+            f"demonstration {i} by {distances[i]:.2g} (most {names[joints[i].argmax()]!r})"
+            for i in odd
+        ]
+        yield Finding(
+            "episodes",
+            "unlikely",
+            "paths differ from the median path, in ranges of the joints, by about "
+            f"{np.median(distances):.2g}, but {listed(places)}",
+            "Is it the same skill, with the columns in the same order and unit? Leave it out",
+            tuple(dict.fromkeys(names[joints[i].argmax()] for i in odd)),
+            tuple(odd),
+            float(distances[odd[0]]),
+        )
+
+
+def check_freedom(
+    n_demonstrations: int,
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    covariance_type: str,
+) -> Iterator[Finding]:
+    """Fewer demonstrations than it takes to tell what varies together from what does not.
+
+    Parameters
+    ----------
+    n_demonstrations : int
+    operators : sequence of Operator
+        What is learned.
+    kinematics : Kinematics
+        What they act on.
+    covariance_type : str
+        As of the estimator.
+
+    Yields
+    ------
+    Finding
+    """
+    widest = max(operator.dimension(kinematics) for operator in operators)
+    full = covariance_type in ("full", "tied") and widest > 2
+    if n_demonstrations == 1:
+        yield Finding(
+            "freedom",
+            "unlikely",
+            "one demonstration does not show what may vary: every covariance is of its path "
+            "alone",
+            "Show the skill again from other starts and places, 5 times or more",
+            value=1.0,
+        )
+    elif n_demonstrations == 2 and full and frame_names(operators, kinematics):
+        yield Finding(
+            "freedom",
+            "unlikely",
+            f"two demonstrations differ in one direction, and the covariances of {widest} "
+            "coordinates would have to tell all apart",
+            "Show the skill 5 times or more, or learn with covariance_type='diag'",
+            value=2.0,
+        )

@@ -1,0 +1,336 @@
+"""What a model has seen, and how far a situation is from it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import fdtri
+
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.plausibility.findings import Finding, listed
+from tpgmm_torch.plausibility.poses import angles_to, mean_orientation, other_order
+from tpgmm_torch.plausibility.summaries import EpisodeSummary, quaternion_columns
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["Shown", "ShownFrame"]
+
+#: Chance that one coordinate of a situation like those shown is called unlike them.
+CHANCE = 0.002
+#: With few demonstrations, no further than this many of the ranges shown.
+MOST_RANGES = 3.0
+#: What is not further outside than this is near enough [m], [rad], [rad or m].
+NEAR, LIKE, POSTURE = 0.05, float(np.deg2rad(20.0)), 0.5
+#: Objects on a line or a table are not exactly so [m].
+FLAT = 0.02
+#: Fewer demonstrations say nothing about which coordinates go together.
+FEWEST = 6
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """Where a frame was, at the beginning of the demonstrations and on its way.
+
+    Parameters
+    ----------
+    low, high : sequence of float
+        Range of its position, x, y, z, over all of the time [m].
+    mean : sequence of float
+        Of its first positions [m].
+    covariance : sequence of sequence of float
+        Of the same [m^2].
+    orientation : sequence of float
+        Mean of its first orientations (w, x, y, z).
+    angle : float
+        How far one of them was turned from there, at most [rad].
+    """
+
+    low: Sequence[float]
+    high: Sequence[float]
+    mean: Sequence[float]
+    covariance: Sequence[Sequence[float]]
+    orientation: Sequence[float]
+    angle: float
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a model was shown: enough to tell how far a situation is from it.
+
+    Parameters
+    ----------
+    n_demonstrations : int
+    joint_names : tuple of str
+    start_low, start_high : sequence of float
+        Range of the start postures [rad or m].
+    compared : sequence of bool
+        Which joints are compared: not those that are parts of a quaternion.
+    frames : mapping of str to ShownFrame
+    """
+
+    n_demonstrations: int
+    joint_names: tuple[str, ...]
+    start_low: Sequence[float]
+    start_high: Sequence[float]
+    compared: Sequence[bool]
+    frames: Mapping[str, ShownFrame]
+
+    @classmethod
+    def of(cls, episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Self:
+        """Summarise demonstrations.
+
+        Parameters
+        ----------
+        episodes : sequence of EpisodeSummary
+            With their joints in the order of the kinematics.
+        kinematics : Kinematics
+        """
+        starts = np.stack([e.path[0] for e in episodes])
+        frames = {}
+        for name in episodes[0].frames:
+            poses = [e.frames[name] for e in episodes]
+            every = np.concatenate([pose.positions for pose in poses])
+            first = np.stack([pose.positions[0] for pose in poses])
+            turns = np.stack([pose.orientations[0] for pose in poses])
+            mean = mean_orientation(turns)
+            covariance = np.cov(first.T) if len(first) > 1 else np.zeros((3, 3))
+            frames[name] = ShownFrame(
+                every.min(axis=0).tolist(),
+                every.max(axis=0).tolist(),
+                first.mean(axis=0).tolist(),
+                covariance.tolist(),
+                mean.tolist(),
+                float(angles_to(turns, mean).max()),
+            )
+        names, width = kinematics.joint_names, kinematics.n_joints
+        compared = ~quaternion_columns(names, width, kinematics.quaternion_starts)
+        return cls(
+            len(episodes),
+            tuple(names),
+            starts.min(axis=0).tolist(),
+            starts.max(axis=0).tolist(),
+            compared.tolist(),
+            frames,
+        )
+
+    def config(self) -> dict[str, Any]:
+        """All of it, ready for JSON."""
+        return asdict(self) | {"joint_names": list(self.joint_names)}
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """The inverse of :meth:`config`.
+
+        Raises
+        ------
+        DataError
+            If it does not fit together.
+        """
+        try:
+            fields = dict(config)
+            fields["joint_names"] = tuple(fields["joint_names"])
+            fields["frames"] = {n: ShownFrame(**f) for n, f in fields["frames"].items()}
+            shown = cls(**fields)
+            n = len(shown.joint_names)
+            shapes = [np.shape(shown.start_low), np.shape(shown.start_high)]
+            shapes += [np.shape(shown.compared)]
+            fits = all(shape == (n,) for shape in shapes) and all(
+                np.shape(f.low) == np.shape(f.high) == np.shape(f.mean) == (3,)
+                and np.shape(f.covariance) == (3, 3)
+                and np.shape(f.orientation) == (4,)
+                for f in shown.frames.values()
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise DataError(f"this does not describe what was shown: {error!r}") from error
+        if not fits:
+            raise DataError("what was shown does not fit together: shapes differ")
+        return shown
+
+    @property
+    def ranges(self) -> float:
+        """How far outside, in ranges, a coordinate like those shown hardly ever is.
+
+        The ranges of N numbers of one uniform law, however wide, are exceeded at one end by
+        more than r of themselves with the chance ``(1 + r)^(1 - N) / (N + 1)``.
+        """
+        n = self.n_demonstrations
+        if n == 1:
+            return MOST_RANGES
+        return float(min(MOST_RANGES, (CHANCE * (n + 1)) ** (-1 / (n - 1)) - 1))
+
+    def distance(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
+        """How far a state is from those that demonstrations began in; 1 is the limit.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints), optional
+        frames : mapping of str to Frame, optional
+            Of shapes that broadcast with the joints; those that were not shown do not count.
+
+        Returns
+        -------
+        array of shape (...)
+            The largest, over all coordinates, of how far it is outside what was shown as a
+            share of what is plausible, and of its Mahalanobis distance: above 1 it is
+            implausible.
+        """
+        found: list[Array] = [np.zeros(())]
+        if joints is not None:
+            found.append(self._posture(_array(joints)).max(axis=-1, initial=0))
+        for name, frame in (frames or {}).items():
+            if name in self.frames:
+                shown = self.frames[name]
+                position, orientation = as_array(frame.position), as_array(frame.orientation)
+                found += [
+                    self._place(shown, position).max(axis=-1, initial=0),
+                    self._turn(shown, orientation),
+                    self._together(shown, position),
+                ]
+        largest = found[0]
+        for one in found[1:]:
+            largest = np.maximum(largest, one)
+        return largest
+
+    def findings(
+        self, joints: Any, frames: Mapping[str, Frame], label: str = ""
+    ) -> list[Finding]:
+        """Name what is implausible about one situation, per coordinate.
+
+        Parameters
+        ----------
+        joints : array-like of shape (n_joints,), or None
+            The start posture.
+        frames : mapping of str to Frame
+            Each one pose, or one per time step.
+        label : str, default=""
+            What comes before each name in the messages, for example ``"situation 2, "``.
+        """
+        return [
+            *([] if joints is None else self._posture_findings(_array(joints), label)),
+            *(
+                finding
+                for name, shown in self.frames.items()
+                if name in frames
+                for finding in self._frame_findings(name, shown, frames[name], label)
+            ),
+        ]
+
+    def _posture_findings(self, joints: Array, label: str) -> list[Finding]:
+        scores = self._posture(joints)
+        odd = [int(j) for j in np.argsort(-scores) if scores[j] > 1]
+        if not odd:
+            return []
+        places = [
+            f"{self.joint_names[j]} = {joints[j]:.4g}, shown {self.start_low[j]:.4g} to "
+            f"{self.start_high[j]:.4g}"
+            for j in odd
+        ]
+        return [
+            Finding(
+                "start",
+                "unlikely",
+                f"{label}start posture: {listed(places)} rad (or m)",
+                "Is it in radians and in the order of the model's joint_names? Start nearer, "
+                "or show the skill from there",
+                tuple(self.joint_names[j] for j in odd),
+                value=float(scores[odd[0]]),
+            )
+        ]
+
+    def _frame_findings(
+        self, name: str, shown: ShownFrame, frame: Frame, label: str
+    ) -> list[Finding]:
+        positions = np.atleast_2d(as_array(frame.position))
+        orientation = np.atleast_2d(as_array(frame.orientation))[0]
+        scores = self._place(shown, positions)
+        worst = scores.argmax(axis=0)
+        remedy = "Is it in metres, in the same base frame? Else show the skill there too"
+        places = [
+            f"{name}: {axis} = {positions[worst[i], i]:.4g} m, shown {shown.low[i]:.4g} to "
+            f"{shown.high[i]:.4g}"
+            for i, axis in enumerate(AXES)
+            if scores[worst[i], i] > 1
+        ]
+        found = []
+        if places:
+            found.append(
+                Finding(
+                    "place",
+                    "unlikely",
+                    f"{label}{'; '.join(places)}",
+                    remedy,
+                    (name,),
+                    value=float(scores.max()),
+                )
+            )
+        elif (score := float(self._together(shown, positions[0]))) > 1:
+            at = ", ".join(f"{x:.3g}" for x in positions[0])
+            found.append(
+                Finding(
+                    "place",
+                    "unlikely",
+                    f"{label}{name}: ({at}) m lies beside the places shown, at {score:.2g} "
+                    "times the plausible Mahalanobis distance",
+                    remedy,
+                    (name,),
+                    value=score,
+                )
+            )
+        if (turn := float(self._turn(shown, orientation))) > 1:
+            angle = angles_to(orientation, np.array(shown.orientation))
+            swapped = float(self._turn(shown, other_order(orientation))) <= 1
+            found.append(
+                Finding(
+                    "turn",
+                    "unlikely",
+                    f"{label}{name}: turned by {np.rad2deg(angle):.0f} deg from the mean, "
+                    f"shown up to {np.rad2deg(shown.angle):.0f}",
+                    "Read as (x, y, z, w) it would fit: quaternions are (w, x, y, z)"
+                    if swapped
+                    else "Is the quaternion (w, x, y, z)? Else show the skill so too",
+                    (name,),
+                    value=turn,
+                )
+            )
+        return found
+
+    def _posture(self, joints: Array) -> Array:
+        low, high = np.array(self.start_low), np.array(self.start_high)
+        scores: Array = self._outside(joints, low, high, POSTURE) * np.array(self.compared)
+        return scores
+
+    def _place(self, shown: ShownFrame, positions: Array) -> Array:
+        return self._outside(positions, np.array(shown.low), np.array(shown.high), NEAR)
+
+    def _outside(self, values: Array, low: Array, high: Array, floor: float) -> Array:
+        """How far values are outside, as shares of what is plausible."""
+        excess = np.maximum(np.maximum(low - values, values - high), 0)
+        share: Array = excess / np.maximum(floor, self.ranges * (high - low))
+        return share
+
+    def _turn(self, shown: ShownFrame, orientation: Array) -> Array:
+        excess = angles_to(orientation, np.array(shown.orientation)) - shown.angle
+        share: Array = np.maximum(excess, 0) / max(LIKE, self.ranges * shown.angle)
+        return share
+
+    def _together(self, shown: ShownFrame, positions: Array) -> Array:
+        """Mahalanobis distance of places, as a share of Hotelling's limit for a new one."""
+        n, d = self.n_demonstrations, 3
+        if n < FEWEST:
+            return np.zeros(positions.shape[:-1])
+        # T^2 = (p - m)' ((1 + 1/n) S)^-1 (p - m) ~ d (n - 1) / (n - d) F(d, n - d)
+        limit = d * (n - 1) / (n - d) * fdtri(d, n - d, 1 - CHANCE)
+        covariance = (1 + 1 / n) * np.array(shown.covariance) + FLAT**2 * np.eye(d)
+        apart = positions - np.array(shown.mean)
+        squared = np.einsum("...i,ij,...j->...", apart, np.linalg.inv(covariance), apart)
+        share: Array = np.sqrt(squared / limit)
+        return share
+
+
+def _array(values: Any) -> Array:
+    return as_array(values) if hasattr(values, "detach") else np.asarray(values, np.float64)
