@@ -534,7 +534,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         joints: Any,
         frames: Mapping[str, Frame] | None = None,
         *,
-        clock: Clock | str = "waiting",
+        clock: Clock | str = "localizing",
         trust: Trust | None = Trust(),  # noqa: B008  (frozen)
         smoothing: OneEuro | None = OneEuro(),  # noqa: B008  (frozen)
         bounds: MotionBounds | Mapping[str, Any] | None = None,
@@ -549,7 +549,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             Start postures.
         frames : mapping of str to Frame, optional
             Object poses, of shapes that broadcast with the batch; a step may be given others.
-        clock : Clock or str, default="waiting"
+        clock : Clock or str, default="localizing"
             How time goes on; text is for :func:`parse_clock`. Without measured joints, every
             clock runs evenly.
         trust : Trust, optional

@@ -134,7 +134,7 @@ class TPGMMConfig(StatePolicyConfig):
     closed_loop : bool, default=True
         Read the joints at every step: the clock looks at them, and a robot stands whose
         joints cannot be believed. Else a skill is played as it was at the start.
-    clock : str, default="waiting"
+    clock : str, default="localizing"
         How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
         ``"waiting"`` or ``"localizing"``, with options.
     smoothing : float or None, default=0.5
@@ -211,7 +211,7 @@ class TPGMMConfig(StatePolicyConfig):
     default_environment_state: list[float] | None = None
     follow_frames: bool = True
     closed_loop: bool = True
-    clock: str = "waiting"
+    clock: str = "localizing"
     smoothing: float | None = 0.5
     patience: float = 0.2
     velocity: dict[str, float] | list[float] | float | None = None

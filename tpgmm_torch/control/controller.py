@@ -192,9 +192,11 @@ class Controller:
                 passed = dt = self._trust.longest_step
             if halted is not None:
                 passed = torch.where(halted, 0.0, passed)
+            holding = self.holding
             observed = Observation(
-                measured, self.reference, self._velocity, self.holding.frames, last.estimate
-            )
+                measured, self.reference, None, holding.frames, last.estimate,
+                holding.state if holding.carries else None,
+            )  # fmt: skip
             self._progress = before.advance(passed, observed)
             if measured is not None and bool((moved := self._progress.relocalized).any()):
                 self._restart_fading(moved)
