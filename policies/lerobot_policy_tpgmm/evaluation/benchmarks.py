@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -84,13 +84,15 @@ class Benchmark(ABC):
         return tuple(dict.fromkeys((NOMINAL, *self.conditions, *self.disturbances)))
 
     @abstractmethod
-    def operators(self, orientation: bool) -> list[Operator]:
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """The subspaces in which TP-GMM learns.
 
         Parameters
         ----------
         orientation : bool
             False leaves the orientation of the hands out.
+        held : bool, default=True
+            False leaves out what is carried as a thing of its own.
         """
 
     @abstractmethod
@@ -219,7 +221,7 @@ class BottleBenchmark(_HandlingBenchmark):
         self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
         self.robot = self.skill.robot
 
-    def operators(self, orientation: bool) -> list[Operator]:
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle, and the joints."""
         return bottle_operators(orientation)
 
@@ -245,26 +247,21 @@ class CarryBenchmark(_HandlingBenchmark):
         self.skill = CarryAndPut(rate=self.rate)
         self.robot = self.skill.robot
 
-    def operators(self, orientation: bool) -> list[Operator]:
-        """Both hands seen from the bottle and from the tray, and the joints."""
-        return [*carry_operators(orientation), Canonical()]
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """Both hands seen from the bottle; the bottle, or the hands, from the tray; joints."""
+        hands = [_poses(HANDS, name, orientation) for name in self.objects]
+        if held:
+            hands[1] = _poses(("bottle",), "tray", orientation)
+        return [*hands, Canonical()]
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         return {**super()._start(motion), "slide": slid(motion)}
 
 
-def carry_operators(orientation: bool) -> list[Operator]:
-    """Both hands seen from each object."""
-    return [
-        Stack(
-            *(
-                operator(hand, name)
-                for hand in HANDS
-                for operator in (RelativePosition, RelativeOrientation)[: 1 + orientation]
-            )
-        )
-        for name in CarryBenchmark.objects
-    ]
+def _poses(links: Sequence[str], frame: str, orientation: bool) -> Stack:
+    """Where links, or objects, are seen from a frame."""
+    kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+    return Stack(*(kind(link, frame) for link in links for kind in kinds))
 
 
 def _references(motion: Demonstration) -> torch.Tensor:
@@ -290,7 +287,7 @@ class AlohaBenchmark(Benchmark):
         super().__init__(rate, options)
         self.robot = aloha_robot()
 
-    def operators(self, orientation: bool) -> list[Operator]:
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both grippers seen from the objects, and the joints."""
         return aloha_operators(self.options["task"], orientation)
 

@@ -138,14 +138,17 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         joints="action",
         episodes=range(cell.demonstrations),
     )
-    if cell.variant.base == "tpgmm-places":
+    base = cell.variant.base
+    if base == "tpgmm-places":
         demonstrations = [_at_first(demonstration) for demonstration in demonstrations]
     if not benchmark.synchronous:
         warping = DynamicTimeWarping(features=["directions"])
         demonstrations = warping.fit_transform(demonstrations)
     model = TaskParameterizedGMM(
         settings.n_components or benchmark.n_components,
-        benchmark.operators(orientation=cell.variant.base != "tpgmm-position-only"),
+        benchmark.operators(
+            orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
+        ),
         benchmark.robot,
         random_state=cell.seed,
     )
