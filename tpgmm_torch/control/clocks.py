@@ -606,9 +606,7 @@ class LocalizingProgress(WaitingProgress):
             reached=_put(went.reached, rows, np.where(moves, place, went.reached[rows])),
             stood=_put(went.stood, rows, np.where(moves[:, None], measured, went.stood[rows])),
             expected=_put(
-                went.expected,
-                rows,
-                np.where(moves[:, None], measured, went.expected[rows]),
+                went.expected, rows, np.where(moves[:, None], measured, went.expected[rows])
             ),
             rate=_put(went.rate, rows, np.where(moves, 0.0, went.rate[rows])),
         )
@@ -662,7 +660,8 @@ class LocalizingProgress(WaitingProgress):
 
 
 def _array(tensor: Tensor) -> Array:
-    return tensor.numpy(force=True)
+    """A copy: whoever measures may use the same memory again."""
+    return np.array(tensor.numpy(force=True), dtype=np.float64)
 
 
 def _deviations(estimate: Estimate) -> Array:

@@ -44,6 +44,24 @@ def seen(joints: Tensor | None, reference: Tensor = START) -> Observation:
     return Observation(joints, reference, None, {})
 
 
+@pytest.mark.parametrize("clock", [EvenClock(), WAITING, LOCALIZING], ids=format_clock)
+def test_numbers_of_single_precision_are_those_of_double(regression, clock):
+    """And a driver that writes what it measures into the same memory disturbs nothing."""
+    times = []
+    for dtype in (torch.float64, torch.float32):
+        joints = START.to(dtype).clone()
+        progress = clock.start(regression, 0.0, LAST, joints, {})
+        for k in range(30):
+            joints += 0.0187
+            progress = progress.advance(0.01 * (k % 3), seen(joints, START.to(dtype)))
+        times.append(float(progress.time))
+        assert progress.time.dtype == torch.float64
+    assert times[0] == pytest.approx(times[1], abs=1e-4)
+    ahead = progress.advance(0.1, seen(joints))
+    joints -= 5.0
+    assert torch.equal(progress.advance(0.1, seen(joints + 5.0)).time, ahead.time)
+
+
 # Even
 
 
