@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
+    Hold,
     Kinematics,
     OneEuro,
     Operator,
@@ -100,6 +101,10 @@ class TPGMMConfig(StatePolicyConfig):
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
         :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
         all links in all frames, stacked, and the joints.
+    holds : list of str, optional
+        From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
+        the aligned skill. By default it is found in frames that are read at every step
+        (``follow_frames``); an empty list stands for nothing.
     robot : dict or str, optional
         The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
         the URDF in it; to begin with, the path of a URDF or ``"upper_body"``. None for
@@ -196,6 +201,7 @@ class TPGMMConfig(StatePolicyConfig):
 
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
+    holds: list[str] | None = None
     robot: dict[str, Any] | str | None = None
     links: list[str] = field(default_factory=list)
     joints: list[str] | str | None = None
@@ -320,6 +326,7 @@ class TPGMMConfig(StatePolicyConfig):
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters."""
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
+        settings["holds"] = "auto" if self.holds is None else list(map(Hold.parse, self.holds))
         return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
 
     def validate_features(self) -> None:

@@ -192,6 +192,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
         config.describe(kinematics, model.operators_)
+        config.holds = list(map(str, model.holds_))
         poses = FrameFeatures(
             model.frame_names_, config.frames, environment_names, config.state_names, None
         )

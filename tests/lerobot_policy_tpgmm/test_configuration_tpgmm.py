@@ -16,10 +16,12 @@ from tpgmm_torch.exceptions import DataError
 def test_what_the_estimator_defaults_to_is_the_default():
     parameters = inspect.signature(TaskParameterizedGMM).parameters
     config = TPGMMConfig(device="cpu")
-    left_out = {"operators", "robot", "warm_start", "device", "verbose"}
+    left_out = {"operators", "robot", "holds", "warm_start", "device", "verbose"}
     assert set(HYPERPARAMETERS) == set(parameters) - left_out
     for name in HYPERPARAMETERS:
         assert getattr(config, name) == parameters[name].default
+    assert config.holds is None and config.estimator(None, ()).holds == "auto"
+    assert TPGMMConfig(holds=[]).estimator(None, ()).holds == []
 
 
 def test_every_field_is_explained():

@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import lerobot_policy_tpgmm
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.carrying import carrying_model, scenes
 from tests.support.policies import (
     ENVIRONMENT,
     STATE,
@@ -240,3 +242,32 @@ def test_a_seed_that_is_no_number_is_left_out(caplog):
     assert policy.config.random_state is None and policy.config.chunk_size == 4
     assert not caplog.records
     assert lerobot_policy_tpgmm.TPGMMConfig is type(policy.config)
+
+
+def test_what_is_held_is_part_of_the_policy(tmp_path):
+    model, scene = carrying_model(), scenes(2, seed=9)
+    names = [
+        f"{frame}.{part}"
+        for frame in ("bottle", "tray")
+        for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
+    ]
+    loop = {"clock": "even", "closed_loop": False, "smoothing": None}
+    policy = TPGMMPolicy.from_estimator(model, environment_names=names, **loop)
+    assert policy.config.holds == [str(hold) for hold in model.holds_]
+    policy.save_pretrained(tmp_path)
+    loaded = TPGMMPolicy.from_pretrained(tmp_path)
+    assert loaded.to_estimator().holds_ == model.holds_
+    poses = [x for f in scene.frames.values() for x in (f.position, f.orientation)]
+    seen = {STATE: scene.start.float(), ENVIRONMENT: torch.cat(poses, -1).float()}
+    controller = model.controller(scene.start, scene.frames, **policy.config.control())
+    for now in model.time_.tolist():
+        actions = loaded.select_action(seen)
+        controller.step(1 / policy.config.rate)
+        if now == 4.5:  # carried, and calm
+            assert_close(actions, controller.reference, 1e-4)
+    # the bottle is seen where it was at first, all the time: that is no news
+    there = controller.holding.frames["bottle"].position
+    assert float((there - scene.tray.position).norm(dim=-1).max()) < 2e-3
+    assert_close(loaded._controller.holding.frames["bottle"].position, there, 1e-4)
+    with pytest.raises(DataError, match=r"hold 'bottle' is not of the form"):
+        TPGMMConfig(holds=["bottle"])

@@ -29,12 +29,15 @@ class Held:
         The index of the link that holds it, for all robots or each of them; -1 if it is free.
     grasp : Frame, optional
         Its pose in that link; None if it was not held yet.
+    taken : Frame, optional
+        Where it was when it was taken.
     told : bool, or Tensor of bool, of shape (...)
         Whether what was told at run time counts, and no longer the holds of the model.
     """
 
     carrier: int | Tensor = -1
     grasp: Frame | None = None
+    taken: Frame | None = None
     told: bool | Tensor = False
 
 
@@ -89,7 +92,9 @@ class Holding:
         UnknownNameError, DataError
             If a frame or a link is not known, or an object is held by two links at once.
         """
-        checked = check_holds(holds, frames, kinematics.links)
+        # whatever is not there yet has to be seen before it is asked for
+        names = frames or [hold.frame for hold in holds]
+        checked = check_holds(holds, names, kinematics.links)
         return cls(kinematics, checked, carried_objects(operators, kinematics), dict(frames))
 
     @property
@@ -117,7 +122,7 @@ class Holding:
             Where the robots stand [rad or m].
         frames : mapping of str to Frame, optional
             Objects that are seen now. Those that are held may be left out; one that is seen
-            exactly where it was taken, when it is let go, counts as not seen.
+            exactly where it was taken, once it was carried, counts as not seen.
         told : mapping of str to str or None, optional
             For objects of which it is known, the link that holds them from now on; None if
             they are free from now on. The model's holds of that object no longer count.
@@ -130,7 +135,7 @@ class Holding:
             If what is told names a frame or link that does not exist.
         """
         for name in told or ():
-            if name not in self.frames:
+            if name not in self.frames and name not in (frames or ()):
                 raise UnknownNameError("frame", name, "the situation", self.frames)
         if not self.holds and not self.held and not told:
             return self if not frames else replace(self, frames={**self.frames, **frames})
@@ -138,16 +143,19 @@ class Holding:
         time = time.item() if isinstance(time, Tensor) and not time.ndim else time
         state: RobotState | None = None
         for name in dict.fromkeys((*(hold.frame for hold in self.holds), *held, *(told or ()))):
+            if name not in places:
+                continue
             before = held.get(name, FREE)
             carrier, is_told = self._carrier(name, time, before, told or {}, where)
-            place = self.frames[name]
+            place = self.frames.get(name, places[name])
             if _equal(carrier, before.carrier):
-                places[name] = _choose(_held(carrier), place, seen.get(name, place))
+                pose = _unless(before.taken, seen.get(name, place), place)
+                places[name] = _choose(_held(carrier), place, pose)
                 if is_told is not before.told:
                     held[name] = replace(before, told=is_told)
                 continue
             state = self.kinematics.state(joints) if state is None else state
-            now = self._now(name, before, seen.get(name), state)
+            now = self._now(name, place, before, seen.get(name), state)
             held[name] = self._taken(before, carrier, is_told, now, state)
             still = _held(before.carrier) & _held(carrier)
             places[name] = _choose(still, place, now)
@@ -192,17 +200,12 @@ class Holding:
             return index, True
         return _choose_index(where, index, carrier), before.told | where
 
-    def _now(self, name: str, before: Held, seen: Frame | None, state: RobotState) -> Frame:
+    def _now(
+        self, name: str, place: Frame, before: Held, seen: Frame | None, state: RobotState
+    ) -> Frame:
         """Where an object is that is taken or let go."""
-        place = self.frames[name]
-        if before.grasp is None:
-            return place if seen is None else seen
-        carried = self._with(state, name, before).pose(name)
-        if seen is None:
-            return carried
-        elsewhere = (seen.position != place.position).any(-1)
-        elsewhere = elsewhere | (seen.orientation != place.orientation).any(-1)
-        return _choose(elsewhere | ~torch.as_tensor(_held(before.carrier)), seen, carried)
+        known = place if before.grasp is None else self._with(state, name, before).pose(name)
+        return known if seen is None else _unless(before.taken, seen, known)
 
     def _taken(
         self,
@@ -220,7 +223,11 @@ class Holding:
                 grasp = other
             news = torch.as_tensor(carrier == index) & torch.as_tensor(before.carrier != index)
             grasp = _choose(news, other, grasp)
-        return Held(carrier, grasp, told)
+        taken = now
+        if before.taken is not None:
+            still = _held(before.carrier) | ~torch.as_tensor(_held(carrier))
+            taken = _choose(still, before.taken, now)
+        return Held(carrier, grasp, taken, told)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""
@@ -257,6 +264,14 @@ def _choose_index(where: bool | Tensor, one: int | Tensor, other: int | Tensor) 
     if isinstance(where, bool):
         return one if where else other
     return torch.where(where, torch.as_tensor(one), torch.as_tensor(other))
+
+
+def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
+    """What is seen; what is known where that is exactly a pose of before."""
+    if stale is None or seen is known:
+        return seen
+    same = (seen.position == stale.position).all(-1)
+    return _choose(same & (seen.orientation == stale.orientation).all(-1), known, seen)
 
 
 def _choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:

@@ -155,7 +155,7 @@ def holds_for(
     demonstrations : sequence of Demonstration
         At least one.
     operators : sequence of Operator
-        Only the frames that they refer to are looked at.
+        Only the frames that they refer to matter.
     kinematics : Kinematics
 
     Raises
@@ -165,10 +165,11 @@ def holds_for(
     """
     if holds is None:
         return ()
+    names = frame_names(operators, kinematics)
     if isinstance(holds, str):
-        names = frame_names(operators, kinematics)
         return find_holds(demonstrations, kinematics, frames=names)
-    return check_holds(holds, demonstrations[0].frames, kinematics.links)
+    checked = check_holds(holds, demonstrations[0].frames, kinematics.links)
+    return tuple(hold for hold in checked if hold.frame in names)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from lerobot_policy_tpgmm.training.losses import (
     local_points,
     regression,
 )
-from tpgmm_torch import Demonstration, Kinematics, Operator
+from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError
@@ -91,6 +91,7 @@ class Learner:
         self.clock: Clock | None = None
         self.regularization: list[Tensor] | None = None
         self._steps = 0
+        self._told = False
         self._losses: list[float] = []  # of the present epoch, while it is of interest
         self._before: float | None = None  # their mean in the one before
 
@@ -134,6 +135,16 @@ class Learner:
                 f"there is nothing to evaluate before the first epoch is over: {recorder}. "
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
+        if self._config.holds:
+            # frames by themselves do not tell where an object was last free
+            if not self._told:
+                log.warning(
+                    "objects are held, %s: the mixture stays as EM fitted it, and more steps "
+                    "change nothing",
+                    ", ".join(self._config.holds),
+                )
+            self._told = True
+            return torch.zeros((), requires_grad=True)
         loss = self._gradient_loss(batch, training)
         if training:
             self._watch(loss.item(), len(batch["index"]))
@@ -179,6 +190,7 @@ class Learner:
             mixture.copy_from(model)
             config.n_steps = len(mixture.time)
             config.shown = None if model.shown_ is None else model.shown_.config()
+            config.holds = list(map(str, model.holds_))
             log.info(
                 "%d components fitted by %d steps of EM: the policy is trained",
                 config.n_components,
@@ -187,7 +199,8 @@ class Learner:
         self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
-        rows = torch.cat(local_data(aligned, self._operators, kinematics))
+        holds = list(map(Hold.parse, config.holds or ()))
+        rows = torch.cat(local_data(aligned, self._operators, kinematics, holds=holds))
         self.regularization = self._regularization(rows, kinematics)
         self._learned, self._recorder = set(numbers), None
         with torch.no_grad():

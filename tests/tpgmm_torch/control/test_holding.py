@@ -66,11 +66,13 @@ def test_after_the_release_it_stays_where_it_was_let_go():
     there = held.advance(HELD.end, joints + 0.1)
     assert_at(there.frames["bottle"], hand(joints + 0.1).compose(grasp))
     assert_at(there.advance(5.5, joints).frames["bottle"], there.frames["bottle"])
-    assert there.advance(5.5, joints, {"bottle": LATER}).frames["bottle"] is LATER
+    assert_at(there.advance(5.5, joints, {"bottle": LATER}).frames["bottle"], LATER)
     # what is seen counts, unless it is what was seen before the grasp
     assert_at(held.advance(HELD.end, joints, {"bottle": LATER}).frames["bottle"], LATER)
     stale = held.advance(HELD.end, joints + 0.1, holding.frames)
     assert_at(stale.frames["bottle"], there.frames["bottle"])
+    later = stale.advance(5.5, joints, holding.frames)
+    assert_at(later.frames["bottle"], there.frames["bottle"])
     as_a_thing = there.state(upper_body().state(joints))
     assert as_a_thing.carrier("bottle") == -1
     assert_at(as_a_thing.pose("bottle"), there.frames["bottle"])
@@ -224,3 +226,12 @@ def test_recorded_objects_are_followed_as_they_were_held():
     [predicted] = carrying_model().predict([carries()[0]])
     error = predicted.joints - carries()[0].joints
     assert float(error.square().mean().sqrt()) < 0.05
+
+
+def test_objects_that_are_first_seen_on_the_way_are_held_from_then_on():
+    holding = Holding.start(upper_body(), operators(), [HELD], {})
+    _, joints = begun()
+    assert holding.advance(1.0, joints).frames == {}
+    seen = holding.advance(3.0, joints, {"bottle": LATER})
+    assert seen.frames["bottle"] is LATER and seen.carries
+    assert_at(seen.state(upper_body().state(joints)).pose("bottle"), LATER)
