@@ -17,7 +17,7 @@ from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
@@ -185,7 +185,6 @@ class Controller:
         if last is not None and not 0 < dt < math.inf:
             return self._refuse(last, f"time did not increase: dt = {dt} s")
         measured, halted = self._hear(dt, joints, frames, ages)
-        self._go_on_from(measured)
         before = self._progress
         if last is not None:
             if self._trust is not None and dt > self._trust.longest_step:
@@ -210,16 +209,15 @@ class Controller:
             at = torch.where(measured.isnan(), at, measured)
         seen = None if frames is None else self._frames
         self.holding = self.holding.advance(time, at, seen, told)
-        state: Tensor | RobotState = at
-        if self.holding.carries:
-            state = self.holding.state(self._regression.kinematics.state(at))
-        estimate = self._regression.tick(
-            time, state, self.holding.frames, self._position_bounds
-        )
+        estimate = self._estimated(time, at)
         wanted = estimate.joints
         if self._fading:
             wanted = wanted + self._fade(estimate.joints, 0.0 if last is None else dt)
         wanted = self._regression.kinematics.retract(wanted)
+        if measured is not None and (away := self._driven_away(measured)) is not None:
+            # what drove them there is not fought: they go on from where they stand
+            wanted = torch.where(away.unsqueeze(-1), measured, wanted)
+            self._restart_fading(away)
         if ended is not None and bool(ended.any()):
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
         return self._send(estimate, wanted, dt, halted, ended)
@@ -247,22 +245,46 @@ class Controller:
         halted = None if untrusted is None else torch.as_tensor(untrusted)
         return inputs.measured, halted
 
-    def _go_on_from(self, measured: Tensor | None) -> None:
-        """Take the place of robots that were driven away for their references."""
-        if measured is None or self._inputs is None:
-            return
+    def _estimated(self, time: Tensor, at: Tensor) -> Estimate:
+        """What the model asks for; not finite for robots of which it cannot tell."""
+        state: Tensor | RobotState = at
+        if self.holding.carries:
+            state = self.holding.state(self._regression.kinematics.state(at))
+        frames, bounds = self.holding.frames, self._position_bounds
+        try:
+            return self._regression.tick(time, state, frames, bounds)
+        except TPGMMError:
+            if self._trust is None or self.command is None:
+                raise  # nothing moves yet, or who predicts wants to know
+        # one robot's trouble is not its batch's
+        unknown = self.command.estimate
+        batch = at.shape[:-1]
+        joints = torch.full_like(at, torch.nan)
+        covariance = unknown.covariance.expand(*at.shape, -1).clone()
+        activation = unknown.activation.expand(*batch, -1).clone()
+        for index in np.ndindex(*batch) if batch else ():
+            one = state[index]
+            here = {n: f.expand(batch)[index] for n, f in frames.items()}
+            now = time[index] if time.ndim else time
+            try:
+                estimate = self._regression.tick(now, one, here, bounds)
+            except TPGMMError:
+                continue
+            joints[index], covariance[index] = estimate.joints, estimate.covariance
+            activation[index] = estimate.activation
+        return Estimate(joints, covariance, activation)
+
+    def _driven_away(self, measured: Tensor | None) -> Tensor | None:
+        """Robots that stand far from their references; None if there is none."""
+        if measured is None or self._inputs is None or self.command is None:
+            return None
         trust = self._inputs.trust  # in numpy, which takes a third of the time of torch
         gap = np.abs(measured.numpy(force=True) - self.reference.numpy(force=True))
         allowed = trust.largest_gap + trust.lag * np.abs(self._velocity.numpy(force=True))
         far = gap > allowed  # not where nothing is believed
         if not far.any():
-            return
-        away = torch.as_tensor(far.any(-1), device=self.reference.device)
-        self.reference = torch.where(away.unsqueeze(-1), measured, self.reference)
-        self._velocity = torch.where(away.unsqueeze(-1), 0.0, self._velocity)
-        if self._follower is not None:
-            self._follower = self._follower.reset(self.reference, robots=away)
-        self._restart_fading(away)
+            return None
+        return torch.as_tensor(far.any(-1), device=self.reference.device)
 
     def _checked(self, joints: Any) -> Tensor | None:
         if joints is None:
@@ -295,7 +317,7 @@ class Controller:
         fresh = self._since < 0
         if bool(fresh.any()):
             gap = self.reference - estimate
-            self._gap = torch.where(fresh.unsqueeze(-1), gap, self._gap)
+            self._gap = torch.where(fresh.unsqueeze(-1), gap.nan_to_num(0.0), self._gap)
         self._since = torch.where(fresh, 0.0, self._since + dt)
         left = 1 - minimum_jerk(self._since / self._blend)
         self._fading = bool((left > 0).any())
@@ -310,7 +332,7 @@ class Controller:
         ended: Tensor | None,
     ) -> Command:
         """The command that brings robots where they are wanted, within their bounds."""
-        last, self._wanted = self.reference, wanted
+        last, self._wanted, lost = self.reference, wanted, None
         if self._bounds is None:
             if halted is not None:
                 wanted = torch.where(halted.unsqueeze(-1), last, wanted)
@@ -324,16 +346,23 @@ class Controller:
                 fastest = self._bounds.velocity
                 moving = ((wanted - last) / dt).clamp(-fastest, fastest)
                 self._follower = Follower.at(self._bounds, last, moving)
-            follower = self._follower.take(wanted, dt) or self._follower.advance(wanted, dt)
+            follower = self._follower.take(wanted, dt)
+            if follower is None:
+                follower = self._follower.advance(wanted, dt)
+                lost = ~wanted.isfinite().all(-1)  # and is brought to rest
             self._follower = follower
             self.reference, self._velocity = follower.reference, follower.velocity
         codes = self._codes
         reasons: Mapping[tuple[int, ...], str] = {}
         if ended is not None and bool(ended.any()):
             codes = torch.where(ended, Status.FINISHED.code, codes)
+        if lost is not None and bool(lost.any()):
+            codes = torch.where(lost, Status.HOLDING.code, codes)
+            robots = map(tuple, np.argwhere(lost.numpy(force=True)).tolist())
+            reasons = dict.fromkeys(robots, "the model has no finite answer here")
         if halted is not None and self._inputs is not None:
             codes = torch.where(halted, Status.HOLDING.code, codes)
-            reasons = self._inputs.reasons(halted.numpy())
+            reasons = {**reasons, **self._inputs.reasons(halted.numpy(force=True))}
         self.command = Command(
             self.reference,
             self._velocity,

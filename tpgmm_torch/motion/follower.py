@@ -96,22 +96,9 @@ class Follower:
             speed = _checked(bounds, velocity, "velocity").expand_as(start)
         return cls(bounds, start, Moment.moving(as_array(start), as_array(speed)))
 
-    def reset(self, reference: Any, velocity: Any = None, robots: Any = None) -> Self:
-        """The same follower somewhere else; see :meth:`at`.
-
-        Parameters
-        ----------
-        reference, velocity : array-like of shape (..., n_joints)
-        robots : array-like of bool of shape (...), optional
-            Which robots; all by default.
-        """
-        other = type(self).at(self.bounds, reference, velocity)
-        if robots is None:
-            return other
-        mask = torch.as_tensor(robots).unsqueeze(-1)
-        moment = self.moment.placed(other.moment, mask.numpy(force=True))
-        kept = torch.where(mask.to(self.reference.device), other.reference, self.reference)
-        return replace(self, reference=kept, moment=moment)
+    def reset(self, reference: Any, velocity: Any = None) -> Self:
+        """The same follower somewhere else; see :meth:`at`."""
+        return type(self).at(self.bounds, reference, velocity)
 
     @property
     def velocity(self) -> Tensor:
@@ -216,18 +203,6 @@ class Moment(NamedTuple):
         zero = np.zeros_like(position)
         motion = Motion(position, velocity, zero)
         return cls(motion, velocity, zero, position, velocity, None, 0.0)
-
-    def placed(self, other: Self, robots: Mask) -> Self:
-        """Of some robots (..., 1) the other moment."""
-
-        def chosen(new: Array, old: Array) -> Array:
-            return np.where(robots, new, old)
-
-        motion = Motion(*map(chosen, other.motion, self.motion))
-        slope, bend = chosen(other.slope, self.slope), chosen(other.bend, self.bend)
-        wanted, drift = chosen(other.wanted, self.wanted), chosen(other.drift, self.drift)
-        behind = None if self.behind is None else self.behind & ~robots
-        return type(self)(motion, slope, bend, wanted, drift, behind, self.dt)
 
     def taken(self, position: Array, dt: float) -> Self:
         """The next moment if that is the next reference."""

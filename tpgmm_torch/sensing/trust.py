@@ -54,8 +54,9 @@ class Trust:
     turn_jump : float
         The same of its orientation, on top of 10 rad/s [rad].
     largest_gap : float
-        A robot that stands further than this from its reference, in one joint, goes on from
-        where it stands [rad or m]: what drove it away would be fought with all force otherwise.
+        Of a robot that stands further than this from its reference, in one joint, the reference
+        comes to where it stands, and goes on from there [rad or m]: what drove it away would be
+        fought with all force otherwise.
     lag : float
         How late a servo may be: on top of that, what the reference moves in this time [s].
     longest_step : float

@@ -1,15 +1,20 @@
 """A running skill, tick by tick: its beginning, its end, what it is told on the way."""
 
+from dataclasses import fields
+
+import numpy as np
 import pytest
 import torch
 
 from tests.support.mixtures import CASES, Case, Problem, assert_close
 from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation
+from tpgmm_torch.control.clocks import EvenClock, parse_clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.sensing.trust import Trust
 
 NAMES = ["the paper's", "poses in two frames"]
 EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
@@ -131,3 +136,191 @@ def test_numbers_given_in_another_type_are_converted():
     plain = Controller(regression, problem.state.joints, problem.frames, **options)
     other = Controller(regression, problem.state.joints.tolist(), single, **options)
     assert_close(other.step(DT).reference, plain.step(DT).reference, 1e-5)
+
+
+# Trust
+
+
+def watched(problem: Problem, robots: slice | int = slice(None), **options) -> Controller:
+    """A controller that looks at what it is told, of some of the robots."""
+    regression = problem.regression()
+    frames = {name: frame[robots] for name, frame in problem.frames.items()}
+    defaults = {
+        "begin": 0.2,
+        "end": 0.2 + LAST,
+        "blend": 0.3,
+        "bounds": MotionBounds.of(regression.kinematics, acceleration=20.0, jerk=2000.0),
+        "trust": Trust(),
+    }
+    return Controller(
+        regression, problem.state.joints[robots], frames, **{**defaults, **options}
+    )
+
+
+@pytest.mark.parametrize("lost", ["joints", "frame"])
+def test_a_robot_that_knows_nothing_stands_until_it_does(lost):
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    controller, speeds, statuses = watched(problem), [], []
+    for k in range(100):
+        joints, frames = controller.reference.clone(), dict(problem.frames)
+        if 30 <= k < 70 and lost == "joints":
+            joints[1] = torch.nan
+        if lost == "frame":
+            pose = torch.cat((frames[OBJECT].position, frames[OBJECT].orientation), -1)
+            pose[1] = torch.nan if 30 <= k < 70 else pose[1]
+            frames = {OBJECT: pose}
+        command = controller.step(0.01, joints, frames)
+        assert bool(command.reference.isfinite().all())
+        speeds.append(command.velocity.abs().amax(-1))
+        statuses.append(command.status)
+    assert [robot[0] for robot in statuses] == ["running"] * 100
+    held = [k for k in range(100) if statuses[k][1] == "holding"]
+    assert held == list(range(50, 70))  # after 0.2 s of patience
+    assert float(speeds[69][1]) < 1e-6 < float(speeds[69][0])
+    assert "is missing or not finite" in watched_reason(problem, lost)
+    # it has lost the time for which it stood
+    lag = controller.time[0] - controller.time[1]
+    assert float(lag) == pytest.approx(0.2, abs=1e-6)
+
+
+def watched_reason(problem: Problem, lost: str) -> str:
+    controller = watched(problem)
+    frames = {OBJECT: torch.full((2, 7), torch.nan)}
+    joints = torch.full_like(problem.state.joints, torch.nan)
+    for _ in range(30):
+        told = (joints, None) if lost == "joints" else (None, frames)
+        command = controller.step(0.01, *told)
+    return command.reason(0)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, float("nan"), float("inf")])
+def test_time_that_does_not_increase_moves_nothing(dt):
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    controller = watched(problem)
+    for _ in range(5):
+        controller.step(0.01)
+    before, time = controller.reference, controller.time
+    command = controller.step(dt)
+    assert command.status == ["holding"] * 2
+    assert "time did not increase" in command.reason(1)
+    assert torch.equal(command.reference, before)
+    assert torch.equal(controller.time, time)
+    assert controller.step(0.01).status == ["running"] * 2
+
+
+def test_robots_may_have_times_of_their_own():
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    controller = watched(problem)
+    steps = torch.tensor([0.01, 0.02], dtype=torch.float64)
+    for _ in range(11):
+        controller.step(steps)
+    assert controller.time.tolist() == pytest.approx([0.3, 0.4])
+    controller.step(torch.tensor([0.01, -1.0]))
+    assert controller.time.tolist() == pytest.approx([0.31, 0.4])
+
+
+def test_what_the_model_cannot_tell_stops_one_robot():
+    problem = Problem.of(CASES["the paper's"], 3, 3)
+    controller, regression = watched(problem), problem.regression()
+    for _ in range(40):
+        controller.step(0.01)
+
+    class Failing(type(regression)):
+        def tick(self, time, joints, frames, bounds=None):
+            if joints.ndim == 2 or torch.equal(joints, controller.reference[1]):
+                raise DataError("singular")
+            return super().tick(time, joints, frames, bounds)
+
+    controller._regression = Failing(
+        **{f.name: getattr(regression, f.name) for f in fields(regression)}
+    )
+    for _ in range(60):
+        command = controller.step(0.01)
+    assert command.status == ["running", "holding", "running"]
+    assert "no finite answer" in command.reason(1)
+    speed = command.velocity.abs().amax(-1)
+    assert float(speed[1]) < 1e-9 < float(speed[0])
+
+
+def test_a_robot_that_is_driven_away_goes_on_from_there():
+    problem = Problem.of(CASES["the paper's"], 3, 2)
+    controller = watched(problem, clock=EvenClock())
+    for _ in range(40):
+        controller.step(0.01, controller.reference)
+    away = controller.reference.clone()
+    away[0] += 0.6
+    away = away.clamp(*controller._position_bounds)
+    for _ in range(60):
+        before = controller.reference
+        controller.step(0.01, torch.stack((away[0], controller.reference[1])))
+    assert (controller.reference[0] - away[0]).abs().max() < 0.35
+    assert (controller.reference[1] - before[1]).abs().max() < 0.05
+
+
+CLOCKS = ["even", "waiting", "localizing"]
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_robot_in_a_batch_is_what_it_is_alone(clock):
+    """With faults in some of them, at different times."""
+    problem = Problem.of(CASES["the paper's"], 3, 8)
+    options = {"clock": parse_clock(clock)}
+    batch = watched(problem, **options)
+    alone = [watched(problem, robot, **options) for robot in range(8)]
+    rng = np.random.default_rng(0)
+    for k in range(130):
+        joints = batch.reference + torch.from_numpy(1e-3 * rng.standard_normal((8, 17)))
+        if 20 <= k < 50:
+            joints[2] = torch.nan
+        if 40 <= k < 60:
+            joints[5] += 0.7
+        pose = problem.frames[OBJECT]
+        poses = torch.cat((pose.position, pose.orientation), -1)
+        poses[:, :3] += torch.from_numpy(1e-3 * rng.standard_normal((8, 3)))
+        if 60 <= k < 100:
+            poses[3] = torch.nan
+        command = batch.step(0.01, joints, {OBJECT: poses})
+        for robot, one in enumerate(alone):
+            single = one.step(0.01, joints[robot], {OBJECT: poses[robot]})
+            # random mixtures enlarge the rounding of a batch, which decides for robots in
+            # trouble whether a reference is just within bounds
+            tolerance = 2e-3 if robot in (2, 3, 5) else 1e-6
+            assert_close(command.reference[robot], single.reference, tolerance)
+            assert command.status[robot] == single.status
+            assert command.reason(robot) == single.reason()
+
+
+def test_commands_are_within_bounds_whatever_is_told():
+    """Ticks with faults: every command is finite, and within limits of position and speed."""
+    problem = Problem.of(CASES["the paper's"], 3, 4)
+    controller = watched(problem, clock=parse_clock("localizing"))
+    bounds, rng = controller._bounds, np.random.default_rng(0)
+    kept = [controller.reference]
+    measured = controller.reference
+    for _ in range(400):
+        measured = measured + 0.5 * (controller.reference - measured)
+        joints = measured.clone()
+        pose = problem.frames[OBJECT]
+        poses = torch.cat((pose.position, pose.orientation), -1)
+        for robot in range(4):
+            fault = rng.integers(30)
+            if fault == 0:
+                joints[robot] = float(rng.choice([np.nan, np.inf, 1e9]))
+            elif fault == 1:
+                poses[robot] = float(rng.choice([np.nan, np.inf, 0.0]))
+            elif fault == 2:
+                poses[robot, :3] += torch.from_numpy(rng.uniform(-2, 2, 3))
+            elif fault == 3:
+                joints[robot] *= 57.3
+        dt = float(rng.choice([0.01] * 8 + [0.02, 0.0]))
+        command = controller.step(dt, joints, {OBJECT: poses})
+        assert bool(command.reference.isfinite().all() & command.velocity.isfinite().all())
+        if dt == 0.0:
+            assert torch.equal(command.reference, kept[-1])
+            continue
+        kept.append(command.reference)
+        assert bool((command.velocity.abs() <= bounds.velocity * (1 + 1e-6)).all())
+    stacked = torch.stack(kept)
+    assert bool(
+        (stacked >= bounds.lower - 1e-9).all() and (stacked <= bounds.upper + 1e-9).all()
+    )
