@@ -131,3 +131,15 @@ def test_a_real_recording_can_be_given(pyplot, monkeypatch):
     assert len(variables["demonstrations"]) == 10
     assert 0 < variables["error"] < 1
     assert drawn(pyplot.gcf())
+
+
+def test_the_model_hits_more_softly_than_position_control():
+    from tests.support.skills import small_bottle
+
+    example = runpy.run_path(str(FOLDER / "torque_control.py"))
+    env = example["BottleTorqueEnv"](fps=50, obstacle=1.0, episode_length=120)
+    soft, stiff = (
+        example["episode"](env, small_bottle(), soft, 0)["peak_contact_N"]
+        for soft in (True, False)
+    )
+    assert 0 < soft < 0.5 * stiff

@@ -93,7 +93,7 @@ class Stiffness:
 
     lowest: Numbers = 5.0
     highest: Numbers = 400.0
-    effort: Numbers = 0.1
+    effort: Numbers = 0.2
     inertia: Numbers = 0.1
     damping_ratio: float = math.sqrt(0.5)
 
