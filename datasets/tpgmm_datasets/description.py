@@ -16,6 +16,7 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, open_layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.units import guess_unit, with_pose_units
+from tpgmm_torch.plausibility.joints import is_gripper
 
 __all__ = ["ColumnInfo", "DatasetInfo", "describe_lerobot"]
 
@@ -34,7 +35,7 @@ class ColumnInfo:
         One per value, where the metadata give them.
     units : tuple of str or None
         One per value: those declared; for the joints of a set that declares none, a guess
-        with a question mark.
+        with a question mark, the same for all but grippers.
     low, high : tuple of float or None
         Range of each value over the episodes without problems; None if there are none.
     """
@@ -171,7 +172,17 @@ def _column(
     if extremes is not None:
         low, high = (tuple(map(float, values)) for values in extremes)
         if units is None and feature.key == joints:
-            guesses = [f"{guess_unit(a, b)}?" for a, b in zip(low, high, strict=True)]
+            names = feature.names or ("",) * len(low)
+            # the joints of a feature have one unit, grippers may have their own
+            joint = [n for n, name in enumerate(names) if not is_gripper(name)]
+            common = guess_unit(
+                min((low[n] for n in joint), default=0.0),
+                max((high[n] for n in joint), default=0.0),
+            )
+            guesses = [
+                f"{guess_unit(a, b) if is_gripper(name) else common}?"
+                for name, a, b in zip(names, low, high, strict=True)
+            ]
             units = with_pose_units(feature.names, guesses)
     return ColumnInfo(
         feature.key, feature.dtype, feature.shape, feature.names, units, low, high

@@ -16,6 +16,7 @@ from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
+from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Unit, Units
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.plausibility.check import episodes_report, summarize
@@ -138,6 +139,10 @@ def open_recording(
         rate,
         trim,
     )
+    # one unit for all episodes: a quiet one does not decide
+    stated = stated_range(layout.root, feature.key, feature.width)
+    if stated is not None:
+        assembly.joints.values(stated, file="meta/stats.json")
     chosen = tuple(select_episodes(layout, episodes))
     return Recording(chosen, assembly, policy.names, plausibility)
 

@@ -251,6 +251,15 @@ def a_calibrated_set_of_which_one_joint_is_quiet(folder):
     load_lerobot(root, units={"left_elbow": Scale.calibrated(1000, 3000)})
 
 
+@mistake("units", r"not radians: .*'left_elbow'")
+def the_quiet_episodes_of_a_set_in_degrees(folder):
+    items = [sets.demonstration(n, 12) for n in range(3)]
+    items[2] = replace(items[2], joints=items[2].joints * 600)
+    save_lerobot(items, folder / "set", fps=50, task="reach")
+    sets.undeclared(folder / "set", 1.0)
+    load_lerobot(folder / "set", episodes=[0, 1])
+
+
 @mistake("units", r"unit 'degree' is unknown")
 def a_misspelt_unit(folder):
     load_lerobot(stored(folder), units="degree")

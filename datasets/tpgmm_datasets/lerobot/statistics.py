@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["QUANTILES", "Statistics", "episode_statistics", "merge_statistics"]
+__all__ = ["QUANTILES", "Statistics", "episode_statistics", "merge_statistics", "stated_range"]
 
 #: By column, by name of the statistic: one value per value of the column.
 Statistics = dict[str, dict[str, Array]]
@@ -62,3 +65,40 @@ def _merge_column(a: dict[str, Array], b: dict[str, Array]) -> dict[str, Array]:
         "count": count,
         **{name: (1 - share) * a[name] + share * b[name] for name in QUANTILES},
     }
+
+
+def stated_range(root: Path, key: str, width: int) -> Array | None:
+    """Smallest and largest values of a column over all episodes, by the metadata.
+
+    Parameters
+    ----------
+    root : Path
+        Of the data set, in either layout.
+    key : str
+        Name of the column.
+    width : int
+        How many values it has.
+
+    Returns
+    -------
+    ndarray of shape (2, width), or None
+        None where the metadata do not say: statistics are no part of what a set must have.
+    """
+    try:
+        whole = root / "meta/stats.json"
+        if whole.is_file():
+            stated = [json.loads(whole.read_bytes())]
+        else:
+            lines = (root / "meta/episodes_stats.jsonl").read_text().splitlines()
+            stated = [json.loads(line)["stats"] for line in lines]
+        low, high = (
+            [_numbers(one[key][end], width) for one in stated] for end in ("min", "max")
+        )
+        found: Array = np.stack((np.min(low, axis=0), np.max(high, axis=0)))
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return found if np.isfinite(found).all() else None
+
+
+def _numbers(values: Any, width: int) -> Array:
+    return np.asarray(values, dtype=np.float64).reshape(width)

@@ -1,9 +1,16 @@
 """Statistics of columns: of one episode, and of two parts together."""
 
+import json
+
 import numpy as np
 import pytest
 
-from tpgmm_datasets.lerobot.statistics import QUANTILES, episode_statistics, merge_statistics
+from tpgmm_datasets.lerobot.statistics import (
+    QUANTILES,
+    episode_statistics,
+    merge_statistics,
+    stated_range,
+)
 
 
 def test_statistics_are_those_of_numpy():
@@ -29,3 +36,30 @@ def test_parts_merge_into_the_whole(lengths):
     for name in QUANTILES:
         mean = (1 - share) * first["a"][name] + share * second["a"][name]
         assert merged[name] == pytest.approx(mean)
+
+
+def test_the_stated_range_is_that_of_all_episodes_in_either_layout(tmp_path):
+    (tmp_path / "meta").mkdir()
+    assert stated_range(tmp_path, "state", 2) is None
+    lines = [
+        {"episode_index": n, "stats": {"state": {"min": [-n, 0], "max": [1, 2 * n]}}}
+        for n in range(3)
+    ]
+    text = "\n".join(map(json.dumps, lines))
+    (tmp_path / "meta" / "episodes_stats.jsonl").write_text(text)
+    assert stated_range(tmp_path, "state", 2).tolist() == [[-2, 0], [1, 4]]
+    whole = tmp_path / "meta" / "stats.json"
+    whole.write_text(json.dumps({"state": {"min": [0, -5], "max": [3, 4]}}))
+    assert stated_range(tmp_path, "state", 2).tolist() == [[0, -5], [3, 4]]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "{", "[]", "3", '{"state": 1}', '{"state": {"min": [0], "max": [1, 2]}}',
+     '{"state": {"min": [0, NaN], "max": [1, 2]}}', '{"state": {"min": "a", "max": "b"}}',
+     '{"other": {"min": [0, 0], "max": [1, 2]}}', "[" * 100_000],
+)  # fmt: skip
+def test_what_is_not_stated_is_no_range(tmp_path, text):
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "stats.json").write_text(text)
+    assert stated_range(tmp_path, "state", 2) is None
