@@ -124,6 +124,8 @@ def run(command: str) -> None:
     [page for page in PAGES if any(language != "text" for language, _ in blocks(page))],
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
+# the demo of these tests has so few demonstrations that a fold has only two
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_code_and_commands_of_a_page_run_from_top_to_bottom(page, demo, tmp_path, monkeypatch):
     shutil.copytree(demo, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)

@@ -14,7 +14,11 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.poses import angles_to, mean_orientation, other_order
-from tpgmm_torch.plausibility.summaries import EpisodeSummary, quaternion_columns
+from tpgmm_torch.plausibility.summaries import (
+    EpisodeSummary,
+    poses_among,
+    quaternion_columns,
+)
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Shown", "ShownFrame"]
@@ -182,7 +186,7 @@ class Shown:
         found: list[Array] = [np.zeros(())]
         if joints is not None:
             found.append(self._posture(_array(joints)).max(axis=-1, initial=0))
-        for name, frame in (frames or {}).items():
+        for name, frame in poses_among(frames or {}).items():
             if name in self.frames:
                 shown = self.frames[name]
                 position, orientation = as_array(frame.position), as_array(frame.orientation)
@@ -210,13 +214,14 @@ class Shown:
         label : str, default=""
             What comes before each name in the messages, for example ``"situation 2, "``.
         """
+        poses = poses_among(frames)
         return [
             *([] if joints is None else self._posture_findings(_array(joints), label)),
             *(
                 finding
                 for name, shown in self.frames.items()
-                if name in frames
-                for finding in self._frame_findings(name, shown, frames[name], label)
+                if name in poses
+                for finding in self._frame_findings(name, shown, poses[name], label)
             ),
         ]
 

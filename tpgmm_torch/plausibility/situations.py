@@ -13,6 +13,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.plausibility.findings import Finding, Report
 from tpgmm_torch.plausibility.joints import IMPOSSIBLE
 from tpgmm_torch.plausibility.shown import Shown
+from tpgmm_torch.plausibility.summaries import poses_among
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["situations_report", "tick_report"]
@@ -88,7 +89,10 @@ def tick_report(
                 if given is None
                 else np.broadcast_to(given, (*distance.shape, kinematics.n_joints))[worst]
             )
-            here = {name: frame.expand(distance.shape)[worst] for name, frame in frames.items()}
+            here = {
+                name: frame.expand(distance.shape)[worst]
+                for name, frame in poses_among(frames).items()
+            }
             findings += shown.findings(start, here)
     return Report.of(findings, "the first tick")
 

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import quaternion_groups
 
-__all__ = ["PHASES", "EpisodeSummary", "PoseSummary", "quaternion_columns"]
+__all__ = ["PHASES", "EpisodeSummary", "PoseSummary", "poses_among", "quaternion_columns"]
 
 #: Instants of equal phase at which paths are kept and compared.
 PHASES = 21
@@ -138,13 +139,21 @@ class EpisodeSummary:
             jumps=jumps,
             still=_still(steps),
             plateaus=_plateaus(joints, steps),
-            frames={n: PoseSummary.of(f, time) for n, f in demonstration.frames.items()},
+            frames={
+                name: PoseSummary.of(frame, time)
+                for name, frame in poses_among(demonstration.frames).items()
+            },
             events={
                 name: (at - float(time[0])) / duration if duration else 0.0
                 for name, at in demonstration.events.items()
             },
             digest=hashlib.sha256(joints.tobytes()).hexdigest(),
         )
+
+
+def poses_among(frames: Mapping[str, Frame]) -> dict[str, Frame]:
+    """The ``frames`` that are poses: general task parameters A, b are none."""
+    return {name: frame for name, frame in frames.items() if not isinstance(frame, Affine)}
 
 
 def quaternion_columns(

@@ -37,7 +37,7 @@ def test_fit_takes_operators_as_text(dataset, tmp_path):
 
 
 def test_fit_takes_holds_as_text(dataset, tmp_path):
-    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear")
+    few = ("--n-components", 3, "--episodes", "0,2", "--alignment", "linear", *CALMLY)
     for given, holds in (
         (("bottle@l_hand:5.25-",), [Hold("bottle", "l_hand", 5.25)]),
         (

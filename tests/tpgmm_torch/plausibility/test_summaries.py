@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tpgmm_torch import Demonstration, Frame
+from tpgmm_torch import Affine, Demonstration, Frame
 from tpgmm_torch.plausibility.summaries import (
     PHASES,
     EpisodeSummary,
@@ -80,6 +80,11 @@ def test_frames_are_kept_once_or_at_equal_phases():
     assert found.positions.shape == (PHASES, 3)
     assert found.jump == (pytest.approx(0.4), 0.0, TIME[100])
     assert PoseSummary.of(Frame([1.0, 2, 3]), TIME).positions.tolist() == [[1.0, 2.0, 3.0]]
+
+
+def test_general_task_parameters_are_no_poses():
+    frames = {"cup": Frame([0, 0, 0]), "rail": Affine([[2.0]], [0.1])}
+    assert list(summary(motion(), frames=frames).frames) == ["cup"]
 
 
 def test_one_instant_and_two_have_summaries():
