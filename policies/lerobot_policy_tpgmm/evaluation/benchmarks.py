@@ -248,11 +248,16 @@ class CarryBenchmark(_HandlingBenchmark):
         self.robot = self.skill.robot
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """Both hands seen from the bottle; the bottle, or the hands, from the tray; joints."""
-        hands = [_poses(HANDS, name, orientation) for name in self.objects]
-        if held:
-            hands[1] = _poses(("bottle",), "tray", orientation)
-        return [*hands, Canonical()]
+        """Both hands seen from the bottle and the tray, and the joints.
+
+        With what is held, the bottle from the tray, and one hand from the other.
+        """
+        grasp, put = (_poses(HANDS, name, orientation) for name in self.objects)
+        if not held:
+            return [grasp, put, Canonical()]
+        left, right = HANDS
+        together = _poses((right,), left, orientation)
+        return [grasp, _poses(("bottle",), "tray", orientation), together, Canonical()]
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         return {**super()._start(motion), "slide": slid(motion)}
