@@ -3,11 +3,17 @@
 What is wanted now and how to get there are two questions. A tick asks them in this order::
 
     estimate = regression.tick(time, follower.reference, frames, (bounds.lower, bounds.upper))
-    following = follower.take(estimate.joints, dt)
+    following = None if search.active is not None else follower.take(estimate.joints, dt)
     if following is None:  # a limit, a jump, or something out of reach
-        following = follower.advance(estimate.joints, dt)
+        asked = ~follower.fits(estimate.joints, dt)
+        wanted, search = search.advance(
+            regression, time, follower.reference, frames, estimate, box, asked
+        )
+        following = follower.advance(wanted, dt)
 
-``take`` is all that an ordinary tick needs: the wanted posture becomes the reference as it is.
+where ``search`` is a :class:`~tpgmm_torch.regression.posture.PostureSearch` and ``box`` the
+limits of position. ``take`` is all that an ordinary tick needs: the wanted posture becomes the
+reference as it is.
 
 Let ``w_k = (q_k - q_{k-1}) / dt`` be the mean velocity of a tick and
 ``a_k = (w_k - w_{k-1}) / dt`` the second difference of the references. The parabola through the

@@ -1,0 +1,124 @@
+"""The wanted posture minimises the fused cost within limits, and then nothing moves."""
+
+import pytest
+import torch
+
+from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tpgmm_torch import Frame
+from tpgmm_torch.regression.posture import PostureSearch, _Cost, _descended
+
+# shortly before the grasp, where one component has nearly all the weight
+TIME = torch.tensor(4.4, dtype=torch.float64)
+REACHED = bottle_demonstrations()[0].frames["bottle"]
+HIGH = Frame(torch.tensor([0.28, 0.0, 0.4], dtype=torch.float64))
+
+
+def limits():
+    robot = small_bottle().kinematics_
+    return robot.lower, robot.upper
+
+
+def searched(frame, start, ticks, time=TIME, asked=True, **options):
+    """What is wanted at each tick, of a robot that is where it wants to be at once."""
+    regression, search, found = small_bottle().regression(), PostureSearch(), []
+    asked = torch.full(start.shape[:-1], asked)
+    for _ in range(ticks):
+        estimate = regression.tick(time, start, {"bottle": frame}, limits())
+        start, search = search.advance(
+            regression, time, start, {"bottle": frame}, estimate, limits(), asked, **options
+        )
+        found.append(start)
+    return found, search
+
+
+def costs(frame, joints, time=TIME):
+    """Of the heaviest component, for joints (N, n)."""
+    regression = small_bottle().regression()
+    estimate = regression.tick(time, joints[0], {"bottle": frame})
+    index = estimate.activation.argmax().view(1)
+    frames = {"bottle": frame.expand(joints.shape[:1])}
+    return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
+
+
+def neutral():
+    return generator().neutral_posture()
+
+
+@pytest.mark.parametrize("frame", [REACHED, HIGH], ids=["reached", "high"])
+def test_the_gradient_is_that_of_the_cost(frame):
+    torch.manual_seed(0)
+    joints = neutral() + 0.3 * torch.randn(1, 17, dtype=torch.float64)
+    cost = costs(frame, joints)
+    _, downhill, precision = cost(joints[None])
+    steps = 1e-6 * torch.eye(17, dtype=torch.float64)
+    slope = torch.stack(
+        [(cost((joints + s)[None])[0] - cost((joints - s)[None])[0]).squeeze() for s in steps]
+    )
+    scale = downhill.abs().max()
+    assert float((slope / 2e-6 + downhill[0, 0]).abs().max() / scale) < 1e-6
+    assert bool((torch.linalg.eigvalsh(precision) > 0).all())
+
+
+def test_who_is_not_asked_keeps_the_estimate():
+    regression = small_bottle().regression()
+    estimate = regression.tick(TIME, neutral(), {"bottle": HIGH}, limits())
+    wanted, search = PostureSearch().advance(
+        regression, TIME, neutral(), {"bottle": HIGH}, estimate, limits(), torch.tensor(False)
+    )
+    assert wanted is estimate.joints and search.active is None
+
+
+def test_what_is_reached_is_left_to_the_regression():
+    regression, joints = small_bottle().regression(), neutral()
+    for _ in range(30):
+        joints = regression.tick(TIME, joints, {"bottle": REACHED}, limits()).joints
+    near = joints + 0.01
+    found, search = searched(REACHED, near, 1, asked=False)
+    assert torch.equal(found[0], regression.tick(TIME, near, {"bottle": REACHED}).joints)
+    assert search.active is None
+    # a search that was begun ends there
+    found, search = searched(REACHED, near, 3)
+    assert float((found[-1] - joints).abs().max()) < 1e-3
+    estimate = regression.tick(TIME, near, {"bottle": REACHED}, limits())
+    begun = PostureSearch()
+    for asked in (True, False):
+        wanted, begun = begun.advance(
+            regression, TIME, near, {"bottle": REACHED}, estimate, limits(), torch.tensor(asked)
+        )
+    assert torch.equal(wanted, estimate.joints) and not bool(begun.active)
+
+
+@pytest.mark.parametrize("place", [[0.28, 0.0, 0.4], [0.12, 0.11, 0.55]])
+def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
+    frame = Frame(torch.tensor(place, dtype=torch.float64))
+    found, search = searched(frame, neutral(), 120)
+    lower, upper = limits()
+    assert all(bool(((q >= lower) & (q <= upper)).all()) for q in found)
+    assert float((found[-1] - found[-6]).abs().max()) < 1e-3
+    assert bool(search.active)
+    # the best of many starts, within 5 % of its distance
+    generator = torch.Generator().manual_seed(1)
+    many = torch.rand(1, 60, 17, generator=generator, dtype=torch.float64)
+    many, damping = lower + (upper - lower) * many, torch.zeros(1, 60, dtype=torch.float64)
+    for _ in range(20):
+        cost = costs(frame, many[0])
+        many, damping, height = _descended(cost, many, damping, lower, upper)
+    here = float(costs(frame, found[-1][None])(found[-1][None, None])[0])
+    assert here <= 1.05**2 * float(height.min())
+
+
+def test_a_robot_does_not_depend_on_its_batch():
+    places = torch.tensor([[0.28, 0, 0.4], [0.28, 0, 0.15], [0.1, 0, -0.2]]).double()
+    starts = torch.stack([neutral(), neutral() + 0.02, neutral() - 0.05])
+    together, search = searched(Frame(places), starts, 12)
+    assert search.active.shape == (3,)
+    for robot in range(3):
+        alone, _ = searched(Frame(places[robot]), starts[robot], 12)
+        for one, both in zip(alone, together, strict=True):
+            assert float((one - both[robot]).abs().max()) < 1e-9
+
+
+def test_states_may_be_given():
+    given, _ = searched(HIGH, neutral(), 3, state_at=small_bottle().kinematics_.state)
+    plain, _ = searched(HIGH, neutral(), 3)
+    assert all(torch.equal(one, other) for one, other in zip(given, plain, strict=True))

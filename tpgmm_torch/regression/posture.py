@@ -1,0 +1,420 @@
+"""What is wanted now: the posture that minimises the fused cost within limits of position.
+
+A tick asks for one step of the linearised product (2). That is all there is to do while what is
+wanted stays near: then the step is exact to second order. For what is far away, or cannot be
+reached, the step overshoots, and taken again and again it circles. The product of component i
+is, up to a constant, ``exp(-F_i(q))`` with
+
+    F_i(q) = 1/2 sum_j r_ij(q)^T S_ij^-1 r_ij(q),   r_ij = M_j(q) mu_ij(t) + c_j(q),
+
+where r_ij is the displacement that operator j asks for at q, with Jacobian ``-J_j`` (section
+4.1), and S_ij its covariance. The wanted posture is
+
+    q* = sum_i h_i(t) q_i*,   q_i* = argmin F_i(q)  such that  lower <= q <= upper,
+
+the components' minima mixed as the regression mixes their means: to first order it is the
+regression's estimate. The minima are found by Levenberg's and Marquardt's method with steps
+that keep within the limits exactly, taken only where the cost falls, from where the last tick
+ended: what cannot be reached is approached, and then nothing moves. Where the limits leave
+several minima, others are looked for meanwhile, from a few fixed postures in turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians, quaternions
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.operators import (
+    AbsoluteOrientation,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.operators.base import Reference
+from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.kalman_update import TASKS
+from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.robots.kinematics import RobotState
+
+__all__ = ["PostureSearch"]
+
+#: Steps that are tried in one tick.
+TRIALS = 4
+#: Components of a smaller weight do not count.
+NEGLIGIBLE = 1e-5
+#: Damping, as a share of the precision: at first after a step that failed, and at most.
+FIRST, MOST = 1e-3, 1e8
+#: A step that promises less than this share of the cost is not tried.
+PROMISE = 1e-9
+#: The regression is trusted where its step leaves less than this share of the way to the
+#: minimum, and not at all where it leaves twice as much.
+TRUST = 0.2
+#: Ticks for which a lower cost is looked for from one of so many other postures. It is gone to
+#: if it is lower by this factor, and by so much.
+LOOK, STARTS, BETTER, SLACK = 10, 8, 0.95, 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class PostureSearch:
+    """The search for what is wanted, tick by tick; immutable. Begin with ``PostureSearch()``.
+
+    It costs nothing as long as nobody asks. Once begun for a robot it goes on until the
+    regression's own step leads to the minimum as well.
+
+    Parameters
+    ----------
+    active : Tensor of bool, of shape (...), optional
+        Robots whose regression is not trusted; None if there are none.
+    minima, damping : Tensor of shape (2, K, ..., n_joints) and (2, K, ...), optional
+        Where the components' searches are; then those that look elsewhere for a lower cost.
+    age : Tensor of int, of shape (...), optional
+        Ticks since each robot's search began.
+    """
+
+    active: Tensor | None = None
+    minima: Tensor | None = None
+    damping: Tensor | None = None
+    age: Tensor | None = None
+
+    def advance(
+        self,
+        regression: Regression,
+        time: Tensor,
+        reference: Tensor,
+        frames: Mapping[str, Frame],
+        estimate: Estimate,
+        bounds: tuple[Tensor, Tensor],
+        asked: Tensor,
+        state_at: Callable[[Tensor], RobotState] | None = None,
+    ) -> tuple[Tensor, Self]:
+        """What is wanted by each robot, and the search for the next tick.
+
+        Parameters
+        ----------
+        regression : Regression
+            What gave the estimate.
+        time : Tensor of shape () or (...)
+            Of the estimate [s].
+        reference : Tensor of shape (..., n_joints)
+            The state q_{t-1} from which it was made.
+        frames : mapping of str to Frame
+            Poses of the objects, of shapes that broadcast with the batch.
+        estimate : Estimate
+            Of this tick, within the bounds.
+        bounds : tuple of two Tensor of shape (n_joints,) or (..., n_joints)
+            The lowest and the highest joints allowed.
+        asked : Tensor of bool, of shape (...)
+            Robots that cannot follow the estimate.
+        state_at : callable, optional
+            ``state_at(joints)`` gives the states of joints (K, ..., n_joints), with what the
+            robots hold; the default is the kinematics'.
+
+        Returns
+        -------
+        wanted : Tensor of shape (..., n_joints)
+            The estimate's joints where it is trusted.
+        search : PostureSearch
+            For the next tick.
+        """
+        rows = asked if self.active is None else asked | self.active
+        if not bool(rows.any()):
+            return estimate.joints, type(self)()
+        with torch.no_grad():
+            wanted, trust, *state = self._searched(
+                regression, time, reference, frames, estimate, bounds, rows, state_at
+            )
+        joints = torch.lerp(wanted, estimate.joints, trust.unsqueeze(-1))
+        joints = torch.where((trust < 1).unsqueeze(-1), joints, estimate.joints)
+        return joints, type(self)(rows & (asked | (trust < 1)), *state)
+
+    def _searched(
+        self,
+        regression: Regression,
+        time: Tensor,
+        reference: Tensor,
+        frames: Mapping[str, Frame],
+        estimate: Estimate,
+        bounds: tuple[Tensor, Tensor],
+        rows: Tensor,
+        state_at: Callable[[Tensor], RobotState] | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Wanted joints, trust in the estimate's, minima, damping and age."""
+        like, batch = estimate.joints, estimate.joints.shape[:-1]
+        where: tuple[Any, ...] = rows.nonzero(as_tuple=True) if batch else (None,)
+        weights = estimate.activation.expand(*batch, -1)[where]
+        weights = torch.where(weights > NEGLIGIBLE, weights, 0.0).mT
+        count, index = len(weights), weights.any(-1).nonzero()[:, 0]
+        lower, upper = (bound.expand_as(like)[where] for bound in bounds)
+        # a search begins where the robot stands
+        minima = reference.expand(2, count, *batch, -1)
+        damping = like.new_zeros(2, count, *batch)
+        age = torch.zeros(batch, dtype=torch.long, device=like.device)
+        if self.active is not None and self.minima is not None:
+            assert self.damping is not None and self.age is not None
+            minima = torch.where(self.active.unsqueeze(-1), self.minima, minima)
+            damping = torch.where(self.active, self.damping, damping)
+            age = torch.where(self.active, self.age, age)
+
+        def state(joints: Tensor) -> RobotState:
+            if state_at is None:
+                return regression.kinematics.state(joints)
+            everyone = reference.expand(len(joints), *batch, -1).clone()
+            everyone[(slice(None), *where)] = joints
+            return state_at(everyone)[(slice(None), *where)]
+
+        here, of_all = age[where], (slice(None), *where)
+        starts = torch.where(
+            (here % LOOK == 0).unsqueeze(-1), _starts(here // LOOK, lower, upper), torch.nan
+        )
+        found, damped = minima[0][index][of_all], damping[0][index][of_all]
+        looks = minima[1][index][of_all]
+        looks = torch.where(starts.isnan(), looks, starts)
+        cost = _Cost(
+            regression,
+            torch.cat((index, index)),
+            time.expand(batch)[where] if time.ndim else time,
+            reference[where],
+            {name: frame.expand(batch)[where] for name, frame in frames.items()},
+            state,
+        )
+        relaxed = torch.where(here % LOOK == 0, 0.0, damping[1][index][of_all])
+        found, damped, height = _descended(
+            cost, torch.cat((found, looks)), torch.cat((damped, relaxed)), lower, upper
+        )
+        size = len(index)
+        # the heaviest component decides for all whether it is better elsewhere
+        heaviest = weights[index].argmax(0, keepdim=True)
+        low, other = (x.gather(0, heaviest) for x in (height[:size], height[size:]))
+        better = (here % LOOK == LOOK - 1) & (other < BETTER * low - SLACK)
+        goal = found[size:].gather(0, heaviest.unsqueeze(-1).expand(1, *found.shape[1:]))
+        nearest = torch.where(better.unsqueeze(-1), goal, found[:size])
+        # how much nearer to its minimum one step of the linearised problem leads
+        begun = torch.clamp(reference[where], lower, upper)
+        _, vector, precision = cost(begun.expand_as(found))
+        stepped, _ = _stepped(begun, vector, precision, lower, upper)
+        chosen = heaviest.unsqueeze(-1).expand(1, *found.shape[1:])
+        step, goal = (x[:size].gather(0, chosen)[0] for x in (stepped, nearest))
+        shares = (weights[index] / weights.sum(0)).unsqueeze(-1)
+        mixed = torch.clamp((shares * nearest).sum(0), lower, upper)
+        # out of reach, where components of little weight may lead astray, of the whole mixture
+        reached = (low[0] < SLACK).unsqueeze(-1)
+        goal = torch.where(reached, goal, mixed)
+        step = torch.where(reached, step, estimate.joints[where])
+        away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
+        trust = like.new_ones(batch)
+        trust[where] = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
+        wanted = like.clone()
+        wanted[where] = mixed
+        # a component that counts only later begins where the others are
+        minima = wanted.expand(2, count, *batch, -1).clone()
+        damping = torch.zeros_like(damping)
+        for k, joints in enumerate((nearest, found[size:])):
+            places = (k, index[:, None], *where) if batch else (k, index, None)
+            minima[places] = joints
+            damping[places] = damped[k * size : (k + 1) * size]
+        return wanted, trust, minima, damping, age + 1
+
+
+def _stepped(
+    joints: Tensor, vector: Tensor, precision: Tensor, lower: Tensor, upper: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where the quadratic model of the cost is least within bounds, and the step to it."""
+    factor = gaussians.cholesky(precision, "the product")
+    step = torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
+    there = within(joints + step, torch.cholesky_inverse(factor), lower, upper)
+    return there, there - joints
+
+
+def _starts(number: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Postures (R, n) to look for a lower cost from: the middle of the limits, and others."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(STARTS, lower.shape[-1], generator=generator, dtype=torch.float64)
+    points[0] = 0.5
+    # joints without limits turn
+    low, high = lower.clamp(min=-torch.pi), upper.clamp(max=torch.pi)
+    return torch.lerp(low, torch.maximum(low, high), points.to(lower)[number % STARTS])
+
+
+def _descended(
+    cost: _Cost, joints: Tensor, damping: Tensor, lower: Tensor, upper: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A few steps downhill within bounds from joints (A, ..., n), damping (A, ...), costs."""
+    joints = torch.clamp(joints, lower, upper)
+    here, vector, precision = cost(joints)
+    for _ in range(TRIALS):
+        scale = precision.diagonal(dim1=-2, dim2=-1) * damping.unsqueeze(-1)
+        damped = precision + torch.diag_embed(scale)
+        there, step = _stepped(joints, vector, damped, lower, upper)
+        bend = (step.unsqueeze(-2) @ precision @ step.unsqueeze(-1))[..., 0, 0]
+        promise = (vector * step).sum(-1) - 0.5 * bend
+        tried = promise > PROMISE * (here + PROMISE)
+        if not bool(tried.any()):
+            break
+        new, new_vector, new_precision = cost(there)
+        gain = torch.where(tried, (here - new) / promise, 0.0)
+        taken = tried & (new < here)
+        easier = torch.where(damping > FIRST, damping / 5, 0.0)
+        harder = torch.clamp(10 * damping, FIRST, MOST)
+        damping = torch.where(tried & (gain > 0.75), easier, damping)
+        damping = torch.where(tried & (gain < 0.25), harder, damping)
+        joints = torch.where(taken.unsqueeze(-1), there, joints)
+        here = torch.where(taken, new, here)
+        vector = torch.where(taken.unsqueeze(-1), new_vector, vector)
+        precision = torch.where(taken[..., None, None], new_precision, precision)
+    return joints, damping, here
+
+
+class _Cost:
+    """The costs F_i of some components at one instant, for states of joints (A, ..., n)."""
+
+    def __init__(
+        self,
+        regression: Regression,
+        index: Tensor,
+        time: Tensor,
+        centre: Tensor,
+        frames: Mapping[str, Frame],
+        state_at: Callable[[Tensor], RobotState],
+    ) -> None:
+        self.regression, self.centre, self.frames = regression, centre, frames
+        self.state_at, self.factors = state_at, list[Tensor]()
+        self.local = []
+        ones = [1] * (centre.ndim - 1)
+        for operator, one in zip(regression.operators, regression.conditionals, strict=True):
+            chosen = one.select(index)
+            mean = chosen.at(time).movedim(-2, 0)  # (A, ..., D), or (A, D) of one time
+            if not time.ndim:
+                mean = mean.view(len(index), *ones, -1)
+            covariance = chosen.covariance
+            covariance = covariance.view(len(index), *ones, *covariance.shape[-2:])
+            self.local.append((_Residual.of(operator, regression), mean, covariance))
+        closed = any(operator.determines_joints for operator in regression.operators)
+        self.prior = None if closed else torch.as_tensor(regression.prior_std).to(centre) ** -2
+
+    def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (A, ...), downhill gradient (A, ..., n), and precision (A, ..., n, n)."""
+        state = self.state_at(joints)
+        n = joints.shape[-1]
+        cost = joints.new_zeros(joints.shape[:-1])
+        vector, precision = torch.zeros_like(joints), joints.new_zeros(*joints.shape, n)
+        if self.prior is not None:
+            away = self.centre - joints
+            cost = cost + 0.5 * (self.prior * away.square()).sum(-1)
+            vector, precision = (
+                vector + self.prior * away,
+                precision + torch.diag_embed(self.prior.expand(n)),
+            )
+        first = not self.factors
+        for j, (term, mean, covariance) in enumerate(self.local):
+            matrix, residual, jacobian, noise = term(mean, state, self.frames)
+            if first:  # how far apart displacements are does not change within a tick
+                spread = covariance if matrix is None else matrix @ covariance @ matrix.mT
+                if noise is not None:
+                    spread = spread + noise.diag_embed()
+                name = "the covariance of a projected component"
+                self.factors.append(gaussians.cholesky(spread, name))
+            if jacobian is None:
+                jacobian = torch.eye(n, dtype=joints.dtype, device=joints.device)
+            jacobian = jacobian.expand(*residual.shape, n)
+            right = torch.cat((jacobian, residual.unsqueeze(-1)), -1)
+            white = torch.linalg.solve_triangular(self.factors[j], right, upper=False)
+            gram = white.mT @ white
+            cost = cost + 0.5 * gram[..., n, n]
+            vector = vector + gram[..., :n, n]
+            precision = precision + gram[..., :n, :n]
+        return cost, vector, precision
+
+
+@dataclass(frozen=True, eq=False)
+class _Residual:
+    """The displacement that an operator asks for, and its exact derivative.
+
+    A linearisation is exact where the displacement is small; of a rotation that is still to go,
+    ``delta = eps_wanted conj(eps) = (w, v)`` with ``r = g v``, the derivative is
+    ``-g/2 (w + v x) J_o``, and of what is seen from a frame that turns by ``J_of`` with the
+    joints there are ``-g v x J_of`` and, of a position, ``-r x J_of`` more.
+
+    Parameters
+    ----------
+    operator : Operator
+    blocks : Tensor of shape (Q, D), optional
+        Where the operator's quaternions are; None if it has none.
+    turns : Tensor of shape (Q, 3), optional
+        The rows of their displacements; None if they are not known.
+    leaves : tuple
+        Position and orientation operators that refer to a frame, and their first rows.
+    """
+
+    operator: Operator
+    blocks: Tensor | None
+    turns: Tensor | None
+    half_gains: Tensor
+    leaves: tuple[tuple[Any, int], ...]
+
+    @classmethod
+    def of(cls, operator: Operator, regression: Regression) -> Self:
+        """For one of a regression's operators."""
+        kinematics, like = regression.kinematics, regression.kinematics.lower
+        starts = operator.quaternion_starts(kinematics)
+        blocks = quaternions.quaternion_blocks(starts, operator.dimension(kinematics)).to(like)
+        parts = operator.leaves if isinstance(operator, Stack) else (operator,)
+        rows, gains, leaves, row = [], [], [], 0
+        for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
+            if isinstance(leaf, AbsoluteOrientation | RelativeOrientation):
+                rows.append([row, row + 1, row + 2])
+                gains.append(leaf.gain / 2)
+            if isinstance(leaf, RelativePosition | RelativeOrientation):
+                leaves.append((leaf, row))
+            row += 3
+        turns = torch.tensor(rows, device=like.device) if rows else None
+        return cls(
+            operator, blocks if starts else None, turns, like.new_tensor(gains), tuple(leaves)
+        )
+
+    def __call__(
+        self, mean: Tensor, state: RobotState, frames: Mapping[str, Frame]
+    ) -> tuple[Tensor | None, Tensor, Tensor | None, Tensor | None]:
+        """``M`` with the mean's signs, ``r``, minus its derivative (None: identity), noise."""
+        at = self.operator.linearize(state, frames)
+        matrix, jacobian, flipped = at.matrix, at.jacobian, mean
+        if self.blocks is not None:
+            present = at.present
+            if present is None:
+                present = self.operator.coordinates(state, frames)
+            signs = quaternions.hemisphere_signs(mean, present, self.blocks)
+            flipped = mean * signs
+            if matrix is not None:
+                matrix = matrix * signs.unsqueeze(-2)
+        moved = flipped if at.matrix is None else (at.matrix @ flipped.unsqueeze(-1))[..., 0]
+        residual = moved + at.displacement
+        if jacobian is None:
+            return matrix, residual, None, at.noise
+        if self.turns is not None and self.blocks is not None:
+            assert present is not None  # there are quaternions
+            cosine = (flipped * present) @ self.blocks.mT * self.half_gains
+            turn = residual[..., self.turns] / 2
+            rows = jacobian[..., self.turns, :]
+            exact = cosine[..., None, None] * rows + _cross(turn, rows)
+            jacobian = jacobian.expand(*exact.shape[:-3], *jacobian.shape[-2:]).clone()
+            jacobian[..., self.turns, :] = exact
+        for leaf, row in self.leaves:
+            swing = Reference.of(leaf.frame, state, frames, leaf.held).angular_jacobian
+            if swing is not None:
+                part = slice(row, row + 3)
+                if self.turns is None:
+                    jacobian = jacobian.expand(*residual.shape, -1).clone()
+                jacobian[..., part, :] += _cross(residual[..., part], swing)
+        return matrix, residual, jacobian, at.noise
+
+
+def _cross(vector: Tensor, matrix: Tensor) -> Tensor:
+    """``v x M``, column by column."""
+    shape = torch.broadcast_shapes(vector.unsqueeze(-1).shape, matrix.shape)
+    return torch.linalg.cross(vector.unsqueeze(-1).expand(shape), matrix.expand(shape), dim=-2)
