@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tpgmm_torch.control.clocks import Clock, EvenClock, Observation
 from tpgmm_torch.control.command import Command, Status
+from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
@@ -114,7 +115,7 @@ class Controller:
         self._measured_feedback, self._impedance = feedback == "measured", impedance
         self._frames = self._converted(frames or {})
         self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
-        self._trust = trust
+        self._trust, self._watch = trust, HoldWatch(kinematics)
         self._inputs: Inputs | None = None
         if trust is not None:
             self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
@@ -207,7 +208,12 @@ class Controller:
         at = self.reference
         if self._measured_feedback and measured is not None:
             at = torch.where(measured.isnan(), at, measured)
-        seen = None if frames is None else self._frames
+        seen = None if frames is None else dict(self._frames)
+        if self._inputs is not None and self._inputs.poses and not told:
+            stands = at if measured is None else torch.where(measured.isnan(), at, measured)
+            self._watch, self.holding, seen = self._watch.look(
+                self._inputs.poses, self._frames, stands, self.holding, dt
+            )
         self.holding = self.holding.advance(time, at, seen, told)
         estimate = self._estimated(time, at)
         wanted = estimate.joints

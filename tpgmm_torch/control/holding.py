@@ -16,7 +16,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Held", "Holding"]
+__all__ = ["Held", "Holding", "choose"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ class Holding:
             place = self.frames.get(name, places[name])
             if _equal(carrier, before.carrier):
                 pose = _unless(before.taken, seen.get(name, place), place)
-                places[name] = _choose(_held(carrier), place, pose)
+                places[name] = choose(_held(carrier), place, pose)
                 if is_told is not before.told:
                     held[name] = replace(before, told=is_told)
                 continue
@@ -158,9 +158,43 @@ class Holding:
             now = self._now(name, place, before, seen.get(name), state)
             held[name] = self._taken(before, carrier, is_told, now, state)
             still = _held(before.carrier) & _held(carrier)
-            places[name] = _choose(still, place, now)
+            places[name] = choose(still, place, now)
         same = held.keys() == self.held.keys() and all(held[n] is self.held[n] for n in held)
         return replace(self, frames=places, held=self.held if same else held)
+
+    def free(self, name: str, like: Tensor) -> Tensor:
+        """For which robots an object is free: bool, of the shape of ``like``."""
+        carrier = self.held.get(name, FREE).carrier
+        return torch.as_tensor(carrier, device=like.device).expand(like.shape) < 0
+
+    def taken(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
+        """A link holds an object that was at a place before, as if that had been told.
+
+        Parameters
+        ----------
+        name : str
+            The object.
+        index : int
+            Of the link.
+        where : Tensor of bool, of shape (...)
+            For which robots.
+        place, grasp : Frame
+            Where the object was when it was last free; its pose in the link now.
+        """
+        before = self.held.get(name, FREE)
+        old = grasp if before.grasp is None else before.grasp
+        now = Held(
+            _choose_index(where, index, before.carrier),
+            choose(where, grasp, old),
+            choose(where, place, place if before.taken is None else before.taken),
+            where | torch.as_tensor(before.told),
+        )
+        frames = {**self.frames, name: choose(where, place, self.frames[name])}
+        return replace(self, frames=frames, held={**self.held, name: now})
+
+    def carried(self, name: str, state: RobotState) -> Frame:
+        """Where an object is that is or was held, if its link has it still."""
+        return self._with(state, name, self.held[name]).pose(name)
 
     def state(self, state: RobotState) -> RobotState:
         """The state of the robots with what they hold, as operators refer to it.
@@ -222,11 +256,11 @@ class Holding:
             if grasp is None:
                 grasp = other
             news = torch.as_tensor(carrier == index) & torch.as_tensor(before.carrier != index)
-            grasp = _choose(news, other, grasp)
+            grasp = choose(news, other, grasp)
         taken = now
         if before.taken is not None:
             still = _held(before.carrier) | ~torch.as_tensor(_held(carrier))
-            taken = _choose(still, before.taken, now)
+            taken = choose(still, before.taken, now)
         return Held(carrier, grasp, taken, told)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
@@ -271,10 +305,10 @@ def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
     if stale is None or seen is known:
         return seen
     same = (seen.position == stale.position).all(-1)
-    return _choose(same & (seen.orientation == stale.orientation).all(-1), known, seen)
+    return choose(same & (seen.orientation == stale.orientation).all(-1), known, seen)
 
 
-def _choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:
+def choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:
     """One pose for some robots, the other for the rest."""
     if isinstance(where, bool):
         return one if where else other

@@ -1,0 +1,183 @@
+"""Seeing that a robot carries something, of which nobody told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.control.holding import Holding, choose
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["HoldWatch", "Rest"]
+
+#: The unit of motions [m], [rad]: what moved by one with a link is carried.
+MOVED, TURNED = 0.01, math.radians(5)
+#: What moved by less rests.
+RESTING = 0.1
+#: It moves with a link if its pose there changes by less than this share of the motion; up to
+#: the second it is not clear yet.
+WITH, PERHAPS = 0.4, 0.7
+#: A link has lost what is so far from where it would have it [m], [rad], for so long [s].
+LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
+#: How often that is looked at [s].
+LOOK = 0.1
+#: How fast a place follows what rests there, but is seen a little elsewhere [s].
+SETTLING = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """Where an object rested.
+
+    Parameters
+    ----------
+    seen, pose : Frame
+        As it was seen last, and where it rested.
+    joints : Tensor of shape (..., n_joints)
+        Where the robots stood when it rested last [rad or m].
+    away : Tensor of shape (...)
+        For how long it is far from where its link would have it [s].
+    since : float
+        The last look at that [s].
+    """
+
+    seen: Frame
+    pose: Frame
+    joints: Tensor
+    away: Tensor
+    since: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class HoldWatch:
+    """What objects do when robots move: finds holds of which nobody told.
+
+    An object that has moved by 1 cm (or turned by 5 degrees) from where it rested, while its
+    pose in a link changed by less than 0.4 of that, is held by that link since it rested. Until
+    that is clear it is taken to be where it rested: hands that follow what they carry would
+    run away with it. One that moved otherwise was moved by somebody else. What was found to be
+    held is free again once it is 5 cm from where the link would have it for 0.3 s.
+
+    Parameters
+    ----------
+    kinematics : Kinematics
+    rests : mapping of str to Rest
+        Of the objects that are seen at each tick.
+    found : frozenset of str
+        Objects whose holds were found here.
+    """
+
+    kinematics: Kinematics
+    rests: Mapping[str, Rest] = field(default_factory=dict)
+    found: frozenset[str] = frozenset()
+
+    def look(
+        self,
+        names: Iterable[str],
+        frames: Mapping[str, Frame],
+        joints: Tensor,
+        holding: Holding,
+        dt: float,
+    ) -> tuple[Self, Holding, dict[str, Frame]]:
+        """What is held after one more look, and where objects are taken to be.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Objects that are seen at each tick.
+        frames : mapping of str to Frame
+            Where they are seen, of the batch's shape.
+        joints : Tensor of shape (..., n_joints)
+            Where the robots stand [rad or m].
+        holding : Holding
+            What is known to be held.
+        dt : float
+            Since the last look [s].
+        """
+        rests, found, places = dict(self.rests), self.found, dict(frames)
+        for name in names:
+            seen, rest = frames[name], rests.get(name)
+            if rest is None:
+                rests[name] = Rest(seen, seen, joints, joints.new_zeros(joints.shape[:-1]))
+            elif rest.seen is not seen:
+                rest = replace(rest, seen=seen, since=rest.since + dt)
+                rest, holding, taken = self._taken(name, rest, joints, holding, dt)
+                found = found | {name} if taken else found
+                if name in found and rest.since >= LOOK:
+                    rest, holding = self._lost(name, rest, joints, holding)
+                rests[name], places[name] = rest, rest.pose
+            elif rest.pose is seen:  # it has not moved
+                rests[name] = replace(rest, joints=joints)
+            else:
+                places[name] = rest.pose
+        return replace(self, rests=rests, found=found), holding, places
+
+    def _taken(
+        self, name: str, rest: Rest, joints: Tensor, holding: Holding, dt: float
+    ) -> tuple[Rest, Holding, bool]:
+        """Whether a link has taken an object along, or somebody else has moved it."""
+        moved = _change(rest.pose, rest.seen, MOVED, TURNED)
+        free = holding.free(name, moved)
+        rests = free & (moved < RESTING)
+        settles, held, elsewhere = rests, torch.zeros_like(rests), torch.zeros_like(rests)
+        if bool((asked := free & ~rests).any()):
+            before, now = self.kinematics.state(rest.joints), self.kinematics.state(joints)
+            grasps = [rest.seen.seen_from(now.pose(link)) for link in self.kinematics.links]
+            changes = torch.stack(
+                [
+                    _change(rest.pose.seen_from(before.pose(link)), grasp, MOVED, TURNED)
+                    for link, grasp in zip(self.kinematics.links, grasps, strict=True)
+                ]
+            )
+            least, holder = changes.min(0)
+            far, alone = moved >= 1, least >= PERHAPS * moved
+            held = asked & far & (least < WITH * moved)
+            elsewhere = asked & far & alone
+            settles = rests | (asked & ~far & alone)
+            for index, grasp in enumerate(grasps):
+                where = held & (holder == index)
+                if bool(where.any()):
+                    holding = holding.taken(name, index, where, rest.pose, grasp)
+        share = torch.where(settles, min(1.0, dt / SETTLING), elsewhere.to(moved))
+        stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
+        pose = _between(rest.pose, rest.seen, share)
+        return replace(rest, pose=pose, joints=stood), holding, bool(held.any())
+
+    def _lost(
+        self, name: str, rest: Rest, joints: Tensor, holding: Holding
+    ) -> tuple[Rest, Holding]:
+        """Let go what is not where its link would have it."""
+        carried = holding.carried(name, self.kinematics.state(joints))
+        far = ~holding.free(name, rest.away)
+        far = far & (_change(carried, rest.seen, LOST, LOST_TURN) >= 1)
+        away = torch.where(far, rest.away + rest.since, 0.0)
+        lost = away >= LOST_TIME
+        if bool(lost.any()):
+            holding = holding.advance(0.0, joints, {name: rest.seen}, {name: None}, lost)
+        pose = choose(lost, rest.seen, rest.pose)
+        stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
+        return replace(rest, pose=pose, joints=stood, away=away, since=0.0), holding
+
+
+def _change(one: Frame, other: Frame, distance: float, angle: float) -> Tensor:
+    """How far poses are apart, in units of a distance [m] and an angle [rad]."""
+    moved = torch.linalg.vector_norm(other.position - one.position, dim=-1)
+    inner = (one.orientation * other.orientation).sum(-1).abs().clamp(max=1)
+    return torch.maximum(moved / distance, 2 * torch.acos(inner) / angle)
+
+
+def _between(one: Frame, other: Frame, share: Tensor) -> Frame:
+    """Some of the way from one pose to another."""
+    share = share.unsqueeze(-1)
+    position = one.position + share * (other.position - one.position)
+    turn = quaternions.match_hemisphere(other.orientation, one.orientation)
+    return Frame._from(
+        position, quaternions.normalize(one.orientation + share * (turn - one.orientation))
+    )
