@@ -410,9 +410,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise DataError(f"predict takes a list of Situation, got {type(X).__name__}")
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
-        # what has no limit of speed is no robot that could be asked too much
-        limited = self.keep_limits and bool(self.kinematics_.velocity.isfinite().any())
-        bounds = self.motion_bounds() if limited else None
+        bounds = self.motion_bounds() if self.keep_limits and self._limited else None
         situations_report(situations, self.shown_, self.time_, self.kinematics_).act(
             self.plausibility
         )
@@ -578,8 +576,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._check_fitted()
         for operator in self.operators_:
             operator.check(self.kinematics_, frames or {})
-        if not isinstance(bounds, MotionBounds):
-            bounds = self.motion_bounds(**(bounds or {}))
+        if bounds or self._limited:
+            if not isinstance(bounds, MotionBounds):
+                bounds = self.motion_bounds(**(bounds or {}))
+        else:
+            bounds = None
         self._examine_tick(self.time_[0], joints, frames or {})
         return Controller(
             self.regression(),
@@ -982,6 +983,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if self.acceleration_ is not None and self.jerk_ is not None:
             peaks = self.acceleration_, self.jerk_
         return MotionBounds.of(self.kinematics_, peaks, **given)
+
+    @property
+    def _limited(self) -> bool:
+        """What has no limit of speed is no robot that could be asked too much."""
+        return bool(self.kinematics_.velocity.isfinite().any())
 
     def _set_peaks(self, acceleration: Tensor, jerk: Tensor) -> Self:
         like = self.kinematics_.lower

@@ -25,6 +25,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.plausibility import Shown
 
 __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
@@ -117,6 +118,9 @@ class TPGMMConfig(StatePolicyConfig):
         T, the length of the time grid that was learned; 0 before a fit.
     shown : dict, optional
         What the demonstrations showed: a :class:`tpgmm_torch.plausibility.Shown` as JSON.
+    peaks : list of two lists of float, optional
+        Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
+        the bounds of what neither the robot nor the user bounds.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -208,6 +212,7 @@ class TPGMMConfig(StatePolicyConfig):
     coordinates: list[str] = field(default_factory=list)
     n_steps: int = 0
     shown: dict[str, Any] | None = None
+    peaks: list[list[float]] | None = None
 
     state_names: list[str] | None = None
     action_names: list[str] | None = None
@@ -322,6 +327,24 @@ class TPGMMConfig(StatePolicyConfig):
         self.operators = [_description(operator) for operator in operators]
         self.kinematics()  # what cannot be read back is refused now
         self.decoded_operators()
+
+    def note(self, model: TaskParameterizedGMM) -> None:
+        """Write down what a fitted model is beside its mixture."""
+        self.n_steps = len(model.time_)
+        self.holds = list(map(str, model.holds_))
+        self.shown = None if model.shown_ is None else model.shown_.config()
+        self.peaks = None
+        if model.acceleration_ is not None and model.jerk_ is not None:
+            self.peaks = [model.acceleration_.tolist(), model.jerk_.tolist()]
+
+    def recall(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
+        """The inverse of :meth:`note`, for a model made of a mixture; it is changed."""
+        if self.shown is not None:
+            model.shown_ = Shown.from_config(self.shown)
+        if self.peaks is not None:
+            like = model.kinematics_.lower
+            model.acceleration_, model.jerk_ = (like.new_tensor(peak) for peak in self.peaks)
+        return model
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters."""

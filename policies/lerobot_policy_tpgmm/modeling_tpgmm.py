@@ -30,7 +30,6 @@ from tpgmm_torch import Controller, TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.operators.base import frame_names
-from tpgmm_torch.plausibility import Shown
 
 __all__ = ["TPGMMPolicy"]
 
@@ -185,14 +184,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config = TPGMMConfig(
             **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
         )
-        config.n_steps = len(time)
-        config.shown = None if model.shown_ is None else model.shown_.config()
+        config.note(model)
         config.state_names = list(state_names or kinematics.joint_names)
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
         config.describe(kinematics, model.operators_)
-        config.holds = list(map(str, model.holds_))
         poses = FrameFeatures(
             model.frame_names_, config.frames, environment_names, config.state_names, None
         )
@@ -208,10 +205,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         kinematics = self.kinematics.to(device=device)
         model = self.config.estimator(kinematics, list(self.operators))
         model.device = str(device)
-        model = self.mixture.to_estimator(model)
-        if self.config.shown is not None:
-            model.shown_ = Shown.from_config(self.config.shown)
-        return model
+        return self.config.recall(self.mixture.to_estimator(model))
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
@@ -261,31 +255,38 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         references = [self._step(ahead, batch)]
         while len(references) < self.config.chunk_size:
             ahead.step(1 / self.config.rate)
-            references.append(ahead.reference)
+            references.append(ahead.reference.reshape(references[0].shape))
         return self.joints.action(torch.stack(references, dim=1))
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
         model = self.to_estimator()
         self._timestamp = None
-        return model.controller(
-            self._observed(batch), self.frames.frames(batch), **self.config.control()
-        )
+        joints, frames = self._observed(batch), self.frames.frames(batch)
+        if len(joints) == 1:  # one robot is sooner computed without a batch
+            joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
+        return model.controller(joints, frames, **self.config.control())
 
     def _step(self, controller: Controller, batch: Mapping[str, Tensor]) -> Tensor:
         """The references (B, n_joints) of the next action."""
         start, first, config = controller.reference, controller.command is None, self.config
-        measured = self._observed(batch) if config.closed_loop else None
-        frames = self.frames.poses(batch) if config.follow_frames and not first else None
-        if measured is not None and measured.shape != start.shape:
+        measured, begun = self._observed(batch), len(start) if start.ndim == 2 else 1
+        if len(measured) != begun:
             raise ShapeError(
-                f"the episode began with {len(start)} robots, now there are {len(measured)}: "
+                f"the episode began with {begun} robots, now there are {len(measured)}: "
                 "call reset() between episodes"
             )
-        command = controller.step(self._passed(batch), measured, frames)
+        poses = self.frames.poses(batch) if config.follow_frames and not first else {}
+        passed = self._passed(batch)
+        if start.ndim == 1:
+            measured, passed = measured[0], float(passed)
+            poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
+        command = controller.step(
+            passed, measured if config.closed_loop else None, poses or None
+        )
         if first:
             self._check_start(start, command.estimate.joints)
-        return controller.reference
+        return controller.reference.reshape(begun, -1)
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
         """Seconds since the last observation."""
@@ -300,13 +301,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         largest, gap = self.config.largest_start_gap, (wanted - start).abs()
         if largest is None or not bool((gap > largest).any()):
             return
-        row, joint = divmod(int(gap.argmax()), gap.shape[1])
+        row, joint = divmod(int(gap.argmax()), gap.shape[-1])
+        stands, begins = (float(q.flatten()[gap.argmax()]) for q in (start, wanted))
         raise DataError(
             f"joint {self.kinematics.joint_names[joint]!r} of robot {row} stands at "
-            f"{float(start[row, joint]):.4g} rad, but the skill begins at "
-            f"{float(wanted[row, joint]):.4g} rad: the order of the state's entries "
-            "(--policy.state_names) or their unit (--policy.units) is wrong, or the robot has "
-            f"to be brought to the start first. Further than {largest} rad is refused "
+            f"{stands:.4g} rad, but the skill begins at {begins:.4g} rad: the "
+            "order of the state's entries (--policy.state_names) or their unit "
+            "(--policy.units) is wrong, or the robot has to be brought to the start first. "
+            f"Further than {largest} rad is refused "
             "(--policy.largest_start_gap, null for any)"
         )
 

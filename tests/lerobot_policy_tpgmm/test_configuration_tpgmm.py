@@ -1,16 +1,22 @@
 """What ``config.json`` holds: defaults, overrides, and values that are refused."""
 
+import copy
 import inspect
 
 import pytest
+import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_policy
 
 from lerobot_policy_tpgmm.configuration_tpgmm import HYPERPARAMETERS, TPGMMConfig
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.policies import loaded
-from tpgmm_torch import TaskParameterizedGMM
+from tests.support.skills import small_bottle
+from tpgmm_torch import Hold, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
+
+HANDED_OVER = [Hold("bottle", "l_hand", 4.3, 5.0), Hold("bottle", "r_hand", 5.0)]
 
 
 def test_what_the_estimator_defaults_to_is_the_default():
@@ -47,8 +53,39 @@ def test_fields_can_be_overridden(saved):
 
 
 @pytest.mark.parametrize(
+    ("override", "wanted"),
+    [
+        ('--holds=["bottle@l_hand:4.3-5.2"]', [Hold("bottle", "l_hand", 4.3, 5.2)]),
+        ('--holds=["bottle@l_hand:4.3-5","bottle@r_hand:5-"]', HANDED_OVER),
+        ("--holds=[]", []),
+        ("--clock=localizing", []),  # as it was saved
+    ],
+)
+def test_holds_can_be_overridden(saved, override, wanted):
+    policy = loaded(saved, override, env_cfg=make_env_config("bottle_shaking"))
+    assert policy.to_estimator().holds_ == tuple(wanted)
+
+
+def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):
+    model = copy.copy(small_bottle())
+    model.holds_ = tuple(HANDED_OVER)
+    policy = TPGMMPolicy.from_estimator(model)
+    policy.save_pretrained(tmp_path)
+    again = TPGMMPolicy.from_pretrained(tmp_path)
+    assert again.config == policy.config
+    back = again.to_estimator()
+    assert back.holds_ == model.holds_
+    assert torch.equal(back.acceleration_, model.acceleration_)
+    assert torch.equal(back.jerk_, model.jerk_)
+    for name, bound in vars(model.motion_bounds()).items():
+        assert torch.equal(getattr(back.motion_bounds(), name), bound)
+
+
+@pytest.mark.parametrize(
     ("field", "value"),
     [
+        ("clock", "sundial"),
+        ("patience", 0.0),
         ("feedback", "velocity"),
         ("loss", "hinge"),
         ("alignment", "guess"),
@@ -64,6 +101,18 @@ def test_fields_can_be_overridden(saved):
 def test_a_value_that_is_none_is_refused(field, value):
     with pytest.raises((ValueError, TypeError), match=field):
         TPGMMConfig(device="cpu", **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"holds": ["bottle"]}, "not of the form FRAME@LINK:BEGIN-END"),
+        ({"smoothing": -1.0}, "cutoff of OneEuro is positive"),
+    ],
+)
+def test_a_setting_of_the_controller_that_cannot_be_is_refused(options, message):
+    with pytest.raises(DataError, match=message):
+        TPGMMConfig(device="cpu", **options)
 
 
 def test_a_policy_without_anything_to_learn_from_is_refused():

@@ -22,6 +22,16 @@ def fitted() -> TPGMMPolicy:
     return TPGMMPolicy.from_estimator(small_bottle())
 
 
+#: What plays a skill as it was at the start.
+OPEN = {"closed_loop": False, "follow_frames": False, "clock": "even"}
+
+
+@cache
+def played() -> TPGMMPolicy:
+    """The same, open loop; not to be changed."""
+    return policy(**OPEN)
+
+
 def policy(**options: object) -> TPGMMPolicy:
     return TPGMMPolicy.from_estimator(small_bottle(), **options)
 

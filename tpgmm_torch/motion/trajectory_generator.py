@@ -178,7 +178,7 @@ def _plan(asked: InputParameter) -> Trajectory | None:
     plan = Trajectory(size)
     try:
         Ruckig(size).calculate(asked, plan)
-    except RuckigError:
+    except (RuckigError, ValueError):  # it has no name for a motion that takes hours
         return None
     return plan
 

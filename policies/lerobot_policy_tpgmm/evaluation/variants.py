@@ -17,8 +17,8 @@ OPEN_LOOP = "tpgmm-open-loop"
 #: Variants with a name of their own. A gap at the start is no reason to give up here.
 NAMED: Mapping[str, str] = MappingProxyType(
     {
-        OPEN_LOOP: "tpgmm --policy.feedback=reference --policy.follow_frames=false "
-        "--policy.largest_start_gap=null"
+        OPEN_LOOP: "tpgmm --policy.closed_loop=false --policy.clock=even "
+        "--policy.follow_frames=false --policy.largest_start_gap=null"
     }
 )
 OPTION = "--policy."

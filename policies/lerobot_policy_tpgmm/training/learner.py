@@ -188,9 +188,7 @@ class Learner:
             log.info("EM: fitting %d components", config.n_components)
             model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
-            config.n_steps = len(mixture.time)
-            config.shown = None if model.shown_ is None else model.shown_.config()
-            config.holds = list(map(str, model.holds_))
+            config.note(model)
             log.info(
                 "%d components fitted by %d steps of EM: the policy is trained",
                 config.n_components,
