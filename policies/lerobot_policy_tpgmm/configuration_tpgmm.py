@@ -148,8 +148,9 @@ class TPGMMConfig(StatePolicyConfig):
         ``"waiting"`` or ``"localizing"``, with options.
     smoothing : float or None, default=0.5
         Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
-    patience : float, default=0.2
-        How long a robot goes on with what it last knew, before it stands [s].
+    patience, frame_patience : float, default=0.2, 1.0
+        How long a robot goes on with the joints and the frames that it saw last, before it
+        stands [s].
     velocity, acceleration, jerk : float, list of float or dict, optional
         Bounds that are tighter than those of the robot and of the demonstrations [rad/s^n].
     fps : float, optional
@@ -225,6 +226,7 @@ class TPGMMConfig(StatePolicyConfig):
     clock: str = "localizing"
     smoothing: float | None = 0.5
     patience: float = 0.2
+    frame_patience: float = 1.0
     velocity: dict[str, float] | list[float] | float | None = None
     acceleration: dict[str, float] | list[float] | float | None = None
     jerk: dict[str, float] | list[float] | float | None = None
@@ -288,7 +290,7 @@ class TPGMMConfig(StatePolicyConfig):
         limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
         return {
             "clock": parse_clock(self.clock),
-            "trust": Trust(patience=self.patience),
+            "trust": Trust(patience=self.patience, frame_patience=self.frame_patience),
             "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
             "feedback": "measured" if self.feedback == "observation" else "reference",
             "bounds": {name: limit for name, limit in limits.items() if limit is not None},

@@ -160,11 +160,11 @@ class Inputs:
         signals = self._signals()
         if all(reading.calm for _, reading in signals) and not self.stale:
             return None
-        held, patience = np.zeros(tuple(self.shape), dtype=bool), self._patience
-        for _, reading in signals:
-            held |= reading.age > patience
-        for age in self.stale.values():
-            held |= ~(age <= patience)
+        held = np.zeros(tuple(self.shape), dtype=bool)
+        for name, reading in signals:
+            held |= reading.age > self._patience(name)
+        for name, age in self.stale.items():
+            held |= ~(age <= self._patience(name))
         return held if held.any() else None
 
     def reasons(self, robots: Mask) -> dict[tuple[int, ...], str]:
@@ -173,20 +173,20 @@ class Inputs:
         for index in map(tuple, np.argwhere(robots).tolist()):
             parts = []
             for name, reading in self._signals():
-                if reading.age[index] > self._patience:
+                if reading.age[index] > self._patience(name):
                     what = WORDS.get(int(reading.why[index]), "was not believed")
                     parts.append(f"{name} {what}, for {float(reading.age[index]):.2g} s")
             for name, age in self.stale.items():
                 old = float(np.broadcast_to(age, self.shape)[index])
-                if not old <= self._patience:
+                if not old <= self._patience(name):
                     parts.append(f"{name} is {old:.2g} s old")
             texts[index] = "; ".join(parts)
         return texts
 
-    @property
-    def _patience(self) -> float:
-        """But for the rounding of a sum of ticks."""
-        return self.trust.patience * (1 + 1e-9)
+    def _patience(self, name: str) -> float:
+        """With a signal, but for the rounding of a sum of ticks."""
+        trust = self.trust
+        return (1 + 1e-9) * (trust.patience if name == "joints" else trust.frame_patience)
 
     def _signals(self) -> list[tuple[str, Reading]]:
         known: list[tuple[str, Reading]] = (

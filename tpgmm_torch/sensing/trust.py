@@ -37,12 +37,14 @@ class Trust:
     A reading that is not finite is lost; one beyond the limits is impossible; one too far from
     the last one has jumped. None of them is used. A jump is believed once the readings have
     stayed there for ``settling``; a jump to what the last reading is in degrees never is. A
-    robot that has had no reading to believe for ``patience`` is held until there is one.
+    robot that has had no reading to believe for its ``patience`` is held until there is one.
 
     Parameters
     ----------
     patience : float
-        How long a robot goes on with the last reading [s].
+        How long a robot goes on with the last reading of its joints [s].
+    frame_patience : float
+        The same of the pose of an object, which is less likely to change [s].
     settling : float
         How long readings have to stay where they jumped to [s].
     beyond : float
@@ -69,6 +71,7 @@ class Trust:
     """
 
     patience: float = 0.2
+    frame_patience: float = 1.0
     settling: float = 0.1
     beyond: float = 0.5
     joint_jump: float = 0.1

@@ -150,7 +150,7 @@ def watched(problem: Problem, robots: slice | int = slice(None), **options) -> C
         "end": 0.2 + LAST,
         "blend": 0.3,
         "bounds": MotionBounds.of(regression.kinematics, acceleration=20.0, jerk=2000.0),
-        "trust": Trust(),
+        "trust": Trust(frame_patience=0.2),
     }
     return Controller(
         regression, problem.state.joints[robots], frames, **{**defaults, **options}

@@ -31,12 +31,12 @@ def test_nothing_told_is_nothing_lost():
 
 def test_what_was_told_once_is_expected():
     inputs = begun().hear(DT, torch.zeros(2), {"cup": CUP})
-    for k in range(1, 20):
+    for k in range(1, 60):
         inputs = inputs.hear(DT, torch.zeros(2), {"cup": None})
-        lost = k * DT > Trust().patience + 1e-9
+        lost = k * DT > Trust().frame_patience + 1e-9
         assert (inputs.untrusted() is not None) == lost
     text = inputs.reasons(inputs.untrusted())[()]
-    assert text == "frame 'cup' is missing or not finite, for 0.38 s"
+    assert text == "frame 'cup' is missing or not finite, for 1.2 s"
     assert torch.equal(inputs.frames["cup"].position, CUP.position)
     assert inputs.hear(DT, torch.zeros(2), {"cup": CUP}).untrusted() is None
 
