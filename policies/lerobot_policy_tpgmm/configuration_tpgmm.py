@@ -143,9 +143,10 @@ class TPGMMConfig(StatePolicyConfig):
     closed_loop : bool, default=True
         Read the joints at every step: the clock looks at them, and a robot stands whose
         joints cannot be believed. Else a skill is played as it was at the start.
-    clock : str, default="localizing"
+    clock : str, default="localizing:initial=anywhere"
         How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
-        ``"waiting"`` or ``"localizing"``, with options.
+        ``"waiting"`` or ``"localizing"``, with options. By default an episode may begin in the
+        middle of the skill.
     smoothing : float or None, default=0.5
         Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
     patience, frame_patience : float, default=0.2, 1.0
@@ -223,7 +224,7 @@ class TPGMMConfig(StatePolicyConfig):
     default_environment_state: list[float] | None = None
     follow_frames: bool = True
     closed_loop: bool = True
-    clock: str = "localizing"
+    clock: str = "localizing:initial=anywhere"
     smoothing: float | None = 0.5
     patience: float = 0.2
     frame_patience: float = 1.0

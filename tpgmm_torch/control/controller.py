@@ -23,6 +23,7 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
@@ -125,6 +126,8 @@ class Controller:
         if bounds is not None:
             self._follower = Follower.at(bounds, self.reference) if at_rest else None
             self._position_bounds = bounds.lower, bounds.upper
+        self._search = PostureSearch()
+        self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity = torch.zeros_like(self.reference)
         shape = self.reference.shape[:-1]
         self._codes = torch.zeros(shape, dtype=torch.int8, device=self.reference.device)
@@ -216,10 +219,10 @@ class Controller:
             )
         self.holding = self.holding.advance(time, at, seen, told)
         estimate = self._estimated(time, at)
-        wanted = estimate.joints
-        if self._fading:
-            wanted = wanted + self._fade(estimate.joints, 0.0 if last is None else dt)
-        wanted = self._regression.kinematics.retract(wanted)
+        shift = self._fade(estimate.joints, 0.0 if last is None else dt)
+        wanted = self._shifted(estimate.joints, shift)
+        if self._follower is not None and last is not None and not self._follows(wanted, dt):
+            wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
         if measured is not None and (away := self._driven_away(measured)) is not None:
             # what drove them there is not fought: they go on from where they stand
             wanted = torch.where(away.unsqueeze(-1), measured, wanted)
@@ -250,6 +253,39 @@ class Controller:
         untrusted = inputs.untrusted()
         halted = None if untrusted is None else torch.as_tensor(untrusted)
         return inputs.measured, halted
+
+    def _shifted(self, joints: Tensor, shift: Tensor | None) -> Tensor:
+        if shift is not None:
+            joints = joints + shift
+        return self._regression.kinematics.retract(joints)
+
+    def _follows(self, wanted: Tensor, dt: float) -> bool:
+        """Whether all robots can be where they are wanted, as in an ordinary tick."""
+        if self._search.active is not None or self._follower is None:
+            return False
+        self._taken = self._follower.take(wanted, dt)
+        return self._taken is not None
+
+    def _searched(
+        self, time: Tensor, at: Tensor, estimate: Estimate, wanted: Tensor, dt: float
+    ) -> Tensor:
+        """What is wanted where one step of the linearised product leads too far."""
+        assert self._follower is not None and self._position_bounds is not None
+        asked = ~self._follower.fits(wanted, dt) & wanted.isfinite().all(-1)
+        holding = self.holding
+        try:
+            joints, self._search = self._search.advance(
+                self._regression, time, at, holding.frames, estimate, self._position_bounds,
+                asked, self._carrying if holding.carries else None,
+            )  # fmt: skip
+        except TPGMMError:
+            if self._trust is None:
+                raise
+            return estimate.joints
+        return joints
+
+    def _carrying(self, joints: Tensor) -> RobotState:
+        return self.holding.state(self._regression.kinematics.state(joints))
 
     def _estimated(self, time: Tensor, at: Tensor) -> Estimate:
         """What the model asks for; not finite for robots of which it cannot tell."""
@@ -318,8 +354,10 @@ class Controller:
         self._since = torch.where(robots, -1.0, self._since)  # their gap is not known yet
         self._fading = self._blend > 0
 
-    def _fade(self, estimate: Tensor, dt: float) -> Tensor:
+    def _fade(self, estimate: Tensor, dt: float) -> Tensor | None:
         """What is left of the difference between where robots went on and the estimate."""
+        if not self._fading:
+            return None
         fresh = self._since < 0
         if bool(fresh.any()):
             gap = self.reference - estimate
@@ -352,8 +390,8 @@ class Controller:
                 fastest = self._bounds.velocity
                 moving = ((wanted - last) / dt).clamp(-fastest, fastest)
                 self._follower = Follower.at(self._bounds, last, moving)
-            follower = self._follower.take(wanted, dt)
-            if follower is None:
+            follower, self._taken = self._taken, None
+            if follower is None or follower.reference is not wanted:
                 follower = self._follower.advance(wanted, dt)
                 lost = ~wanted.isfinite().all(-1)  # and is brought to rest
             self._follower = follower

@@ -253,7 +253,8 @@ def test_a_robot_that_is_driven_away_goes_on_from_there():
     for _ in range(60):
         before = controller.reference
         controller.step(0.01, torch.stack((away[0], controller.reference[1])))
-    assert (controller.reference[0] - away[0]).abs().max() < 0.35
+    # 0.3 rad, and what it moves in 0.15 s, are no reason to go there
+    assert (controller.reference[0] - away[0]).abs().max() < 0.45
     assert (controller.reference[1] - before[1]).abs().max() < 0.05
 
 
