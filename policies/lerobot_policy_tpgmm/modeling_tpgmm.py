@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -37,6 +38,51 @@ log = logging.getLogger(__name__)
 
 #: When an observation was made [s], of environments and robots that tell.
 TIMESTAMP = "observation.timestamp"
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """The last chunk of an episode, to go on from.
+
+    Parameters
+    ----------
+    first : Controller
+        After its first action: what it was told last.
+    moments : list of Controller
+        After each of its actions.
+    joints : Tensor of shape (B, chunk_size, n_joints)
+        The references.
+    actions : Tensor of shape (B, chunk_size, n_action)
+    timestamp : float or None
+        Of the observation that it was made from [s].
+    rate : float
+        Actions per second.
+    """
+
+    first: Controller
+    moments: list[Controller]
+    joints: Tensor
+    actions: Tensor
+    timestamp: float | None
+    rate: float
+
+    def passed(
+        self, measured: Tensor, timestamp: float | None, left_over: Tensor | None
+    ) -> int:
+        """The index of the action that was sent last."""
+        last = len(self.moments) - 1
+        if left_over is not None:
+            # rows of zeros fill up what is shorter than LeRobot's horizon
+            same = (self.actions[0] == left_over[:1]).all(-1) if len(left_over) else None
+            if same is None or not bool(left_over.any()):
+                return last
+            if bool(same.any()):
+                return max(int(same.nonzero()[-1]) - 1, 0)
+        if timestamp is not None and self.timestamp is not None:
+            steps = round((timestamp - self.timestamp) * self.rate) - 1
+            return min(max(steps, 0), last)
+        gap = (self.joints - measured[:, None]).square().sum((0, 2))
+        return int(gap.nan_to_num(torch.inf).argmin())
 
 
 class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
@@ -210,6 +256,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
+        self._chunk: Chunk | None = None
         self._timestamp: Tensor | None = None
 
     @torch.no_grad()
@@ -238,25 +285,59 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return self.joints.action(self._step(self._controller, batch))
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next ``chunk_size`` references, open loop; the episode does not advance.
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Tensor],
+        *,
+        prev_chunk_left_over: Tensor | None = None,
+        **_unused: Any,
+    ) -> Tensor:
+        """The next ``chunk_size`` references, of robots that follow.
+
+        Called again in an episode, it goes on from the step of the last chunk at which the
+        robot is: before the first action that is left over, where LeRobot's ``rtc`` tells
+        that, else where the timestamp says, else where the posture is nearest.
 
         Parameters
         ----------
         batch : dict of str to Tensor
             As for :meth:`select_action`.
+        prev_chunk_left_over : Tensor of shape (n, n_action), optional
+            Actions of the last chunk that were not sent yet.
 
         Returns
         -------
         Tensor of shape (B, chunk_size, n_action)
         """
-        begun = self._controller
-        ahead = self._begin(batch) if begun is None else begun.copy()
-        references = [self._step(ahead, batch)]
+        now = batch.get(TIMESTAMP)
+        timestamp, last = None if now is None else float(now.flatten()[0]), self._chunk
+        if self._controller is not None:  # select_action says how far the episode is
+            ahead = self._controller.copy()
+        elif last is None:
+            ahead = self._begin(batch)
+        else:
+            passed = last.passed(self._observed(batch), timestamp, prev_chunk_left_over)
+            measured, poses = self._told(batch, last.first)
+            ahead = last.first.resumed(
+                last.moments[passed], passed / self.config.rate, measured, poses
+            )
+        told = self._timestamp
+        references = [self._step(ahead, batch, 1 / self.config.rate)]
+        self._timestamp = told
+        moments, first, ahead = [ahead], ahead, ahead.ahead()
         while len(references) < self.config.chunk_size:
             ahead.step(1 / self.config.rate)
             references.append(ahead.reference.reshape(references[0].shape))
-        return self.joints.action(torch.stack(references, dim=1))
+            moments.append(ahead.copy())
+        joints = torch.stack(references, dim=1)
+        actions = self.joints.action(joints)
+        if self._controller is None:
+            self._chunk = Chunk(first, moments, joints, actions, timestamp, self.config.rate)
+        return actions
+
+    def supports_rtc(self) -> bool:
+        """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
+        return True
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
@@ -267,26 +348,35 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return model.controller(joints, frames, **self.config.control())
 
-    def _step(self, controller: Controller, batch: Mapping[str, Tensor]) -> Tensor:
-        """The references (B, n_joints) of the next action."""
-        start, first, config = controller.reference, controller.command is None, self.config
-        measured, begun = self._observed(batch), len(start) if start.ndim == 2 else 1
+    def _told(
+        self, batch: Mapping[str, Tensor], controller: Controller
+    ) -> tuple[Tensor | None, dict[str, Any] | None]:
+        """Joints and poses that a controller is told."""
+        shape, config, measured = controller.reference.shape, self.config, self._observed(batch)
+        begun = shape[0] if len(shape) == 2 else 1
         if len(measured) != begun:
             raise ShapeError(
                 f"the episode began with {begun} robots, now there are {len(measured)}: "
                 "call reset() between episodes"
             )
+        first = controller.command is None
         poses = self.frames.poses(batch) if config.follow_frames and not first else {}
-        passed = self._passed(batch)
-        if start.ndim == 1:
-            measured, passed = measured[0], float(passed)
+        if len(shape) == 1:
+            measured = measured[0]
             poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
-        command = controller.step(
-            passed, measured if config.closed_loop else None, poses or None
-        )
+        return measured if config.closed_loop else None, poses or None
+
+    def _step(
+        self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
+    ) -> Tensor:
+        """The references (B, n_joints) of the next action."""
+        start, first = controller.reference, controller.command is None
+        told = self._told(batch, controller)
+        passed = self._passed(batch) if passed is None else passed
+        command = controller.step(float(passed) if start.ndim == 1 else passed, *told)
         if first:
             self._check_start(start, command.estimate.joints)
-        return controller.reference.reshape(begun, -1)
+        return controller.reference.reshape(-1, start.shape[-1])
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
         """Seconds since the last observation."""

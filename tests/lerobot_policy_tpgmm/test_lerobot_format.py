@@ -119,3 +119,29 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
         follows = wanted.joints[:12, index].rad2deg()
         np.testing.assert_allclose(moved[:12], follows, atol=1e-2)
     assert np.ptp([action["l_elbow.pos"] for action in sent]) > 1  # degrees
+
+
+def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
+    observed = {key: value[:1] for key, value in batch().items()}
+    changed(fitted(), control_fps=20.0).save_pretrained(tmp_path / "policy")
+    start = dict(zip((f"{n}.pos" for n in NAMES), observed[STATE][0].tolist(), strict=True))
+    start |= dict(
+        zip(POSE_NAMES, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True)
+    )
+    done, log = rollout(
+        tmp_path / "policy", start, tmp_path, "--fps=20", "--inference.type=rtc",
+        "--inference.queue_threshold=30", f"--policy.state_names={json.dumps(list(start))}",
+        f"--policy.action_names={json.dumps(list(start)[:17])}",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "RTC inference error" not in done.stderr
+    sent = json.loads(log.read_text())
+    assert len(sent) >= 12
+    moved = np.array([list(action.values()) for action in sent])
+    time = torch.arange(100, dtype=torch.float64) / 20
+    [wanted] = small_bottle().predict(situations(observed, time), candidates=False)
+    # whenever a chunk comes, it goes on from what was sent before
+    step = np.abs(np.diff(moved, axis=0)).max()
+    assert step < 2 * float(wanted.joints.diff(dim=0).abs().max())
+    np.testing.assert_allclose(moved[0], wanted.joints[0], atol=0.05)
+    assert np.ptp(moved, axis=0).max() > 0.05

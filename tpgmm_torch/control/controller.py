@@ -235,6 +235,33 @@ class Controller:
         """The same moment, to look ahead from."""
         return copy.copy(self)  # its tensors are replaced, never changed
 
+    def ahead(self) -> Self:
+        """The same moment, to look ahead from: robots will follow, and objects will stay."""
+        other = self.copy()
+        other._inputs = None
+        return other
+
+    def resumed(
+        self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
+    ) -> Self:
+        """What was looked ahead to has come, and what is told counts again.
+
+        Parameters
+        ----------
+        moment : Controller
+            Out of steps of :meth:`ahead`.
+        passed : float
+            Seconds between this moment and that one.
+        joints, frames
+            As for :meth:`step`, at that moment.
+        """
+        other = moment.copy()
+        other._inputs = self._inputs
+        if self._inputs is not None and passed > 0:
+            other._inputs = self._inputs.hear(passed, joints, frames)
+            other._frames = other._inputs.frames
+        return other
+
     def _hear(
         self,
         dt: float,
