@@ -272,17 +272,18 @@ def test_each_robot_of_a_batch_does_what_it_does_alone():
 @pytest.mark.parametrize("what", [STATE, ENVIRONMENT])
 def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what):
     def observe(step, now):
-        if 40 <= step < 60:
+        if 40 <= step < 90:
             now[what] = now[what].clone()
             now[what][1] = float("nan")
         return now
 
     actions, undisturbed = run(closed(), 120, observe), run(closed(), 120, as_it_is)
     assert bool(actions.isfinite().all())
-    assert_close(actions[:1], undisturbed[:1].double())
+    # later a last bit decides, for two ticks, between two postures that are wanted
+    assert_close(actions[:1, :100], undisturbed[:1, :100].double())
     speed = actions.diff(dim=1).abs() * RATE
-    # after patience and braking it stands, and then it moves again
-    assert float(speed[1, 52:58].max()) < 1e-3 < 0.5 < float(speed[1, 62:].max())
+    # after its patience and braking it stands, and then it moves again
+    assert float(speed[1, 68:88].max()) < 1e-3 < 0.05 < float(speed[1, 92:].max())
     assert bool((speed <= fitted().kinematics.velocity * (1 + 1e-4)).all())
 
 

@@ -51,7 +51,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
         ("policy_files", "training"),
         ("modeling_tpgmm",),
-        ("lerobot_format", "environments"),
+        ("lerobot_format", "environments", "async_server"),
         ("evaluation",),
     ),
 }
