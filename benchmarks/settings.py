@@ -18,6 +18,7 @@ CASES = {
     "processes": "processes",
     "kinematics": "kinematics",
     "step": "control_step",
+    "exported": "exported_tick",
     "batch": "batched_step",
     "predict": "prediction",
     "curves": "curves",

@@ -22,6 +22,7 @@ from tpgmm_torch import gaussians
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.control.export import export
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
@@ -526,6 +527,58 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         finally:
             self._untried = untried
         return self
+
+    def export(
+        self,
+        path: str | Path,
+        *,
+        clock: Clock | str = "even",
+        bounds: MotionBounds | Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write a controller of one robot that loads in an instant, without a compiler.
+
+        It is the controller with ``trust=None``: one compiled graph from what is measured to
+        the next reference, state included, for Python (:func:`load_exported`) and for C++
+        (AOTInductor's package, .pt2). Making it takes about a minute and a compiler. It runs
+        on processors like this one's with this version of PyTorch.
+
+        Parameters
+        ----------
+        path : str or Path
+            A file, replaced in one step.
+        clock : Clock or str, default="even"
+            An :class:`EvenClock` or a :class:`WaitingClock`.
+        bounds : MotionBounds or mapping, optional
+            As for :meth:`controller`.
+
+        Raises
+        ------
+        DependencyError
+            If there is no C++ compiler.
+        DataError
+            If the model is none that :meth:`compile` serves, holds objects, lives on another
+            device than the processor or does not keep limits, or the clock is another one.
+        NotFittedError
+            If the model is not fitted.
+        """
+        self._check_fitted()
+        if not isinstance(bounds, MotionBounds):
+            bounds = self.motion_bounds(**(bounds or {}))
+        if self.holds_ or not self.keep_limits or self.time_.device.type != "cpu":
+            raise DataError(
+                "export() serves models on the CPU with keep_limits=True in which nothing is "
+                f"held; this one has keep_limits={self.keep_limits}, holds={self.holds_} and "
+                f"is on {self.time_.device}: use controller()"
+            )
+        export(
+            self.regression(),
+            path,
+            begin=float(self.time_[0]),
+            end=float(self.time_[-1]),
+            blend=self.blend,
+            bounds=bounds,
+            clock=parse_clock(clock) if isinstance(clock, str) else clock,
+        )
 
     def controller(
         self,

@@ -35,13 +35,15 @@ __all__ = ["CompiledRegression", "check_compiler"]
 PART = 64
 
 
-def check_compiler(backend: str) -> None:
+def check_compiler(backend: str, purpose: str = "compile") -> None:
     """Refuse to begin what cannot be finished.
 
     Parameters
     ----------
     backend : str
         Only ``"inductor"`` needs a compiler.
+    purpose : str
+        The method that needs it.
 
     Raises
     ------
@@ -51,7 +53,7 @@ def check_compiler(backend: str) -> None:
     names = (os.environ.get("CXX"), "g++", "clang++", "c++")
     if backend == "inductor" and not any(name and shutil.which(name) for name in names):
         raise DependencyError(
-            "compile() needs a C++ compiler, and there is none (g++, clang++, or what CXX "
+            f"{purpose}() needs a C++ compiler, and there is none (g++, clang++, or what CXX "
             "names): install one, or use the model as it is; the results are the same"
         )
 
@@ -84,7 +86,7 @@ class CompiledRegression(Regression):
         """One tick from the joints q_{t-1}; see :meth:`Regression.tick`."""
         if isinstance(joints, RobotState):
             return super().tick(time, joints, frames, bounds)
-        names, like = self._served_frames, self.kinematics.lower
+        names, like = self.served_frames, self.kinematics.lower
         poses = [frames[name] for name in names if name in frames]
         learning = torch.is_grad_enabled() and joints.requires_grad
         components = self._components_at(time)
@@ -138,7 +140,7 @@ class CompiledRegression(Regression):
         with torch.inference_mode(False), torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what torch asks of itself
             examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
-            program = torch.export.export(_Tick(self, self._served_frames), examples)
+            program = torch.export.export(Tick(self, self.served_frames), examples)
             if self.backend != "inductor":
                 graph = torch.compile(program.module(), backend=self.backend, fullgraph=True)
                 return lambda inputs: graph(*inputs)
@@ -149,7 +151,7 @@ class CompiledRegression(Regression):
                 return torch._inductor.aoti_load_package(path).loader.run
 
     @cached_property
-    def _served_frames(self) -> tuple[str, ...]:
+    def served_frames(self) -> tuple[str, ...]:
         """Names of the frames, of a model that the graph serves."""
         kinematics, update = self.kinematics, self._update
         terms = None
@@ -178,7 +180,7 @@ class CompiledRegression(Regression):
         return components
 
 
-class _Tick(torch.nn.Module):
+class Tick(torch.nn.Module):
     """:meth:`Regression.fuse` from joints, poses of objects, time and components."""
 
     def __init__(self, regression: Regression, names: Sequence[str]) -> None:

@@ -240,6 +240,28 @@ class Regression:
             total = total + one.log_density(coordinates, time)
         return torch.logsumexp(total, -1)
 
+    def windows(self, begin: float, end: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Which components count between two instants, as tables for a graph.
+
+        Returns
+        -------
+        edges : Tensor of shape (W - 1,)
+            Instants between windows [s].
+        index : Tensor of shape (W, A)
+            Components that count; windows with fewer have others too,
+        log_peak : Tensor of shape (W, A)
+            which have no weight in :class:`TimeMarginals`.
+        """
+        edges, sets = torch.empty(0, dtype=torch.float64), [(*range(len(self.log_weights)),)]
+        if self._active is not None:
+            edges, sets = self._active.between(begin, end)
+        width = max(map(len, sets))
+        index = torch.tensor([(*one, *one[:1] * (width - len(one))) for one in sets])
+        log_peak = self._marginals.log_peak.detach()[index]
+        for row, one in zip(log_peak, sets, strict=True):
+            row[len(one) :] = -torch.inf
+        return edges, index, log_peak
+
     def candidates(
         self,
         time: Tensor,

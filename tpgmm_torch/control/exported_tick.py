@@ -1,0 +1,365 @@
+"""A tick of one robot with the state of its controller: tensors in, tensors out.
+
+What :class:`~tpgmm_torch.control.controller.Controller` does with ``trust=None``, without
+Python: clock, components, kinematics, update, mixing, blend and bounds of motion are one graph
+for ``torch.export``. A wanted posture becomes the reference wherever
+:class:`~tpgmm_torch.motion.follower.Follower` takes it exactly. Elsewhere a joint moves with
+the constant jerk that lets it come to rest at what is wanted, if it can be stopped within
+all bounds after that; else it is stopped. Because stopping keeps the bounds, and what follows
+a part of a stop is the rest of it, every tick keeps them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.control.clocks import RESTART, EvenClock, WaitingClock
+from tpgmm_torch.control.command import Status
+from tpgmm_torch.control.compiled_tick import Tick
+from tpgmm_torch.motion.follower import CRUISE, HASTE, MEMORY, ROUNDING
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.regression import Regression
+
+__all__ = ["BrakingLaw", "ExportedTick"]
+
+#: Numbers of a state that are not of a joint: progress, status, whether it has begun, the last
+#: tick's duration, time since the robot went on, rate of progress.
+SCALARS = 6
+#: Numbers of each joint: position, velocity and acceleration of the motion, first and second
+#: difference of the references, the wanted posture and its drift, whether the joint is behind
+#: it, the gap that fades, where a servo would be. Behind them is the last covariance.
+ROWS = 10
+#: Bounds that are not there.
+ENDLESS = 1e9
+#: Into how many parts the span of jerks is divided, and how often.
+PARTS, ROUNDS = 16, 3
+
+Motion = tuple[Tensor, Tensor, Tensor]
+
+
+class ExportedTick(torch.nn.Module):
+    """``forward(state, dt, joints, frames) -> state, reference, velocity, covariance``.
+
+    Parameters
+    ----------
+    regression : Regression
+        Of a model that the compiled tick serves.
+    names : sequence of str
+        Its frames, in order.
+    begin, end, blend : float
+        As for the controller [s].
+    bounds : MotionBounds
+    clock : EvenClock or WaitingClock
+    """
+
+    def __init__(
+        self,
+        regression: Regression,
+        names: Sequence[str],
+        begin: float,
+        end: float,
+        blend: float,
+        bounds: MotionBounds,
+        clock: EvenClock | WaitingClock,
+    ) -> None:
+        super().__init__()
+        self._tick, self._like = Tick(regression, names), regression.kinematics.lower
+        self._begin, self._end, self._blend, self._clock = begin, end, blend, clock
+        arrivals = clock.arrivals if isinstance(clock, WaitingClock) else ()
+        self._stops = torch.tensor([*arrivals, torch.inf], dtype=torch.float64)
+        self._brakes = BrakingLaw(bounds)
+        self._all = regression._components
+        self._edges, self._table, self._peaks = regression.windows(begin, end)
+
+    @property
+    def size(self) -> int:
+        """How many numbers a state has; zeros begin the skill where the robot stands."""
+        joints = len(self._like)
+        return SCALARS + ROWS * joints + joints**2
+
+    def forward(
+        self, state: Tensor, dt: Tensor, joints: Tensor, frames: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """One tick.
+
+        Parameters
+        ----------
+        state : Tensor of shape (size,)
+            What the last tick returned.
+        dt : Tensor of shape ()
+            Seconds since then.
+        joints : Tensor of shape (n_joints,)
+            Measured [rad or m].
+        frames : Tensor of shape (F, 7)
+            Positions and quaternions (w, x, y, z) of objects.
+        """
+        timely, heard = (dt > 0) & dt.isfinite(), joints.isfinite().all()
+        norms = torch.linalg.vector_norm(frames[:, 3:], dim=-1, keepdim=True)
+        heard = heard & frames.isfinite().all() & (norms > 0).all()
+        before, _, begun, last_dt, since, rate = state[:SCALARS].unbind()
+        begun = begun > 0
+        count = len(joints)
+        rows, last = state[SCALARS:].split((ROWS * count, count * count))
+        rows, last = rows.view(ROWS, count), last.view(count, count)
+        measured = torch.where(heard, joints, rows[0])
+        standing = torch.zeros_like(rows)
+        standing[0], standing[5], standing[9] = measured, measured, measured
+        rows = torch.where(begun, rows, standing)
+        before = torch.where(begun, before, self._begin)
+        rate = torch.where(begun, rate, 1.0)
+        passed = torch.where(begun & heard & timely, dt, 0.0)
+        time, rate, expected = self._progress(before, rate, passed, rows, measured, last)
+        ended = begun & (before >= self._end) & (time >= self._end)
+
+        unit = torch.eye(7, dtype=frames.dtype, device=frames.device)[3]
+        poses = torch.where(heard, frames / torch.cat((norms.new_ones(1, 3).expand(
+            len(frames), 3), norms.expand(-1, 4)), 1), unit)  # fmt: skip
+        mean, covariance = self._estimate(time, rows[0], poses)
+        mean = torch.clamp(mean, self._brakes.lower, self._brakes.upper)
+        gap = torch.where(begun, rows[8], rows[0] - mean)
+        since = torch.where(begun, since + passed, 0.0)
+        wanted = mean
+        if self._blend > 0:
+            wanted = mean + (1 - minimum_jerk(since / self._blend)) * gap
+        wanted = torch.where(ended, rows[5], wanted)
+        known = wanted.isfinite().all()
+        moves = heard & known
+        # what cannot be known brings the robot to rest
+        step = torch.where(timely, dt, 1.0)
+        moved = self._brakes.follow(rows, torch.where(moves, wanted, rows[5]), moves, step,
+                                    last_dt)  # fmt: skip
+        status = torch.where(
+            moves & (timely | ~begun),
+            torch.where(ended, float(Status.FINISHED.code), float(Status.RUNNING.code)),
+            float(Status.HOLDING.code),
+        )
+        covariance = torch.where(moves & ~ended, covariance, last)
+        kept = torch.stack((torch.where(known, gap, 0.0), expected))
+        # the first reference is where the robot stands; nothing moves in no time
+        after = torch.cat((torch.where(begun, moved, rows[:8]), kept))
+        starts = heard & known & ~begun
+        after_dt = torch.where(begun, dt, 0.0)
+        scalars = torch.stack((time, status, (begun | starts).to(time), after_dt, since, rate))
+        new = torch.cat((scalars, after.flatten(), covariance.flatten()))
+        halted = torch.cat((state[:1], status[None], state[2:]))
+        # who has not begun begins anew
+        new = torch.where((begun & timely) | starts, new, halted)
+        position, velocity = new[SCALARS : SCALARS + 2 * count].view(2, count)
+        reference = torch.where(new[2] > 0, position, joints)
+        return new, reference, velocity.clone(), covariance
+
+    def _progress(
+        self,
+        now: Tensor,
+        rate: Tensor,
+        passed: Tensor,
+        rows: Tensor,
+        measured: Tensor,
+        covariance: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Time, rate and where a servo would be: the formulas of the clocks."""
+        clock, reference, expected = self._clock, rows[0], rows[9]
+        late = stop = None
+        if isinstance(clock, WaitingClock):
+            expected = reference + torch.exp(-passed / clock.lag) * (expected - reference)
+            error = (measured - reference).abs()
+            usual = (reference - expected).abs() + clock.floor
+            excess = (
+                error / (usual + covariance.diagonal().sqrt())
+            ).amax() / clock.tolerance - 1
+            excess = excess.clamp(0, 1)
+            waits = (error / usual).amax() > clock.tolerance
+            follows = torch.where(waits, 1 - excess**2 * (3 - 2 * excess), 1.0)
+            rate = torch.minimum(follows, rate + passed / RESTART)
+            if clock.arrivals:
+                later = self._stops >= now
+                stop = torch.where(later, self._stops, torch.inf).amin()
+                late = error.amax() > clock.floor
+        step = clock.speed * passed * rate
+        time = now + step
+        time = torch.where(time > self._end - 1e-6 * step, self._end, time)
+        if late is not None and stop is not None:
+            time = torch.where(late, torch.minimum(time, stop), time)
+        return time, rate, expected
+
+    def _estimate(self, time: Tensor, joints: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """The model's mean (n,) and covariance (n, n)."""
+        window = torch.bucketize(time[None], self._edges, right=True)
+        index = self._table.index_select(0, window)[0]
+        marginals, [conditionals] = self._all.marginals, self._all.conditionals
+        parts = [
+            self._peaks.index_select(0, window)[0],
+            marginals.mean[index],
+            marginals.precision[index],
+        ]
+        parts += [tensor[index] for tensor in vars(conditionals).values()]
+        poses = poses.to(self._like)
+        rows = [joints.to(self._like)[None], *(pose[None, :3] for pose in poses)]
+        rows += [pose[None, 3:] for pose in poses]
+        mean, covariance, _ = self._tick(*rows, time.to(self._like), *parts)
+        return mean[0].to(time), covariance[0].to(time)
+
+
+class BrakingLaw:
+    """The bounds of a motion, and what moves within them."""
+
+    def __init__(self, bounds: MotionBounds) -> None:
+        limits = bounds.arrays
+        names = "lower", "upper", "velocity", "acceleration", "jerk"
+        for name in names:
+            tensor = torch.from_numpy(getattr(limits, name)).double().clamp(-ENDLESS, ENDLESS)
+            setattr(self, name, tensor)
+
+    lower: Tensor
+    upper: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    jerk: Tensor
+
+    def follow(
+        self, rows: Tensor, wanted: Tensor, moves: Tensor, dt: Tensor, last_dt: Tensor
+    ) -> Tensor:
+        """The rows of a state that are of the motion, a tick later: (8, n_joints)."""
+        position, velocity, acceleration, slope, bend, before, drift, behind = rows[:8]
+        ago = torch.where(last_dt > 0, last_dt, dt)
+        last = torch.where(last_dt > 0, last_dt, 0.0)
+        # what stands outside its limits may stay as far out as it is, and come back
+        low, high = torch.minimum(self.lower, position), torch.maximum(self.upper, position)
+        target = torch.clamp(wanted, low, high)
+        exact_slope = (target - position) / dt
+        exact_bend = (exact_slope - slope) * (2 / (dt + torch.where(last > 0, last, dt)))
+        exact = target, exact_slope + exact_bend * (dt / 2), exact_bend  # (F1)
+        change = (exact_bend - bend).abs()
+        fits = (exact_bend.abs() <= self.acceleration) & (
+            change <= self.jerk * ((dt + 2 * ago) / 3)
+        )
+        is_behind = behind > 0
+        exact_drift = torch.where(is_behind, (target - before) / dt, exact_slope)
+        joining, onset = (exact_drift - exact_slope) / dt, self.jerk * dt
+        keeps = joining.abs() <= torch.minimum(self.acceleration, onset)
+        keeps = keeps & ((joining - exact_bend).abs() <= onset)
+        fits = fits & (exact_slope.abs() <= self.velocity * (1 + ROUNDING))
+        fits = fits & (keeps | ~is_behind) & self._stops(exact, low, high) & moves
+
+        fastest = torch.minimum(self.velocity, HASTE * self.acceleration)
+        moved = (target - before) / dt
+        turn = torch.where(moved.abs() <= fastest, moved - drift, 0.0)
+        drift = drift + (dt / MEMORY).clamp(max=1.0) * turn
+        drift = torch.clamp(drift, -CRUISE * self.velocity, CRUISE * self.velocity)
+        start = position, velocity, acceleration
+        towards = self._towards(start, target, drift, dt, low, high)
+        braked = self._braked(start, dt)
+        safe = self._stops(towards, low, high) & moves
+        safe = safe & ((towards[0] - position).abs() <= self.velocity * dt * (1 + ROUNDING))
+        chosen = [
+            torch.where(fits, x, torch.where(safe, y, z))
+            for x, y, z in zip(exact, towards, braked, strict=True)
+        ]
+        slope_now = (chosen[0] - position) / dt
+        bend_now = (slope_now - slope) * (2 / (dt + torch.where(last > 0, last, dt)))
+        drift = torch.where(fits, exact_drift, torch.where(moves, drift, 0.0))
+        rest = slope_now, bend_now, target, drift, (~fits).to(target)
+        return torch.stack((*chosen, *rest))
+
+    def _towards(
+        self,
+        start: Motion,
+        target: Tensor,
+        drift: Tensor,
+        dt: Tensor,
+        low: Tensor,
+        high: Tensor,
+    ) -> Motion:
+        """With a constant jerk to where a stop ends at the target, which moves on."""
+        # more jerk ends further on: the most that does not end too far, by trying many at once
+        least, part = -self.jerk, 2 * self.jerk / PARTS
+        tried = torch.arange(1, PARTS + 1, dtype=target.dtype).unsqueeze(-1)
+        for _ in range(ROUNDS):
+            jerk = torch.minimum(least + tried * part, self.jerk)
+            moved = _moved(start, jerk, dt)
+            position, velocity, acceleration = moved
+            lowest, highest = self._range(moved)
+            peak = self._peak(moved)
+            relative = position, velocity - drift, acceleration
+            ahead = self._braked(relative, None)[0] > target
+            mean = (position - start[0]) / dt  # half-way it may have been faster
+            fast = (acceleration > self.acceleration) | (peak.maximum(mean) > self.velocity)
+            slow = (acceleration < -self.acceleration) | (peak.minimum(mean) < -self.velocity)
+            down = fast | (highest > high) | (ahead & ~slow & (lowest >= low))
+            least = torch.minimum(least + (~down).sum(0) * part, self.jerk)
+            part = part / PARTS
+        return _moved(start, least, dt)
+
+    def _peak(self, motion: Motion) -> Tensor:
+        """The speed when the acceleration is given up."""
+        _, velocity, acceleration = motion
+        return velocity + acceleration * acceleration.abs() / (2 * self.jerk)
+
+    def _stops(self, motion: Motion, low: Tensor, high: Tensor) -> Tensor:
+        """Whether it can be stopped within all bounds."""
+        lowest, highest = self._range(motion)
+        speed = torch.maximum(motion[1].abs(), self._peak(motion).abs())
+        within = (lowest >= low - ROUNDING) & (highest <= high + ROUNDING)
+        slow = speed <= self.velocity * (1 + ROUNDING)
+        gentle = motion[2].abs() <= self.acceleration * (1 + ROUNDING)
+        return within & slow & gentle
+
+    def _phases(self, motion: Motion) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """The fastest stop: its side, its greatest deceleration, and how long it takes what.
+
+        With v, a >= 0 on its side the jerk is -J until the acceleration is -m, 0, and J, where
+        ``m^2 = J v + a^2 / 2`` if that is within A.
+        """
+        side = torch.where(self._peak(motion) < 0, -1.0, 1.0)
+        velocity, acceleration = side * motion[1], side * motion[2]
+        lost = (velocity + acceleration.square() / (2 * self.jerk)).clamp(min=0.0)
+        most = torch.minimum(
+            (self.jerk * lost).sqrt(), torch.maximum(self.acceleration, -acceleration)
+        )
+        held = (lost - most.square() / self.jerk) / most.clamp(min=1e-12)
+        phases = (acceleration + most) / self.jerk, held, most / self.jerk
+        return side, most, tuple(phase.clamp(min=0.0) for phase in phases)  # type: ignore[return-value]
+
+    def _braked(self, motion: Motion, dt: Tensor | None) -> Motion:
+        """A part of the fastest stop, or all of it."""
+        side, _, phases = self._phases(motion)
+        left, signs = dt, (-1.0, 0.0, 1.0)
+        for phase, sign in zip(phases, signs, strict=True):
+            now = phase if left is None else torch.minimum(phase, left)
+            motion = _moved(motion, sign * side * self.jerk, now)
+            left = None if left is None else left - now
+        if left is None:
+            return motion
+        over = left > 0  # it stands: no crumb of rounding moves it
+        position, velocity, acceleration = motion
+        return (
+            position,
+            torch.where(over, 0.0, velocity),
+            torch.where(over, 0.0, acceleration),
+        )
+
+    def _range(self, motion: Motion) -> tuple[Tensor, Tensor]:
+        """The lowest and the highest position of the fastest stop."""
+        side, _, _ = self._phases(motion)
+        position, velocity, acceleration = motion[0], side * motion[1], side * motion[2]
+        # who still moves the other way turns
+        root = (acceleration.square() + 2 * self.jerk * velocity).clamp(min=0.0).sqrt()
+        turning = torch.where(velocity < 0, (acceleration - root) / self.jerk, 0.0)
+        turned = _moved(motion, -side * self.jerk, turning.clamp(min=0.0))[0]
+        end = self._braked(motion, None)[0]
+        lowest = torch.minimum(torch.minimum(position, turned), end)
+        return lowest, torch.maximum(torch.maximum(position, turned), end)
+
+
+def _moved(motion: Motion, jerk: Tensor, dt: Tensor) -> Motion:
+    """A constant jerk for a while."""
+    position, velocity, acceleration = motion
+    return (
+        position + dt * (velocity + dt * (acceleration / 2 + dt * (jerk / 6))),
+        velocity + dt * (acceleration + dt * (jerk / 2)),
+        acceleration + dt * jerk,
+    )
