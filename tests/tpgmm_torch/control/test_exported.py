@@ -45,7 +45,8 @@ URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="l
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
 <axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="300" effort="1"/></joint>
 <joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/>
-<origin xyz="0.3 0 0"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="300" effort="1"/>
+<origin xyz="0.3 0 0"/><axis xyz="0 0 1"/>
+<limit lower="-2" upper="2" velocity="300" effort="1"/>
 </joint></robot>"""
 START, DT, TICKS = [0.02, 0.51], 0.01, 130
 
@@ -100,7 +101,7 @@ def test_it_is_the_controller(package, expected):
             (one.reference, other.reference),
             (one.velocity, other.velocity),
             (one.covariance, other.estimate.covariance),
-            (torch.tensor(one.time).double(), other.time),
+            (torch.tensor(one.time, dtype=torch.float64), other.time),
         ):
             torch.testing.assert_close(actual, wanted, rtol=0, atol=1e-9)
         assert one.status.code == int(other.codes)
