@@ -139,9 +139,10 @@ for name, operators in sets.items():
     print(f"{name:18} off the right distance by {errors[name]:.1f} mm (second half)")
 
 # %%
-# For ten new posts the distance is kept to less than a millimetre; the joints alone miss
-# it by more than a centimetre. The picture shows three of them from above; in the first second
-# the start posture leads into the model's reference, across the circle if need be.
+# For ten new posts the distance is kept to a few millimetres, as far as the bounds on the
+# joints' acceleration allow; the joints alone miss it by more than a centimetre. The picture
+# shows three of them from above; in the first second the start posture leads into the model's
+# reference, across the circle if need be.
 
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.8), layout="constrained")
 for number, axes in enumerate(panels):

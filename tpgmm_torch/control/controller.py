@@ -128,7 +128,7 @@ class Controller:
             self._position_bounds = bounds.lower, bounds.upper
         self._search = PostureSearch()
         self._taken: Follower | None = None  # of this tick, where all can be followed
-        self._velocity = torch.zeros_like(self.reference)
+        self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
         shape = self.reference.shape[:-1]
         self._codes = torch.zeros(shape, dtype=torch.int8, device=self.reference.device)
         self._gap, self._since = self._velocity, torch.full_like(self._velocity[..., 0], -1.0)
@@ -197,7 +197,7 @@ class Controller:
                 passed = torch.where(halted, 0.0, passed)
             holding = self.holding
             observed = Observation(
-                measured, self.reference, None, holding.frames, last.estimate,
+                measured, self._asked, None, holding.frames, last.estimate,
                 holding.state if holding.carries else None,
             )  # fmt: skip
             self._progress = before.advance(passed, observed)
@@ -214,8 +214,9 @@ class Controller:
         seen = None if frames is None else dict(self._frames)
         if self._inputs is not None and self._inputs.poses and not told:
             stands = at if measured is None else torch.where(measured.isnan(), at, measured)
+            known = {hold.frame for hold in self.holding.holds}  # from when to when
             self._watch, self.holding, seen = self._watch.look(
-                self._inputs.poses, self._frames, stands, self.holding, dt
+                self._inputs.poses.keys() - known, self._frames, stands, self.holding, dt
             )
         self.holding = self.holding.advance(time, at, seen, told)
         estimate = self._estimated(time, at)
@@ -223,13 +224,20 @@ class Controller:
         wanted = self._shifted(estimate.joints, shift)
         if self._follower is not None and last is not None and not self._follows(wanted, dt):
             wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
-        if measured is not None and (away := self._driven_away(measured)) is not None:
-            # what drove them there is not fought: they go on from where they stand
-            wanted = torch.where(away.unsqueeze(-1), measured, wanted)
-            self._restart_fading(away)
         if ended is not None and bool(ended.any()):
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
-        return self._send(estimate, wanted, dt, halted, ended)
+        led, goal = None, None
+        if measured is not None and self._trust is not None and last is not None:
+            if (away := self._driven_away(measured)) is not None:
+                self._restart_fading(away)
+            waits = time - before.time < 0.05 * passed
+            if away is not None or bool(waits.any()):
+                # what holds them is not fought: they are led on from where they stand
+                lead = (wanted - measured).clamp(-self._trust.lead, self._trust.lead)
+                led = waits.expand(self._codes.shape) if away is None else away | waits
+                led = led.unsqueeze(-1) & ~measured.isnan()
+                goal = torch.where(led, measured + lead, wanted)
+        return self._send(estimate, wanted, dt, halted, ended, led, goal)
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
@@ -401,9 +409,12 @@ class Controller:
         dt: float,
         halted: Tensor | None,
         ended: Tensor | None,
+        led: Tensor | None = None,
+        goal: Tensor | None = None,
     ) -> Command:
-        """The command that brings robots where they are wanted, within their bounds."""
+        """The command that brings robots to where they are wanted, or are led (..., 1)."""
         last, self._wanted, lost = self.reference, wanted, None
+        wanted = wanted if goal is None else goal
         if self._bounds is None:
             if halted is not None:
                 wanted = torch.where(halted.unsqueeze(-1), last, wanted)
@@ -423,6 +434,10 @@ class Controller:
                 lost = ~wanted.isfinite().all(-1)  # and is brought to rest
             self._follower = follower
             self.reference, self._velocity = follower.reference, follower.velocity
+        # who is led is not where it should be, however near its reference is
+        self._asked = self.reference
+        if led is not None:
+            self._asked = torch.where(led, self._wanted, self.reference)
         codes = self._codes
         reasons: Mapping[tuple[int, ...], str] = {}
         if ended is not None and bool(ended.any()):

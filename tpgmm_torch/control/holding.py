@@ -309,7 +309,14 @@ def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
 
 
 def choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:
-    """One pose for some robots, the other for the rest."""
+    """One pose for some robots, the other for the rest.
+
+    Parameters
+    ----------
+    where : bool, or Tensor of bool, of shape (...)
+        For which robots the first.
+    one, other : Frame
+    """
     if isinstance(where, bool):
         return one if where else other
     mask = where[..., None]

@@ -61,6 +61,8 @@ class Trust:
         fought with all force otherwise.
     lag : float
         How late a servo may be: on top of that, what the reference moves in this time [s].
+    lead : float
+        How far the reference of a robot that is waited for is ahead of it [rad or m].
     longest_step : float
         A loop that stood for longer goes on as if it had stood for that long [s].
 
@@ -79,6 +81,7 @@ class Trust:
     turn_jump: float = 0.6
     largest_gap: float = 0.3
     lag: float = 0.15
+    lead: float = 0.015
     longest_step: float = 0.5
 
     def __post_init__(self) -> None:

@@ -149,6 +149,7 @@ def test_where_nothing_is_known_every_instant_is_alike():
     assert np.ptp(got[0]) > 1
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_of_a_stack_some_may_be_seen_and_references_are_as_far():
     """One stack over two objects, of which one is not there: its marginal."""
     situation, wanted = new_handling()
