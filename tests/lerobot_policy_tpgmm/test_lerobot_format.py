@@ -143,5 +143,7 @@ def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
     # whenever a chunk comes, it goes on from what was sent before
     step = np.abs(np.diff(moved, axis=0)).max()
     assert step < 2 * float(wanted.joints.diff(dim=0).abs().max())
-    np.testing.assert_allclose(moved[0], wanted.joints[0], atol=0.05)
+    # it begins at the skill's first instants; which one, a thread's delay decides
+    first = np.abs(wanted.joints[:60].numpy() - moved[0]).max(axis=1)
+    assert first.min() < 0.05
     assert np.ptp(moved, axis=0).max() > 0.05

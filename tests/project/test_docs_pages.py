@@ -69,6 +69,7 @@ def check_options(program: str, arguments: list[str]) -> None:
     from lerobot.envs import EnvConfig
     from lerobot.robots import RobotConfig, so_follower
     from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
+    from lerobot.rollout.inference import InferenceEngineConfig
 
     from lerobot_policy_tpgmm import TPGMMConfig
 
@@ -80,7 +81,12 @@ def check_options(program: str, arguments: list[str]) -> None:
         "lerobot-rollout": RolloutConfig,
     }
     groups = {"policy": TPGMMConfig, "eval": EvalConfig, "dataset": DatasetConfig}
-    choices = {"env": EnvConfig, "robot": RobotConfig, "strategy": RolloutStrategyConfig}
+    choices = {
+        "env": EnvConfig,
+        "robot": RobotConfig,
+        "strategy": RolloutStrategyConfig,
+        "inference": InferenceEngineConfig,
+    }
     for group, registry in choices.items():
         if f"{group}.type" in options:
             groups[group] = registry.get_choice_class(options[f"{group}.type"])
