@@ -248,9 +248,9 @@ class Regression:
         edges : Tensor of shape (W - 1,)
             Instants between windows [s].
         index : Tensor of shape (W, A)
-            Components that count; windows with fewer have others too,
+            Components that count; windows with fewer have others too.
         log_peak : Tensor of shape (W, A)
-            which have no weight in :class:`TimeMarginals`.
+            As in :class:`TimeMarginals`; those others have no weight.
         """
         edges, sets = torch.empty(0, dtype=torch.float64), [(*range(len(self.log_weights)),)]
         if self._active is not None:
