@@ -137,7 +137,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     holds : "auto", sequence of Hold or None, default="auto"
         From when to when a link holds an object. "auto" finds it in demonstrations whose
         frames were recorded over time
-        (:func:`~tpgmm_torch.training.hold_detection.find_holds`); what was recorded once, or
+        (``find_holds``); what was recorded once, or
         never moves, is never held. While an object is held, its frame as a place is where it
         was last free, for learning and for reproducing alike.
     plausibility : {"warn", "error", "ignore"}, default="warn"
@@ -821,7 +821,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         time : Tensor of shape (T,)
             The time grid of a typical demonstration [s].
         holds : sequence of Hold, default=()
-            Of objects by links, as :attr:`holds_`.
+            Of objects by links, as ``holds_``.
 
         Returns
         -------

@@ -277,7 +277,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         left out with a :class:`DatasetWarning`, those for one reason together.
     plausibility : {"warn", "error", "ignore"}, default="warn"
         What is done about recordings that are unlikely to be what they are taken for
-        (:func:`tpgmm_torch.plausibility.check.check`): one warning, an error, or nothing.
+        (``tpgmm_torch.plausibility.check.check``): one warning, an error, or nothing.
         What cannot be is an error unless ignored.
 
     Returns

@@ -234,7 +234,7 @@ class WaitingClock(Clock):
     The rate of progress falls with the tracking error in units of what is to be expected: of
     joint j, with ``x`` where a servo with that ``lag`` would be,
 
-        u_j = |reference_j - measured_j| / (|reference_j - x_j| + std_j + floor),
+        ``u_j = |reference_j - measured_j| / (|reference_j - x_j| + std_j + floor)``,
 
     where std is the standard deviation of the fused Gaussian. Up to ``tolerance`` the largest
     u leaves time alone, at twice the tolerance it stands still. A robot that comes back

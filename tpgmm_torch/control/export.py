@@ -31,7 +31,7 @@ def export(
     bounds: MotionBounds,
     clock: Clock,
 ) -> None:
-    """Write what :func:`~tpgmm_torch.control.exported.load_exported` reads; atomically.
+    """Write what ``load_exported`` reads; atomically.
 
     Parameters
     ----------

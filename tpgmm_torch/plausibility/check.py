@@ -90,7 +90,7 @@ def examine(demonstrations: Iterable[Demonstration], robot: Kinematics | None = 
 def episodes_report(
     episodes: Sequence[EpisodeSummary], robot: Kinematics | None = None
 ) -> Report:
-    """What :func:`examine` finds in demonstrations that were looked at before.
+    """What ``examine`` finds in demonstrations that were looked at before.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def learning_report(
 ) -> Report:
     """What stands against learning from demonstrations as they are.
 
-    Beyond :func:`examine`: whether they are on one clock, and whether they are enough.
+    Beyond ``examine``: whether they are on one clock, and whether they are enough.
 
     Parameters
     ----------

@@ -113,7 +113,7 @@ class Report:
         plausibility : {"warn", "error", "ignore"}, default="warn"
             "error" raises what is unlikely too; "ignore" does nothing.
         stacklevel : int, default=2
-            As of :func:`warnings.warn`: whose line the warning names.
+            As of ``warnings.warn``: whose line the warning names.
 
         Returns
         -------

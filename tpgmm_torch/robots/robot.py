@@ -60,7 +60,7 @@ class Robot(Kinematics):
             Names of the links (or ``tools``) whose poses are wanted.
         joints : sequence of str, optional
             Names and order of the joint vector. A pattern, ``"left_*"``, stands for all that
-            fit it (:mod:`fnmatch`) and are not named beside it, in document order. The default
+            fit it (``fnmatch``) and are not named beside it, in document order. The default
             is every movable joint that is neither locked nor mimics another, in document
             order. The others stand still.
         locked : mapping of str to float, optional

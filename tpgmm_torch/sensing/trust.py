@@ -102,7 +102,7 @@ class Reading:
     age : ndarray of shape (...)
         For how long nothing was believed [s].
     why : ndarray of shape (...)
-        What was wrong with the last one, :data:`BELIEVED` where nothing was.
+        What was wrong with the last one, ``BELIEVED`` where nothing was.
     rival : ndarray of shape (..., d)
         Where the signal jumped to, NaN where it did not.
     rival_age : ndarray of shape (...)
