@@ -20,7 +20,7 @@ __all__ = ["Command", "Status"]
 
 
 class Status(StrEnum):
-    """How a robot fares with its skill; in tensors by its :attr:`code`."""
+    """How a robot fares with its skill; in tensors by its ``code``."""
 
     RUNNING = "running"  #: the skill goes on
     WAITING = "waiting"  #: its clock waits for the robot, or for something to happen

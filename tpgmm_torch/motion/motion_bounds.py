@@ -73,7 +73,7 @@ class LimitArrays:
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """What every tick of a motion keeps within; made by :meth:`of`.
+    """What every tick of a motion keeps within; made by ``of``.
 
     Parameters
     ----------
