@@ -123,7 +123,7 @@ class HoldWatch:
         self, name: str, rest: Rest, joints: Tensor, holding: Holding, dt: float
     ) -> tuple[Rest, Holding, bool]:
         """Whether a link has taken an object along, or somebody else has moved it."""
-        moved = _change(rest.pose, rest.seen, MOVED, TURNED)
+        moved = rest.pose.change(rest.seen, MOVED, TURNED)
         free = holding.free(name, moved)
         rests = free & (moved < RESTING)
         settles, held, elsewhere = rests, torch.zeros_like(rests), torch.zeros_like(rests)
@@ -132,7 +132,7 @@ class HoldWatch:
             grasps = [rest.seen.seen_from(now.pose(link)) for link in self.kinematics.links]
             changes = torch.stack(
                 [
-                    _change(rest.pose.seen_from(before.pose(link)), grasp, MOVED, TURNED)
+                    rest.pose.seen_from(before.pose(link)).change(grasp, MOVED, TURNED)
                     for link, grasp in zip(self.kinematics.links, grasps, strict=True)
                 ]
             )
@@ -156,7 +156,7 @@ class HoldWatch:
         """Let go what is not where its link would have it."""
         carried = holding.carried(name, self.kinematics.state(joints))
         far = ~holding.free(name, rest.away)
-        far = far & (_change(carried, rest.seen, LOST, LOST_TURN) >= 1)
+        far = far & (carried.change(rest.seen, LOST, LOST_TURN) >= 1)
         away = torch.where(far, rest.away + rest.since, 0.0)
         lost = away >= LOST_TIME
         if bool(lost.any()):
@@ -164,13 +164,6 @@ class HoldWatch:
         pose = choose(lost, rest.seen, rest.pose)
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
         return replace(rest, pose=pose, joints=stood, away=away, since=0.0), holding
-
-
-def _change(one: Frame, other: Frame, distance: float, angle: float) -> Tensor:
-    """How far poses are apart, in units of a distance [m] and an angle [rad]."""
-    moved = torch.linalg.vector_norm(other.position - one.position, dim=-1)
-    inner = (one.orientation * other.orientation).sum(-1).abs().clamp(max=1)
-    return torch.maximum(moved / distance, 2 * torch.acos(inner) / angle)
 
 
 def _between(one: Frame, other: Frame, share: Tensor) -> Frame:

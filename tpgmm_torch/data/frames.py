@@ -301,6 +301,20 @@ class Frame:
         turned = quaternions.product(self.orientation, inner.orientation)
         return self._from(self.transform(inner.position), turned)
 
+    def change(self, other: Frame, distance: float, angle: float) -> Tensor:
+        """How far another pose is from this one, in units of a distance and an angle: (...).
+
+        Parameters
+        ----------
+        other : Frame
+            Of a shape that broadcasts with this one's.
+        distance, angle : float
+            The units [m], [rad]; the larger of both changes counts.
+        """
+        moved = torch.linalg.vector_norm(other.position - self.position, dim=-1)
+        inner = (self.orientation * other.orientation).sum(-1).abs().clamp(max=1)
+        return torch.maximum(moved / distance, 2 * torch.acos(inner) / angle)
+
     def seen_from(self, other: Frame) -> Frame:
         """The pose in another frame: ``other.compose(pose.seen_from(other))`` is the pose."""
         turn = quaternions.conjugate(other.orientation)

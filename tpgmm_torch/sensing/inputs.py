@@ -229,18 +229,15 @@ class Inputs:
         wanted = (*self.shape, size)
         if array.shape == wanted:
             return array
-        if array.shape[-1:] != (size,) or array.ndim > len(wanted):
-            raise ShapeError(
-                f"the skill began with robots of shape {tuple(self.shape)}, {what} now has "
-                f"shape {array.shape}, not {wanted}: begin it anew for other robots"
-            )
         try:
-            return np.broadcast_to(array, wanted)
+            if array.shape[-1:] == (size,):  # one value is not broadcast over the coordinates
+                return np.broadcast_to(array, wanted)
         except ValueError:
-            raise ShapeError(
-                f"the skill began with robots of shape {tuple(self.shape)}, {what} now has "
-                f"shape {array.shape}, not {wanted}: begin it anew for other robots"
-            ) from None
+            pass
+        raise ShapeError(
+            f"the skill began with robots of shape {tuple(self.shape)}, {what} now has "
+            f"shape {array.shape}, not {wanted}: begin it anew for other robots"
+        )
 
 
 def _numpy(values: Tensor) -> NDArray[np.float64]:

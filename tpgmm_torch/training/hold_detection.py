@@ -133,9 +133,7 @@ def find_holds(
 
 def _change_in(tolerance: float, angle: float) -> Change:
     def change(one: Frame, other: Frame) -> Tensor:
-        distance = torch.linalg.vector_norm(other.position - one.position, dim=-1)
-        inner = (one.orientation * other.orientation).sum(-1).abs().clamp(max=1)
-        return torch.maximum(distance / tolerance, 2 * torch.acos(inner) / angle)
+        return one.change(other, tolerance, angle)
 
     return change
 
