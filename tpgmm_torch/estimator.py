@@ -74,8 +74,8 @@ __all__ = ["TaskParameterizedGMM"]
 
 #: Parameters that the estimator and its mixture share.
 MIXTURE_PARAMETERS = (
-    "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
-    "random_state", "warm_start", "verbose", "dtype", "device",
+    "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
+    "n_init", "init_params", "random_state", "warm_start", "verbose", "dtype", "device",
 )  # fmt: skip
 
 
@@ -100,6 +100,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Added to the diagonal of the covariances, relative to the variance of each coordinate.
         A smaller value is more exact where demonstrations agree, a larger one smoother where
         operators contradict each other.
+    covariance_shrinkage : "auto" or float, default="auto"
+        How far the full or tied covariances given time go towards their diagonals after EM,
+        from 0 to 1; slopes over time stay as they are. N demonstrations leave N - 1 directions
+        in which they differ, and what seems exact across these is chance. "auto" follows from
+        N and the number of coordinates, for each component and operator, and falls as 1 / N
+        (``oracle_approximating_intensity``);
+        0 is the paper's.
     tol : float, default=1e-3
         EM stops when the mean log-likelihood gains less.
     max_iter : int, default=100
@@ -175,7 +182,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     n_iter_ : int
     converged_ : bool
     lower_bound_ : float
-        Mean log-likelihood per time step at the end of EM.
+        Mean log-likelihood per time step at the end of EM, before covariances are shrunk.
     mixture_ : BlockGaussianMixture
         Of the local data of all operators side by side.
     shown_ : Shown or None
@@ -207,6 +214,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "robot": [Kinematics, None],
         "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
         "reg_covar": [Interval(Real, 0, None, closed="left")],
+        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
         "tol": [Interval(Real, 0, None, closed="left")],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
@@ -245,6 +253,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         *,
         covariance_type: str = "full",
         reg_covar: float = 1e-5,
+        covariance_shrinkage: float | str = "auto",
         tol: float = 1e-3,
         max_iter: int = 100,
         n_init: int = 1,
@@ -270,6 +279,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.robot = robot
         self.covariance_type = covariance_type
         self.reg_covar = reg_covar
+        self.covariance_shrinkage = covariance_shrinkage
         self.tol = tol
         self.max_iter = max_iter
         self.n_init = n_init
@@ -775,6 +785,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         group_size: int,
         operators: Sequence[Operator],
         kinematics: Kinematics,
+        n_demonstrations: int,
     ) -> BlockGaussianMixture:
         """The mixture that :meth:`fit` learns from rows of local data.
 
@@ -787,9 +798,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators : sequence of Operator
         kinematics : Kinematics
             What they act on.
+        n_demonstrations : int
+            That the rows are of.
         """
         settings = self._shared_settings(operators, kinematics)
-        settings["group_size"] = group_size
+        settings |= {"group_size": group_size, "n_demonstrations": n_demonstrations}
         settings["reg_covar"] = regularization(
             moments,
             operators,
@@ -984,7 +997,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 )
             settings = config["parameters"]
             settings["device"] = device or settings["device"]
-            holds = settings.pop("holds", "auto")  # models of before know none
+            settings.setdefault("covariance_shrinkage", 0.0)  # models of before know none,
+            holds = settings.pop("holds", "auto")  # nor holds
             given = holds if isinstance(holds, str | None) else list(map(Hold.from_list, holds))
             here = _moved(tensors, settings["device"], path)
             means, covariances = (
@@ -1060,7 +1074,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     ) -> Self:
         """Fit the mixture to rows, and take over what it learned."""
         moments = column_moments(learning.rows, learning.processes)
-        mixture = self.unfitted_mixture(moments, learning.group_size, operators, kinematics)
+        mixture = self.unfitted_mixture(
+            moments, learning.group_size, operators, kinematics, learning.n_demonstrations
+        )
         mixture.fit_rows(
             learning.rows,
             moments=moments,
@@ -1077,7 +1093,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         rank: int = 0,
     ) -> Shown:
         """Act on what is implausible about demonstrations; what they showed."""
-        report = learning_report(episodes, operators, kinematics, self.covariance_type)
+        report = learning_report(
+            episodes, operators, kinematics, self.covariance_type, self.covariance_shrinkage
+        )
         if rank == 0 or report.errors() or self.plausibility == "error":
             report.act(self.plausibility, stacklevel=3)
         return Shown.of(episodes, kinematics)
@@ -1100,7 +1118,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     ) -> dict[str, Any]:
         """What the mixture has of the estimator's parameters, and its blocks."""
         settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
-        return settings | {"blocks": block_widths(operators, kinematics)}
+        return settings | {"blocks": block_widths(operators, kinematics), "timed_blocks": True}
 
     def _situation(self, given: Situation | Demonstration) -> Situation:
         names, like = self.kinematics_.joint_names, self.time_

@@ -144,7 +144,8 @@ def fit_folds(
     if twice or mixed or len(holds) != 1:
         return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     episodes = summarize(demonstrations, kinematics)
-    report = learning_report(episodes, operators, kinematics, estimator.covariance_type)
+    family = estimator.covariance_type, estimator.covariance_shrinkage
+    report = learning_report(episodes, operators, kinematics, *family)
     report.act(estimator.plausibility)
     [held] = holds
     learning = rows_in_memory(
@@ -164,7 +165,9 @@ def fit_folds(
         members = np.repeat(belongs, [len(d) for d in demonstrations], axis=1)
     moments = [ColumnMoments.of(rows[own]) for own in members]
     mixtures = [
-        model.unfitted_mixture(known, len(fold) if size > 1 else 1, operators, kinematics)
+        model.unfitted_mixture(
+            known, len(fold) if size > 1 else 1, operators, kinematics, len(fold)
+        )
         for model, fold, known in zip(models, chosen, moments, strict=True)
     ]
     fit_subsets(mixtures, rows, members, size, moments)

@@ -31,9 +31,9 @@ __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
 #: Parameters of the estimator that go into the configuration under their own names.
 HYPERPARAMETERS = (
-    "n_components", "covariance_type", "reg_covar", "tol", "max_iter", "n_init", "init_params",
-    "responsibilities", "fusion", "activation", "epsilon", "prior_std", "negligible", "blend",
-    "keep_limits", "plausibility", "random_state", "dtype",
+    "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
+    "n_init", "init_params", "responsibilities", "fusion", "activation", "epsilon",
+    "prior_std", "negligible", "blend", "keep_limits", "plausibility", "random_state", "dtype",
 )  # fmt: skip
 
 CHOICES = {
@@ -94,9 +94,9 @@ class TPGMMConfig(StatePolicyConfig):
 
     Parameters
     ----------
-    n_components, covariance_type, reg_covar, tol, max_iter, n_init, init_params, \
-    responsibilities, fusion, activation, epsilon, prior_std, negligible, blend, keep_limits, \
-    random_state, dtype
+    n_components, covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, \
+    init_params, responsibilities, fusion, activation, epsilon, prior_std, negligible, blend, \
+    keep_limits, random_state, dtype
         As for :class:`tpgmm_torch.TaskParameterizedGMM`.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
@@ -189,6 +189,7 @@ class TPGMMConfig(StatePolicyConfig):
     n_components: int = 10
     covariance_type: str = "full"
     reg_covar: float = 1e-5
+    covariance_shrinkage: float | str = "auto"
     tol: float = 1e-3
     max_iter: int = 100
     n_init: int = 1

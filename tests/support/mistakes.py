@@ -358,7 +358,7 @@ def a_single_demonstration(_):
 
 @mistake("lengths", r"freedom: two demonstrations")
 def two_demonstrations(_):
-    learn(shown()[:2])
+    learn(shown()[:2], covariance_shrinkage=0.0)
 
 
 @mistake("lengths", r"copies: .*demonstration 1 is a copy of 0")

@@ -57,6 +57,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import LinearTimeNormalization
+from tpgmm_torch.em.covariance_shrinkage import oracle_approximating_intensity
 from tpgmm_torch.exceptions import (
     DataError,
     DegenerateComponentWarning,
@@ -69,6 +70,7 @@ from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.persistence import MODEL
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.local_data import local_data
 
@@ -164,6 +166,50 @@ def test_different_grids_are_learned_point_by_point():
     model = canonical().fit(uneven)
     assert model.mixture_.group_size == 1
     same(model, canonical(responsibilities="point").fit(uneven))
+
+
+def test_few_demonstrations_shrink_covariances_given_time_towards_the_diagonal():
+    plain = hands_model(covariance_shrinkage=0).fit(handlings(5))
+    model = hands_model().fit(handlings(5))
+    assert model.lower_bound_ == plain.lower_bound_
+    gains = []
+    for j, (mean, covariance) in enumerate(zip(model.means_, model.covariances_, strict=True)):
+        ours = Conditionals.of(mean, covariance)
+        em = Conditionals.of(plain.means_[j], plain.covariances_[j])
+        torch.testing.assert_close(ours.gain, em.gain, rtol=1e-7, atol=1e-9)
+        share = oracle_approximating_intensity(em.covariance, 4.0)[:, None, None]
+        diagonal = torch.diag_embed(em.covariance.diagonal(dim1=1, dim2=2))
+        shrunk = (1 - share) * em.covariance + share * diagonal
+        torch.testing.assert_close(ours.covariance, shrunk, rtol=1e-6, atol=1e-10)
+        gains.append(float(share.min()))
+    assert min(gains) > 0.1
+
+
+def test_the_shrinkage_of_batches_is_that_of_all_their_demonstrations():
+    shown = handlings(6)
+    whole = hands_model().fit(shown)
+    batches = hands_model().fit([shown[:4], shown[4:]])
+    for one, other in zip(whole.covariances_, batches.covariances_, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-9)
+
+
+def test_models_of_before_shrinkage_are_as_they_were(tmp_path):
+    model = hands_model(covariance_shrinkage=0).fit(handlings(5))
+    model.save(tmp_path / "model")
+    config, tensors = MODEL.read(tmp_path / "model")
+    own = ("format", "version", "tensors", "tensors_sha256", "digest")
+    old = {name: value for name, value in config.items() if name not in own}
+    del old["parameters"]["covariance_shrinkage"]
+    MODEL.write(tmp_path / "old", old, tensors)
+    back = TaskParameterizedGMM.load(tmp_path / "old")
+    assert back.covariance_shrinkage == 0
+    assert all(map(torch.equal, back.covariances_, model.covariances_))
+
+
+def test_few_demonstrations_say_more_of_others_when_shrunk():
+    shown = handlings(9)
+    plain = hands_model(covariance_shrinkage=0).fit(shown[:3]).score(shown[3:])
+    assert hands_model().fit(shown[:3]).score(shown[3:]) > plain + 5
 
 
 def test_covariance_types_are_those_of_the_mixture():
@@ -446,6 +492,7 @@ BAD = {
     "robot": ["robot.urdf", 3],
     "covariance_type": ["block", None],
     "reg_covar": [-1e-6, "small"],
+    "covariance_shrinkage": [-0.1, 1.1, "oas", None],
     "tol": [-1.0],
     "max_iter": [0, 1.5],
     "n_init": [0],
@@ -653,6 +700,7 @@ SETTINGS = {
     "robot": HANDS,
     "covariance_type": "tied",
     "reg_covar": 1e-3,
+    "covariance_shrinkage": 0.25,
     "tol": 1e-2,
     "max_iter": 50,
     "n_init": 2,

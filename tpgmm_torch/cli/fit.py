@@ -96,6 +96,14 @@ def fit(
             "Added to the covariances' diagonal, relative to each coordinate's variance.", min=0
         ),
     ] = 1e-5,
+    covariance_shrinkage: Annotated[
+        str,
+        learning(
+            "How far full or tied covariances go towards their diagonals, 0 to 1; 'auto' "
+            "follows the number of episodes.",
+            metavar="auto | FLOAT",
+        ),
+    ] = "auto",
     tol: Annotated[
         float, learning("Stop when the mean log-likelihood gains less.", min=0)
     ] = 1e-3,
@@ -176,6 +184,7 @@ def fit(
             holds=given if hold else "auto",
             covariance_type=covariance_type,
             reg_covar=reg_covar,
+            covariance_shrinkage=options.number_or_auto(covariance_shrinkage),
             tol=tol,
             max_iter=max_iter,
             n_init=n_init,

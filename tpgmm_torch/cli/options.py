@@ -185,6 +185,22 @@ def read_robot(
     )
 
 
+def number_or_auto(text: str) -> float | str:
+    """The number that an option's text is, or "auto".
+
+    Raises
+    ------
+    typer.BadParameter
+        If it is neither.
+    """
+    if text == "auto":
+        return text
+    try:
+        return float(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is neither a number nor 'auto'") from error
+
+
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
     """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
     from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization

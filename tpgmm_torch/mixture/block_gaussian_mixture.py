@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.em.covariance_family import CovarianceFamily
+from tpgmm_torch.em.covariance_shrinkage import shrink
 from tpgmm_torch.em.expectation_maximization import Fit, expectation_maximization
 from tpgmm_torch.em.parameters import Parameters, Standardization, check_blocks
 from tpgmm_torch.em.points import standardized_chunks
@@ -82,6 +83,16 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Whether ``reg_covar`` is a share of each column's variance (of its block's mean
         variance where a column is constant), or in squared units of the data as in
         scikit-learn. It is never less than 1e-12 (float64), 2e-6 (float32) of the variance.
+    covariance_shrinkage : float or "auto", default=0
+        How far the full or tied covariances that EM found go towards their diagonals, from 0
+        to 1. "auto" follows from the number of samples and of columns, component by component
+        (:func:`~tpgmm_torch.em.covariance_shrinkage.oracle_approximating_intensity`).
+    n_demonstrations : int, optional
+        How many samples there are for "auto", where the rows are those of so many
+        demonstrations that each visit every component; None counts each row.
+    timed_blocks : bool, default=False
+        Whether every block begins with time: the covariances *given time* shrink then, and
+        slopes over time stay as they are.
     max_iter : int, default=100
         Most EM iterations per start.
     n_init : int, default=1
@@ -124,7 +135,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Iterations of the best start.
     lower_bound_ : float
         Mean log-likelihood of the training data under the mixture before the last M step,
-        as in scikit-learn; ``score`` of the result is not below it.
+        as in scikit-learn; ``score`` of the result is not below it, unless the covariances
+        were shrunk thereafter.
     lower_bounds_ : list of float
         Its history, which never falls. Where reseeding a component lowers it, the history
         begins again at that point.
@@ -155,6 +167,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "tol": [Interval(Real, 0.0, None, closed="left")],
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
         "regularization": [StrOptions({"relative", "absolute"})],
+        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
+        "n_demonstrations": [Interval(Integral, 1, None, closed="left"), None],
+        "timed_blocks": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "init_params": [StrOptions({"time", "kmeans", "random"})],
@@ -179,6 +194,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         tol: float = 1e-3,
         reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
         regularization: str = "relative",
+        covariance_shrinkage: float | str = 0.0,
+        n_demonstrations: int | None = None,
+        timed_blocks: bool = False,
         max_iter: int = 100,
         n_init: int = 1,
         init_params: str = "time",
@@ -199,6 +217,9 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.tol = tol
         self.reg_covar = reg_covar
         self.regularization = regularization
+        self.covariance_shrinkage = covariance_shrinkage
+        self.n_demonstrations = n_demonstrations
+        self.timed_blocks = timed_blocks
         self.max_iter = max_iter
         self.n_init = n_init
         self.init_params = init_params
@@ -338,7 +359,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         expectation_maximization(
             fits, points, family, group_size=self.group_size, after=after, **self._loop()
         )
-        return self._take_best(fits, units)
+        return self._take_best(fits, units, moments.count)
 
     def _units(self, rows: Rows, moments: ColumnMoments) -> Standardization:
         """The units in which the mixture is learned."""
@@ -388,7 +409,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     def _initial_parameters(self) -> tuple[Any, Any, Any]:
         """Weights, means and covariances as far as they are given, else None."""
         if self.warm_start and hasattr(self, "weights_"):
-            return self.weights_, self.means_, self.covariances_
+            # where EM ended, which what was shrunk thereafter is not
+            return self.weights_, self.means_, getattr(self, "_unshrunk", self.covariances_)
         return self.weights_init, self.means_init, self.covariances_init
 
     def _starts(
@@ -430,11 +452,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         """The settings of the loop of EM."""
         return {"tol": self.tol, "max_iter": self.max_iter, "verbose": self.verbose}
 
-    def _take_best(self, fits: Sequence[Fit], units: Standardization) -> Self:
+    def _take_best(self, fits: Sequence[Fit], units: Standardization, n_rows: int) -> Self:
         """Take over the best of the fits, and warn of what the user should know."""
         best = max(fits, key=lambda fit: fit.bounds[-1])
         self.n_features_in_ = sum(units.widths)
         self._set(units.restore(best.parameters))
+        self._unshrunk = self.covariances_
+        self._set(units.restore(self._shrunk(best.parameters, n_rows)))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
         self.lower_bound_ = self.lower_bounds_[-1]
@@ -453,6 +477,18 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
                 stacklevel=4,
             )
         return self
+
+    def _shrunk(self, parameters: Parameters, n_rows: int) -> Parameters:
+        """What EM found, with covariances shrunk where they have correlations."""
+        if self.covariance_type not in ("full", "tied") or self.covariance_shrinkage == 0:
+            return parameters
+        n_samples: Tensor | float = n_rows  # those of a tied covariance
+        if self.n_demonstrations is not None:
+            n_samples = self.n_demonstrations
+        elif self.covariance_type == "full":
+            n_samples = n_rows * parameters.weights
+        given = int(self.timed_blocks)
+        return shrink(parameters, self.covariance_shrinkage, n_samples, given=given)
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
         """Fit, and return :meth:`predict` of the same points."""
@@ -580,7 +616,8 @@ def fit_subsets(
     Parameters
     ----------
     mixtures : sequence of BlockGaussianMixture
-        Of equal settings, but for ``reg_covar``, ``group_size`` and what the start is.
+        Of equal settings, but for ``reg_covar``, ``group_size``, ``n_demonstrations`` and what
+        the start is.
     X : array of shape (n_samples, n_features)
         All rows.
     members : array of bool, of shape (S, n_samples)
@@ -623,8 +660,8 @@ def fit_subsets(
         members=belongs.repeat_interleave(len(fits[0]), 0),
         **first._loop(),
     )
-    for mixture, starts in zip(mixtures, fits, strict=True):
-        mixture._take_best(starts, units)
+    for mixture, starts, known in zip(mixtures, fits, moments, strict=True):
+        mixture._take_best(starts, units, known.count)
 
 
 def on_cpu(X: Any) -> Any:

@@ -158,6 +158,7 @@ def learning_report(
     operators: Sequence[Operator],
     kinematics: Kinematics,
     covariance_type: str,
+    covariance_shrinkage: float | str = 0.0,
 ) -> Report:
     """What stands against learning from demonstrations as they are.
 
@@ -169,12 +170,13 @@ def learning_report(
         As :func:`summarize` gives them.
     operators : sequence of Operator
     kinematics : Kinematics
-    covariance_type : str
+    covariance_type, covariance_shrinkage : str, float or str
         As of the estimator.
     """
     findings = _findings(episodes, kinematics)
     findings += check_one_clock(episodes)
-    findings += check_freedom(len(episodes), operators, kinematics, covariance_type)
+    free = covariance_type in ("full", "tied") and covariance_shrinkage == 0
+    findings += check_freedom(len(episodes), operators, kinematics, free)
     return Report.of(findings, _subject(episodes))
 
 

@@ -76,7 +76,7 @@ def check_freedom(
     n_demonstrations: int,
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    covariance_type: str,
+    correlated: bool,
 ) -> Iterator[Finding]:
     """Fewer demonstrations than it takes to tell what varies together from what does not.
 
@@ -87,15 +87,14 @@ def check_freedom(
         What is learned.
     kinematics : Kinematics
         What they act on.
-    covariance_type : str
-        As of the estimator.
+    correlated : bool
+        Whether correlations of coordinates are learned, and not shrunk.
 
     Yields
     ------
     Finding
     """
     widest = max(operator.dimension(kinematics) for operator in operators)
-    full = covariance_type in ("full", "tied") and widest > 2
     if n_demonstrations == 1:
         yield Finding(
             "freedom",
@@ -105,12 +104,17 @@ def check_freedom(
             "Show the skill again from other starts and places, 5 times or more",
             value=1.0,
         )
-    elif n_demonstrations == 2 and full and frame_names(operators, kinematics):
+    elif (
+        n_demonstrations == 2
+        and correlated
+        and widest > 2
+        and frame_names(operators, kinematics)
+    ):
         yield Finding(
             "freedom",
             "unlikely",
             f"two demonstrations differ in one direction, and the covariances of {widest} "
             "coordinates would have to tell all apart",
-            "Show the skill 5 times or more, or learn with covariance_type='diag'",
+            "Show the skill 5 times or more, or learn with covariance_shrinkage='auto'",
             value=2.0,
         )

@@ -49,6 +49,8 @@ class LearningRows:
         So many consecutive rows share one responsibility.
     time : Tensor of shape (T,)
         Time grid of a typical demonstration.
+    n_demonstrations : int
+        Of all processes.
     processes : Processes
         Among which the rows are spread.
     """
@@ -56,6 +58,7 @@ class LearningRows:
     rows: Rows
     group_size: int
     time: Tensor
+    n_demonstrations: int
     processes: Processes
 
 
@@ -182,7 +185,8 @@ def rows_in_memory(
     group_size = len(rows) if aligned and responsibilities != "point" else 1
     together = torch.cat(rows) if group_size == 1 else torch.stack(rows, 1).flatten(0, 1)
     points = StoredRows(together.cpu().numpy())
-    return LearningRows(points, group_size, typical_time(demonstrations).to(rows[0]), ALONE)
+    time = typical_time(demonstrations).to(rows[0])
+    return LearningRows(points, group_size, time, len(rows), ALONE)
 
 
 def share_one_grid(demonstrations: Sequence[Demonstration]) -> bool:
@@ -266,14 +270,15 @@ def gather_rows(
     time = _typical_time(file, spans, processes).to(reference)
     if responsibilities == "instant":
         _check_aligned(aligned)
+    n_demonstrations = sum(processes.gather(len(spans)))
     if responsibilities == "point" or not aligned:
-        return LearningRows(file, 1, time, processes)
+        return LearningRows(file, 1, time, n_demonstrations, processes)
     instants = Instants(torch.where(constant, reference[0], reference).cpu().numpy(), widths)
     instants.add(file)
     points, size = instants.points(processes)
     own = processes.share(range(len(points) // size))
     share = StoredRows(points[own[0] * size : (own[-1] + 1) * size])
-    return LearningRows(share, size, time, processes)
+    return LearningRows(share, size, time, n_demonstrations, processes)
 
 
 def _check_aligned(aligned: bool) -> None:

@@ -20,6 +20,7 @@ from sklearn.base import clone
 from tests.support.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
 from tests.support.em_reference import WIDTHS as FOLD_WIDTHS
 from tests.support.em_reference import counted_passes, movements
+from tpgmm_torch.em.covariance_shrinkage import oracle_approximating_intensity
 from tpgmm_torch.exceptions import (
     ConvergenceWarning,
     DataError,
@@ -203,6 +204,41 @@ def test_float32_agrees_with_float64(clusters):
         outer = scale[:, :, None] * scale[:, None]
         assert ((single.covariances_[j] - double.covariances_[j]).abs() / outer).max() < 1e-3
     assert single.score(clusters) == pytest.approx(double.score(clusters), abs=1e-3)
+
+
+@pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
+def test_shrinkage_comes_after_em(clusters, covariance_type):
+    X = clusters
+    settings = {"n_components": 3, "blocks": WIDTHS, "covariance_type": covariance_type}
+    plain = fitted(BlockGaussianMixture(**settings), X)
+    settings |= {"covariance_shrinkage": 0.5, "warm_start": True, "tol": 1e-9}
+    shrunk = fitted(BlockGaussianMixture(**settings | {"tol": 1e-3}), X)
+    assert shrunk.lower_bound_ == plain.lower_bound_
+    for block, (one, other) in enumerate(
+        zip(plain.covariances_, shrunk.covariances_, strict=True)
+    ):
+        diagonal = torch.diag_embed(one.diagonal(dim1=1, dim2=2))
+        torch.testing.assert_close(other, (one + diagonal) / 2, msg=f"block {block}")
+    # a warm start goes on from where EM was, not from what was shrunk
+    again = fitted(clone(shrunk), X)
+    bounds = fitted(again.set_params(max_iter=1), X).lower_bounds_
+    assert bounds[0] >= plain.lower_bound_ - 1e-9
+
+
+def test_automatic_shrinkage_follows_the_samples_of_each_component(clusters):
+    X = clusters
+    settings = {"n_components": 3, "blocks": WIDTHS}
+    plain = fitted(BlockGaussianMixture(**settings), X)
+    settings["covariance_shrinkage"] = "auto"
+    points = fitted(BlockGaussianMixture(**settings), X)
+    shown = fitted(BlockGaussianMixture(**settings, n_demonstrations=3), X)
+    for model, n_samples in ((points, len(X) * plain.weights_), (shown, torch.tensor(3.0))):
+        for one, other in zip(plain.covariances_, model.covariances_, strict=True):
+            if one.shape[-1] == 1:
+                continue
+            share = oracle_approximating_intensity(one, n_samples - 1)[:, None, None]
+            diagonal = torch.diag_embed(one.diagonal(dim1=1, dim2=2))
+            torch.testing.assert_close(other, (1 - share) * one + share * diagonal)
 
 
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)

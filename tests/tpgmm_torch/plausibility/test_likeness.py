@@ -45,20 +45,20 @@ def test_joints_that_hardly_move_say_little():
 
 
 @pytest.mark.parametrize(
-    ("n", "family", "told"),
+    ("n", "correlated", "told"),
     [
-        (1, "full", True),
-        (1, "diag", True),
-        (2, "full", True),
-        (2, "diag", False),
-        (3, "full", False),
+        (1, True, True),
+        (1, False, True),
+        (2, True, True),
+        (2, False, False),
+        (3, True, False),
     ],
 )
-def test_freedom(n, family, told):
-    findings = list(check_freedom(n, HANDLING, HANDS, family))
+def test_freedom(n, correlated, told):
+    findings = list(check_freedom(n, HANDLING, HANDS, correlated))
     assert [f.check for f in findings] == ["freedom"] * told
     assert len(summarize(handlings(n), HANDS)) == n
 
 
 def test_one_joint_alone_is_learned_from_two():
-    assert list(check_freedom(2, [Canonical()], JointSpace(("a",)), "full")) == []
+    assert list(check_freedom(2, [Canonical()], JointSpace(("a",)), correlated=True)) == []

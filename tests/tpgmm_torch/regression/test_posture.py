@@ -72,7 +72,7 @@ def test_what_is_reached_is_left_to_the_regression():
     regression, joints = small_bottle().regression(), neutral()
     for _ in range(30):
         joints = regression.tick(TIME, joints, {"bottle": REACHED}, limits()).joints
-    near = joints + 0.01
+    near = joints + 0.001
     found, search = searched(REACHED, near, 1, asked=False)
     assert torch.equal(found[0], regression.tick(TIME, near, {"bottle": REACHED}).joints)
     assert search.active is None
