@@ -57,7 +57,7 @@ def encode(thing: Operator | Kinematics) -> dict[str, Any]:
     --------
     >>> from tpgmm_torch import RelativePosition
     >>> encode(RelativePosition("hand", "cup"))
-    {'type': 'RelativePosition', 'link': 'hand', 'frame': 'cup', 'held': False}
+    {'type': 'RelativePosition', 'link': 'hand', 'frame': 'cup', 'held': False, ...}
     """
     name = type(thing).__name__
     if KNOWN.get(name, type(thing)) is not type(thing):

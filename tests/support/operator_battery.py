@@ -194,6 +194,17 @@ class OperatorLaws(World):
         with pytest.raises(FrozenInstanceError):
             operator.link = "elbow"
 
+    def test_a_tolerance_is_as_far_as_it_moves_each_coordinate(self):
+        if not hasattr(self.operator, "tolerance"):  # a stack has those of its members
+            return
+        tolerant = replace(self.operator, tolerance=0.02)
+        found = torch.tensor(tolerant.tolerances(self.kinematics))
+        expected = torch.full((self.operator.dimension(self.kinematics),), 0.02)
+        for start in self.operator.quaternion_starts(self.kinematics):
+            turned = quaternions.exp(torch.tensor([0.02, 0.0, 0.0])) - quaternions.identity()
+            expected[start : start + 4] = torch.linalg.vector_norm(turned).float()
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)
+
     def test_local_data_are_the_coordinates_at_each_time(self):
         demonstration = self.demonstration()
         local = self.operator.local(demonstration, self.kinematics)

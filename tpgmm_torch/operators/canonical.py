@@ -20,7 +20,8 @@ class Canonical(Operator):
     Parameters
     ----------
     tolerance : float, default=0.005
-        Standard deviation that is added to the local covariances [rad or m]. In a few
+        Standard deviation that is added to the local covariances [rad or m; of quaternions,
+        the angle in rad]. In a few
         demonstrations the joints seem to keep relations exactly that they keep by chance, or
         only near the demonstrated situations; these would contradict the task elsewhere.
         0 takes them at their word, as the paper does.
@@ -35,8 +36,11 @@ class Canonical(Operator):
     tolerance: float = 0.005
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """The tolerance, for every joint."""
-        return (self.tolerance,) * self.dimension(kinematics)
+        """The tolerance, for every joint; half of it for what is part of a quaternion."""
+        tolerances = [self.tolerance] * self.dimension(kinematics)
+        for start in self.quaternion_starts(kinematics):
+            tolerances[start : start + 4] = [self.tolerance / 2] * 4
+        return tuple(tolerances)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """The number of joints."""

@@ -31,20 +31,28 @@ class AbsoluteOrientation(Operator):
         :class:`AbsolutePosition`.
     gain : float, default=2.0
         The factor g; 1.0 is eq. (14) as printed.
+    tolerance : float, default=0
+        Standard deviation that is added to the local covariances [rad]: agreement below it
+        means nothing, see :class:`Canonical`.
 
     Examples
     --------
     >>> from tpgmm_torch import AbsoluteOrientation
     >>> AbsoluteOrientation("left_hand")
-    AbsoluteOrientation(link='left_hand', gain=2.0)
+    AbsoluteOrientation(link='left_hand', gain=2.0, tolerance=0.0)
     """
 
     link: str
     gain: float = 2.0
+    tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Four: a quaternion (w, x, y, z)."""
         return 4
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Half the tolerance: a turn moves a quaternion by half its angle."""
+        return (self.tolerance / 2,) * 4
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) mu``."""
@@ -85,22 +93,30 @@ class RelativeOrientation(Operator):
     held : bool, default=False
         Whether the frame is the object as a thing that the robot may carry, or the place
         where it was when it was last free; see :class:`RelativePosition`.
+    tolerance : float, default=0
+        Standard deviation that is added to the local covariances [rad]: agreement below it
+        means nothing, see :class:`Canonical`.
 
     Examples
     --------
     >>> from tpgmm_torch import RelativeOrientation
     >>> RelativeOrientation("left_hand", "bottle")
-    RelativeOrientation(link='left_hand', frame='bottle', gain=2.0, held=False)
+    RelativeOrientation(link='left_hand', frame='bottle', gain=2.0, held=False, tolerance=0.0)
     """
 
     link: str
     frame: str
     gain: float = 2.0
     held: bool = False
+    tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Four: a quaternion (w, x, y, z)."""
         return 4
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Half the tolerance: a turn moves a quaternion by half its angle."""
+        return (self.tolerance / 2,) * 4
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``."""

@@ -25,19 +25,27 @@ class AbsolutePosition(Operator):
     link : str
         Name of the link (end-effector), or of an object: while the robot carries it, of its
         point on the link that does; while it is free, the operator says nothing.
+    tolerance : float, default=0
+        Standard deviation that is added to the local covariances [m]: agreement below it
+        means nothing, see :class:`Canonical`.
 
     Examples
     --------
     >>> from tpgmm_torch import AbsolutePosition
     >>> AbsolutePosition("left_hand")
-    AbsolutePosition(link='left_hand')
+    AbsolutePosition(link='left_hand', tolerance=0.0)
     """
 
     link: str
+    tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Three [m]."""
         return 3
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """The tolerance, along each axis."""
+        return (self.tolerance,) * 3
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_p (q - q_{t-1}) = mu - x_{t-1}``."""
@@ -76,12 +84,15 @@ class RelativePosition(Operator):
         robot carries it: then the operator of the hand that carries it says nothing, that of
         the other hand is the closed chain's. By default it is a place: the pose of the object
         when it was last free.
+    tolerance : float, default=0
+        Standard deviation that is added to the local covariances [m]: agreement below it
+        means nothing, see :class:`Canonical`.
 
     Examples
     --------
     >>> from tpgmm_torch import RelativePosition
     >>> RelativePosition("left_hand", "bottle")
-    RelativePosition(link='left_hand', frame='bottle', held=False)
+    RelativePosition(link='left_hand', frame='bottle', held=False, tolerance=0.0)
     >>> put = RelativePosition("bottle", "tray")
     >>> other_hand = RelativePosition("right_hand", "bottle", held=True)
     """
@@ -89,10 +100,15 @@ class RelativePosition(Operator):
     link: str
     frame: str
     held: bool = False
+    tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Three [m]."""
         return 3
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """The tolerance, along each axis."""
+        return (self.tolerance,) * 3
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J (q - q_{t-1}) = R mu + p - x_{t-1}``.

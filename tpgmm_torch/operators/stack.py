@@ -42,7 +42,7 @@ class Stack(Operator):
     --------
     >>> from tpgmm_torch import AbsolutePosition, Stack
     >>> Stack(AbsolutePosition("left_hand"), AbsolutePosition("right_hand"))
-    Stack(AbsolutePosition(link='left_hand'), AbsolutePosition(link='right_hand'))
+    Stack(AbsolutePosition(link='left_hand', tolerance=0.0), AbsolutePosition(link='right_...))
     """
 
     operators: tuple[Operator, ...]

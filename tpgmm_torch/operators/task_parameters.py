@@ -34,17 +34,21 @@ class TaskParameters(Operator):
         Name of the link whose position [m] is seen; the joints by default.
     size : int, optional
         D, the number of columns of A; by default A is square.
+    tolerance : float, default=0
+        Standard deviation that is added to the local covariances, in units of X: agreement
+        below it means nothing, see :class:`Canonical`.
 
     Examples
     --------
     >>> from tpgmm_torch import TaskParameters
     >>> TaskParameters("shelf", link="hand", size=2)
-    TaskParameters(frame='shelf', link='hand', size=2)
+    TaskParameters(frame='shelf', link='hand', size=2, tolerance=0.0)
     """
 
     frame: str
     link: str | None = None
     size: int | None = None
+    tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """D: the columns of A."""
@@ -55,6 +59,10 @@ class TaskParameters(Operator):
         if kinematics is None:
             raise DataError(f"{self!r} has as many coordinates as the robot has joints")
         return kinematics.n_joints
+
+    def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """The tolerance, for every column of A."""
+        return (self.tolerance,) * self.dimension(kinematics)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``A^+ J (q - q_{t-1}) = mu + A^+ (b - x_{t-1})``, with J = I for the joints."""

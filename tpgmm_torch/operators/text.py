@@ -5,13 +5,16 @@
 ``position:r_hand@held:bottle`` refers to the bottle as it is carried, ``position:bottle@tray``
 is where a carried bottle is on a tray, and ``canonical`` the joints themselves.
 ``parameters@shelf`` takes task parameters A, b of the situation, on the joints,
-``parameters:l_hand@shelf`` on a link's position.
+``parameters:l_hand@shelf`` on a link's position. ``~`` and a number behind a term is its
+tolerance, ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad].
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Operator
@@ -36,11 +39,13 @@ TERM = re.compile(
 PARAMETERS = re.compile(
     r"parameters(:(?P<link>[^\s:@+]+))?@(?P<frame>[^\s:@+\[\]]+)(\[(?P<size>[1-9]\d*)\])?"
 )
+TOLERANCE = re.compile(r"(?P<term>[^~]+)~(?P<tolerance>\d+\.?\d*(e-?\d+)?)")
 GRAMMAR = (
     "'canonical', or 'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each "
     "with '@FRAME' behind it if seen from a frame or another link, '@held:FRAME' if from an "
     "object as the robot carries it (LINK may be an object too), or 'parameters@NAME' or "
-    "'parameters:LINK@NAME' (with '[D]' behind it if A has D columns); '+' stacks them, as in "
+    "'parameters:LINK@NAME' (with '[D]' behind it if A has D columns), all but 'pose' perhaps "
+    "with a tolerance, '~NUMBER', behind it; '+' stacks them, as in "
     "'position:l_hand@bottle + orientation:l_hand@bottle'"
 )
 
@@ -55,7 +60,7 @@ def parse_operator(text: str) -> Operator:
         ``orientation`` or ``pose`` (both), a colon and a link or an object that is carried;
         ``@`` and the name of a frame or of another link make it relative, ``@held:`` to an
         object as it is carried. ``parameters@NAME``, ``parameters:LINK@NAME`` are
-        :class:`TaskParameters`.
+        :class:`TaskParameters`. ``~0.01`` behind a term that is one operator is its tolerance.
 
     Raises
     ------
@@ -65,15 +70,23 @@ def parse_operator(text: str) -> Operator:
     Examples
     --------
     >>> parse_operator("position:l_hand@bottle")
-    RelativePosition(link='l_hand', frame='bottle', held=False)
-    >>> parse_operator("pose:l_hand + canonical").operators[2]
-    Canonical(tolerance=0.005)
+    RelativePosition(link='l_hand', frame='bottle', held=False, tolerance=0.0)
+    >>> parse_operator("pose:l_hand + canonical~0.02").operators[2]
+    Canonical(tolerance=0.02)
     """
     operators = [operator for term in text.split("+") for operator in _term(term.strip(), text)]
     return operators[0] if len(operators) == 1 else Stack(*operators)
 
 
 def _term(term: str, text: str) -> list[Operator]:
+    if given := TOLERANCE.fullmatch(term):
+        operators = _term(given["term"], text)
+        if len(operators) > 1:
+            raise DataError(
+                f"operator {text!r}: {term!r} is a position [m] and an orientation [rad], of "
+                "which each has a tolerance of its own: write both"
+            )
+        return [replace(operators[0], tolerance=float(given["tolerance"]))]  # type: ignore[type-var]
     if term == "canonical":
         return [Canonical()]
     if general := PARAMETERS.fullmatch(term):
@@ -115,14 +128,21 @@ def format_operator(operator: Operator) -> str:
     if isinstance(operator, Stack):
         return " + ".join(map(format_operator, operator.operators))
     if type(operator) is Canonical:
-        return "canonical"
+        return "canonical" + _tolerance(operator)
     if type(operator) is TaskParameters:
         link = "" if operator.link is None else f":{operator.link}"
         size = "" if operator.size is None else f"[{operator.size}]"
-        return f"parameters{link}@{operator.frame}{size}"
+        return f"parameters{link}@{operator.frame}{size}" + _tolerance(operator)
     for kind, classes in KINDS.items():
         if type(operator) in classes:
             places = [f"@{name}" for name in operator.references()]
             link, *held = operator.links()
-            return f"{kind}:{link}" + "".join([*places, *(f"@held:{name}" for name in held)])
+            places += [f"@held:{name}" for name in held]
+            return f"{kind}:{link}" + "".join(places) + _tolerance(operator)
     return repr(operator)
+
+
+def _tolerance(operator: Any) -> str:
+    """What stands behind the term of an operator whose tolerance is not the default one."""
+    given: float = operator.tolerance
+    return "" if given == type(operator).tolerance else f"~{given!r}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -104,9 +105,17 @@ def regularization(
     Returns
     -------
     array of shape (sum of 1 + D_j,)
+
+    Raises
+    ------
+    DataError
+        If a tolerance is negative, or not finite.
     """
     units = moments.standardization(
         block_widths(operators, kinematics), isotropic=covariance_type == "spherical"
     )
     tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
+    for operator, (_, *given) in zip(operators, tolerances, strict=True):
+        if not all(0 <= tolerance < math.inf for tolerance in given):
+            raise DataError(f"a tolerance is a number of at least 0, {operator!r} has {given}")
     return reg_covar + (np.concatenate(tolerances) / torch.cat(units.scales).numpy()) ** 2

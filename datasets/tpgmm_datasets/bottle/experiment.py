@@ -60,7 +60,7 @@ def bottle_operators(orientation: bool = True) -> list[Operator]:
     --------
     >>> hands, joints = bottle_operators(orientation=False)
     >>> hands
-    Stack(RelativePosition(link='l_hand', frame='bottle', held=False), ...
+    Stack(RelativePosition(link='l_hand', frame='bottle', held=False, ...
     """
     rows: list[Operator] = []
     for hand in HANDS:

@@ -1,15 +1,27 @@
 """The joints themselves as local coordinates, and their tolerance."""
 
+from dataclasses import replace
+
 import pytest
 import torch
+from sklearn.base import clone
 
 from tests.support import oracles
 from tests.support.operator_battery import OperatorLaws, OrientationLaws
-from tests.support.skills import bottle_demonstrations, bottle_model, generator, waves
+from tests.support.skills import (
+    bottle_demonstrations,
+    bottle_model,
+    generator,
+    handlings,
+    hands_model,
+    waves,
+)
 from tests.support.worlds import OnPoses, OnRobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import (
     Canonical,
+    RelativeOrientation,
+    RelativePosition,
     Stack,
     TaskParameterizedGMM,
 )
@@ -66,7 +78,7 @@ def test_it_is_an_absolute_variance_whatever_the_spread_of_the_data():
 
 
 def test_with_ten_demonstrations_it_keeps_the_joints_from_contradicting_the_task():
-    """Without it relations that the joints keep by chance pull the hands off the bottle."""
+    """Relations that full covariances keep by chance pull the hands off the bottle."""
     situations = generator().situations(8, seed=21)
     time = bottle_demonstrations()[0].time
     grasp = sum(d.events["grasp"] for d in bottle_demonstrations()) / len(
@@ -76,10 +88,37 @@ def test_with_ten_demonstrations_it_keeps_the_joints_from_contradicting_the_task
     task, _ = bottle_operators()
     errors = {}
     for tolerance in (0.0, Canonical().tolerance):
-        model = bottle_model(30).set_params(operators=[task, Canonical(tolerance)])
+        model = bottle_model(30, covariance_shrinkage=0)
+        model.set_params(operators=[task, Canonical(tolerance)])
         reproductions = model.fit(bottle_demonstrations()).predict(situations, candidates=False)
         errors[tolerance] = sum(
             float(generator().grasp_error(r.joints[contact], s.frames["bottle"])[0])
             for r, s in zip(reproductions, situations, strict=True)
         )
     assert errors[Canonical().tolerance] < errors[0.0] / 3
+
+
+def test_every_operator_has_a_tolerance_in_its_unit():
+    """Their squares are added to the variances, for quaternions half of them."""
+    position = RelativePosition("left", "cup", tolerance=0.003)
+    orientation = RelativeOrientation("left", "cup", tolerance=0.02)
+    model = hands_model(
+        operators=[position, orientation],
+        n_components=1,
+        covariance_type="diag",
+        reg_covar=0.0,
+        plausibility="ignore",
+    )
+    exact = clone(model).set_params(
+        operators=[replace(position, tolerance=0.0), replace(orientation, tolerance=0.0)]
+    )
+    found = [model.fit(handlings()).covariances_, exact.fit(handlings()).covariances_]
+    for tolerant, strict, added in zip(*found, (0.003, 0.01), strict=True):
+        difference = (tolerant - strict).diagonal(dim1=1, dim2=2)[:, 1:]
+        torch.testing.assert_close(difference, torch.full_like(difference, added**2))
+
+
+@pytest.mark.parametrize("tolerance", [-0.01, float("nan"), float("inf")])
+def test_what_is_no_tolerance_is_refused(tolerance):
+    with pytest.raises(DataError, match=r"a tolerance is a number of at least 0, Canonical"):
+        TaskParameterizedGMM(2, [Canonical(tolerance)]).fit(waves())

@@ -32,6 +32,9 @@ OPERATORS = [
     TaskParameters("shelf", "l_hand"),
     TaskParameters("shelf", size=3),
     Stack(TaskParameters("shelf", "l_hand", 2), Canonical()),
+    Canonical(tolerance=0.02),
+    RelativePosition("l_hand", "bottle", tolerance=1e-5),
+    Stack(AbsoluteOrientation("l_hand", tolerance=0.1), TaskParameters("shelf", tolerance=2.0)),
 ]
 
 
@@ -62,11 +65,19 @@ def test_a_pose_is_position_and_orientation():
         "pose:a@held:",
         "parameters",
         "parameters@a[0]",
+        "canonical~",
+        "canonical~-1",
+        "canonical~0.1~0.2",
     ],
 )
 def test_what_is_no_operator_is_refused_and_explained(text):
     with pytest.raises(DataError, match="A term is 'canonical', or"):
         parse_operator(text)
+
+
+def test_a_pose_has_two_tolerances():
+    with pytest.raises(DataError, match=r"position \[m\] and an orientation \[rad\]"):
+        parse_operator("pose:l_hand@bottle~0.01")
 
 
 def test_an_object_may_be_meant_as_it_is_carried():
