@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.control.clocks import Clock, EvenClock, Observation
@@ -31,6 +32,9 @@ from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 
 __all__ = ["Controller"]
+
+#: For so long a robot that was moved is remembered to have been [s].
+PUSH_MEMORY = 0.5
 
 
 class Controller:
@@ -129,8 +133,12 @@ class Controller:
         self._search = PostureSearch()
         self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
+        self._gap_before: NDArray[np.float64] | None = None  # reference and robot, last tick
+        self._pushed: NDArray[np.float64] | float = 0.0
         shape = self.reference.shape[:-1]
         self._codes = torch.zeros(shape, dtype=torch.int8, device=self.reference.device)
+        none = torch.zeros(shape, dtype=torch.bool, device=self.reference.device)
+        self._led, self._brought = none, none
         self._gap, self._since = self._velocity, torch.full_like(self._velocity[..., 0], -1.0)
         self._fading = blend > 0
 
@@ -194,15 +202,20 @@ class Controller:
             if self._trust is not None and dt > self._trust.longest_step:
                 passed = dt = self._trust.longest_step
             if halted is not None:
-                passed = torch.where(halted, 0.0, passed)
+                passed = torch.where(halted, 0.0, torch.as_tensor(passed, dtype=torch.float64))
             holding = self.holding
             observed = Observation(
                 measured, self._asked, None, holding.frames, last.estimate,
                 holding.state if holding.carries else None,
             )  # fmt: skip
             self._progress = before.advance(passed, observed)
-            if measured is not None and bool((moved := self._progress.relocalized).any()):
-                self._restart_fading(moved)
+            if measured is not None:
+                if (away := self._driven_away(measured, dt)) is not None:
+                    self._stand(away, measured)
+                    self._brought = self._brought | away
+                if bool((moved := self._progress.relocalized).any()):
+                    self._stand(moved, measured)
+                    self._brought = self._brought & ~moved
         time, ended = self._progress.time, None
         if last is not None and bool((time >= self._end).any()):
             ended = (time >= self._end) & (before.time >= self._end)
@@ -226,18 +239,10 @@ class Controller:
             wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
         if ended is not None and bool(ended.any()):
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
-        led, goal = None, None
+        goal = None
         if measured is not None and self._trust is not None and last is not None:
-            if (away := self._driven_away(measured)) is not None:
-                self._restart_fading(away)
-            waits = time - before.time < 0.05 * passed
-            if away is not None or bool(waits.any()):
-                # what holds them is not fought: they are led on from where they stand
-                lead = (wanted - measured).clamp(-self._trust.lead, self._trust.lead)
-                led = waits.expand(self._codes.shape) if away is None else away | waits
-                led = led.unsqueeze(-1) & ~measured.isnan()
-                goal = torch.where(led, measured + lead, wanted)
-        return self._send(estimate, wanted, dt, halted, ended, led, goal)
+            goal = self._leading(estimate.joints, wanted, measured, time - before.time, passed)
+        return self._send(estimate, wanted, dt, halted, ended, goal)
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
@@ -351,17 +356,63 @@ class Controller:
             activation[index] = estimate.activation
         return Estimate(joints, covariance, activation)
 
-    def _driven_away(self, measured: Tensor | None) -> Tensor | None:
-        """Robots that stand far from their references; None if there is none."""
-        if measured is None or self._inputs is None or self.command is None:
+    def _driven_away(self, measured: Tensor, dt: float) -> Tensor | None:
+        """Robots that somebody else has moved from their references; None if there is none.
+
+        A robot that is slow, or stopped, is left behind as fast as its reference moves; one
+        that is moved goes faster.
+        """
+        if self._inputs is None:
             return None
         trust = self._inputs.trust  # in numpy, which takes a third of the time of torch
-        gap = np.abs(measured.numpy(force=True) - self.reference.numpy(force=True))
-        allowed = trust.largest_gap + trust.lag * np.abs(self._velocity.numpy(force=True))
-        far = gap > allowed  # not where nothing is believed
+        stands, reference = measured.numpy(force=True), self.reference.numpy(force=True)
+        gap, speed = np.abs(stands - reference), np.abs(self._velocity.numpy(force=True))
+        before, unknown = self._gap_before, np.isnan(gap)
+        if before is None:
+            self._gap_before = np.where(unknown, 0.0, gap)
+            return None
+        if unknown.any():
+            gap = np.where(unknown, before, gap)
+        kept = self._pushed * max(0.0, 1 - dt / PUSH_MEMORY)
+        pushed = np.maximum(kept + gap - before - speed * dt, 0.0)
+        far = (gap > trust.largest_gap + trust.lag * speed) | (pushed > trust.largest_push)
+        self._gap_before, self._pushed = gap, pushed
         if not far.any():
             return None
         return torch.as_tensor(far.any(-1), device=self.reference.device)
+
+    def _stand(self, robots: Tensor, measured: Tensor) -> None:
+        """References of robots that were brought elsewhere begin anew where they stand."""
+        joints = robots.unsqueeze(-1) & ~measured.isnan()
+        self.reference = torch.where(joints, measured, self.reference)
+        self._velocity = torch.where(joints, 0.0, self._velocity)
+        if self._follower is not None:
+            self._follower = self._follower.put(joints, self.reference)
+        if self._gap_before is not None:
+            rows = joints.numpy(force=True)
+            self._gap_before = np.where(rows, 0.0, self._gap_before)
+            self._pushed = np.where(rows, 0.0, self._pushed)
+        self._restart_fading(robots)
+
+    def _leading(
+        self, asked: Tensor, wanted: Tensor, measured: Tensor, went: Tensor, passed: Any
+    ) -> Tensor | None:
+        """Where robots are led that do not follow; None if all do."""
+        assert self._trust is not None
+        waits = (went < 0.05 * passed).expand(self._led.shape)
+        if bool(self._brought.any()):
+            back = (asked - measured).abs().nan_to_num(0.0).amax(-1) <= 2 * self._trust.lead
+            self._brought = self._brought & ~back
+        if bool((follow := self._led & ~waits).any()):
+            self._restart_fading(follow)  # from where they were led to
+        self._led = waits
+        if not bool(waits.any()):
+            return None
+        # what holds them is not fought, and joints go on together, as a held object needs it
+        way = wanted - measured
+        size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
+        lead = way * (self._trust.lead / size.clamp(min=self._trust.lead))
+        return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + lead, wanted)
 
     def _checked(self, joints: Any) -> Tensor | None:
         if joints is None:
@@ -409,10 +460,9 @@ class Controller:
         dt: float,
         halted: Tensor | None,
         ended: Tensor | None,
-        led: Tensor | None = None,
         goal: Tensor | None = None,
     ) -> Command:
-        """The command that brings robots to where they are wanted, or are led (..., 1)."""
+        """The command that brings robots to where they are wanted, or are led."""
         last, self._wanted, lost = self.reference, wanted, None
         wanted = wanted if goal is None else goal
         if self._bounds is None:
@@ -434,10 +484,14 @@ class Controller:
                 lost = ~wanted.isfinite().all(-1)  # and is brought to rest
             self._follower = follower
             self.reference, self._velocity = follower.reference, follower.velocity
-        # who is led is not where it should be, however near its reference is
+        # who is led or was brought elsewhere is not where it should be, however near its
+        # reference is
         self._asked = self.reference
-        if led is not None:
-            self._asked = torch.where(led, self._wanted, self.reference)
+        if goal is not None:
+            self._asked = torch.where(self._led.unsqueeze(-1), self._wanted, self._asked)
+        if bool(self._brought.any()):
+            known = self._brought.unsqueeze(-1) & estimate.joints.isfinite()
+            self._asked = torch.where(known, estimate.joints, self._asked)
         codes = self._codes
         reasons: Mapping[tuple[int, ...], str] = {}
         if ended is not None and bool(ended.any()):

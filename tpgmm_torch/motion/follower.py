@@ -106,6 +106,21 @@ class Follower:
         """The same follower somewhere else; see :meth:`at`."""
         return type(self).at(self.bounds, reference, velocity)
 
+    def put(self, joints: Tensor, reference: Tensor) -> Self:
+        """The same follower, with some joints at rest somewhere else.
+
+        Parameters
+        ----------
+        joints : Tensor of bool, of shape (..., n_joints)
+            Which ones.
+        reference : Tensor of shape (..., n_joints)
+            Where they are then.
+        """
+        moment = self.moment.put(joints.numpy(force=True), as_array(reference))
+        return replace(
+            self, reference=torch.where(joints, reference, self.reference), moment=moment
+        )
+
     @property
     def velocity(self) -> Tensor:
         """Of the reference [rad/s or m/s], shape (..., n_joints)."""
@@ -131,20 +146,23 @@ class Follower:
         Follower or None
             None if a joint of a robot cannot follow.
         """
-        moment = self.moment
-        exact = moment.taken(as_array(wanted), dt)
+        moment, raw, limits = self.moment, as_array(wanted), self.bounds.arrays
+        exact = moment.taken(raw, dt)
         # bytes are sooner looked at than an array of bool
         certain = (
             moment.behind is None and b"\0" not in moment.measured(exact, self.bounds).tobytes()
         )
-        if not certain and not moment.allows(exact, self.bounds).all():
-            return None
+        if not certain:
+            within = (raw >= limits.lower) & (raw <= limits.upper)  # else: back to them
+            if not (within & moment.allows(exact, self.bounds)).all():
+                return None
         return type(self)(self.bounds, wanted, exact)
 
     def fits(self, wanted: Tensor, dt: float) -> Tensor:
         """Which robots :meth:`take` would serve: bool of shape (...)."""
-        exact = self.moment.taken(as_array(wanted), dt)
-        fits = self.moment.allows(exact, self.bounds).all(-1)
+        raw, limits = as_array(wanted), self.bounds.arrays
+        within = (raw >= limits.lower) & (raw <= limits.upper)
+        fits = (within & self.moment.allows(self.moment.taken(raw, dt), self.bounds)).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
 
     def advance(self, wanted: Tensor, dt: float) -> Self:
@@ -209,6 +227,21 @@ class Moment(NamedTuple):
         zero = np.zeros_like(position)
         motion = Motion(position, velocity, zero)
         return cls(motion, velocity, zero, position, velocity, None, 0.0)
+
+    def put(self, joints: Mask, position: Array) -> Self:
+        """Some joints at rest somewhere else."""
+        rest = type(self).moving(position, np.zeros_like(position))
+
+        def either(new: Array, old: Array) -> Array:
+            return np.where(joints, new, old)
+
+        behind = None if self.behind is None else self.behind & ~joints
+        return type(self)(
+            Motion(*map(either, rest.motion, self.motion)),
+            *map(either, rest[1:5], self[1:5]),
+            behind if behind is not None and behind.any() else None,
+            self.dt,
+        )
 
     def taken(self, position: Array, dt: float) -> Self:
         """The next moment if that is the next reference."""

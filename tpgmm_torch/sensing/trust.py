@@ -59,6 +59,9 @@ class Trust:
         Of a robot that stands further than this from its reference, in one joint, the reference
         comes to where it stands, and goes on from there [rad or m]: what drove it away would be
         fought with all force otherwise.
+    largest_push : float
+        Of a robot that was moved further than this from its reference, faster than the
+        reference moves itself, the same [rad or m].
     lag : float
         How late a servo may be: on top of that, what the reference moves in this time [s].
     lead : float
@@ -80,6 +83,7 @@ class Trust:
     frame_jump: float = 0.06
     turn_jump: float = 0.6
     largest_gap: float = 0.3
+    largest_push: float = 0.1
     lag: float = 0.15
     lead: float = 0.015
     longest_step: float = 0.5

@@ -45,6 +45,8 @@ NOMINAL = "nominal"
 FIRST = 0.5
 #: So long before the grasp an object has stopped to move [s].
 APPROACH = 1.5
+#: For so long somebody holds a robot where it was put [s].
+HELD = 0.3
 POSE = 7
 
 
@@ -170,7 +172,7 @@ class Stopped(Disturbance):
 
 @dataclass(frozen=True)
 class Displaced(Disturbance):
-    """The robot is put to where it was, or will be, and left there at rest.
+    """The robot is put to where it was, or will be, held there for a moment, and left at rest.
 
     Back is the state of the world in this very episode: whatever was grasped since then is as
     it was, and the table as high. Ahead is the posture on the generator's path for this start
@@ -190,8 +192,12 @@ class Displaced(Disturbance):
 
     @property
     def delay(self) -> float:
-        """What has to be done a second time."""
-        return max(0.0, -self.seconds)
+        """What has to be done a second time, and what passes while it is held."""
+        return HELD + max(0.0, -self.seconds)
+
+    def stops(self, time: float) -> bool:
+        """While somebody holds the robot where it was put."""
+        return self.moment <= time < self.moment + HELD
 
     def drawn(
         self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]

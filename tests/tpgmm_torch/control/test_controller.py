@@ -273,8 +273,10 @@ def test_a_robot_in_a_batch_is_what_it_is_alone(clock):
         joints = batch.reference + torch.from_numpy(1e-3 * rng.standard_normal((8, 17)))
         if 20 <= k < 50:
             joints[2] = torch.nan
-        if 40 <= k < 60:
-            joints[5] += 0.7
+        if k == 40:
+            away = batch.reference[5] - 0.2 * batch.reference[5].sign()
+        if 40 <= k < 60:  # somebody holds it there
+            joints[5] = away
         pose = problem.frames[OBJECT]
         poses = torch.cat((pose.position, pose.orientation), -1)
         poses[:, :3] += torch.from_numpy(1e-3 * rng.standard_normal((8, 3)))
