@@ -1,0 +1,146 @@
+"""Moving pictures of a skill that runs while things go wrong, as WebP files.
+
+The simulated robot shakes a bottle in episodes of the environment ``bottle_shaking`` in which
+it is stopped, is pushed back, or in which somebody moves the bottle. Beside it, over time: the
+controller's progress in the skill, and how stiff the model wants the arms to be.
+
+    python examples/moving_pictures.py docs/images
+
+It needs the plugin with its extra ``environments``, and EGL or OSMesa to draw with.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_torch import Frame, Impedance, TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.control.command import Command, Status
+
+#: File, condition of the environment, what happens.
+EPISODES = {
+    "stopped": ("stopped-3@6+live", "stopped for 3 s"),
+    "pushed": ("pushed-back-2@8+live", "pushed back by 2 s"),
+    "moved": ("moved-slowly+live", "the bottle is moved on the way"),
+}
+SEED = 10003
+#: Pictures per second of the episode, and how fast they are shown.
+PICTURES, SPEED = 5, 2.0
+#: Of the picture of the robot, and of the curves beside it [pixels].
+HEIGHT, WIDTH, CURVES = 180, 200, 220
+
+
+def learned() -> TaskParameterizedGMM:
+    """The skill from ten generated demonstrations."""
+    skill = BottleShaking(steady_rhythm=True)
+    demonstrations = skill.demonstrations(10, seed=0)
+    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
+    return TaskParameterizedGMM(30, bottle_operators(), skill.robot).fit(aligned)
+
+
+def told(observation: dict[str, Any]) -> tuple[NDArray[np.float64], dict[str, Frame]]:
+    """Posture and objects of an observation."""
+    pose = observation["environment_state"]
+    return observation["agent_pos"], {"bottle": Frame(pose[:3], pose[3:])}
+
+
+def run(
+    model: TaskParameterizedGMM, condition: str, length: int | None = None
+) -> Iterator[tuple[float, Command, NDArray[np.uint8]]]:
+    """Time, command and picture, ``PICTURES`` times a second of an episode of some ticks."""
+    env = BottleShakingEnv(
+        condition=condition,
+        episode_length=length,
+        render_mode="rgb_array",
+        render_width=WIDTH,
+        render_height=HEIGHT,
+    )
+    observation, _ = env.reset(seed=SEED)
+    joints, frames = told(observation)
+    controller = model.controller(joints, frames, impedance=Impedance(model.kinematics_))
+    over, step = False, 0
+    while not over:
+        command = controller.step(1 / env.fps, *told(observation))
+        if step % (env.fps // PICTURES) == 0:
+            yield step / env.fps, command, env.render()
+        observation, _, ended, cut, info = env.step(controller.reference.numpy())
+        over, step = ended or cut, step + 1
+    print(f"{condition}: {'success' if info['is_success'] else 'failure'}")
+
+
+class Curves:
+    """Progress and stiffness over time, up to now."""
+
+    def __init__(self, title: str, seconds: float, length: float) -> None:
+        mpl.rcParams.update(
+            {"font.size": 7, "axes.spines.top": False, "axes.spines.right": False}
+        )
+        figure = Figure((CURVES / 100, HEIGHT / 100), dpi=100, layout="constrained")
+        self._canvas = FigureCanvasAgg(figure)
+        above, below = figure.subplots(2, sharex=True)
+        figure.suptitle(title, fontsize=7)
+        for axes in (above, below):
+            axes.spines[["top", "right"]].set_visible(False)
+        above.plot((0, length), (0, length), color="0.8", linewidth=1)
+        above.set(ylabel="progress [s]", ylim=(0, 1.05 * length), xlim=(0, seconds))
+        below.set(ylabel="stiffness\n[N m/rad]", xlabel="time [s]", ylim=(0, 420))
+        self._lines = above.plot([], [], "k")[0], below.plot([], [], "tab:blue")[0]
+        self._status = above.text(0.02, 0.82, "", transform=above.transAxes, color="tab:red")
+        self._points: list[tuple[float, float, float]] = []
+
+    def __call__(self, time: float, command: Command) -> NDArray[np.uint8]:
+        """The picture (height, width, 3) at the next instant."""
+        self._points.append((time, float(command.time), float(command.stiffness.mean())))
+        times, *curves = np.array(self._points).T
+        for line, curve in zip(self._lines, curves, strict=True):
+            line.set_data(times, curve)
+        self._status.set_text("" if command.status == Status.RUNNING else command.status.value)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3]
+
+
+def write(
+    path: Path,
+    model: TaskParameterizedGMM,
+    condition: str,
+    title: str,
+    length: int | None = None,
+) -> None:
+    """One episode as a file."""
+    moments = list(run(model, condition, length))
+    curves = Curves(title, moments[-1][0], float(model.time_[-1]))
+    pictures = [
+        Image.fromarray(np.hstack((picture, curves(time, command))))
+        for time, command, picture in moments
+    ]
+    shown = round(1000 / (PICTURES * SPEED))
+    durations = [shown] * (len(pictures) - 1) + [1500]  # the last one stands
+    pictures[0].save(
+        path, save_all=True, append_images=pictures[1:], duration=durations, loop=0,
+        quality=35, method=6, minimize_size=True,
+    )  # fmt: skip
+    print(f"{path}: {len(pictures)} pictures, {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, help="where the files go")
+    parser.add_argument("--only", choices=EPISODES, help="one of them")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    skill = learned()
+    for name, (condition, title) in EPISODES.items():
+        if options.only in (None, name):
+            write(options.folder / f"{name}.webp", skill, condition, title)
