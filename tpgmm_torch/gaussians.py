@@ -8,6 +8,7 @@ leave directions of ``x`` free, where eq. (2) would invert a singular matrix.
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,8 +33,10 @@ FEW = 64
 
 
 def common_shape(*shapes: torch.Size) -> torch.Size:
-    """:func:`torch.broadcast_shapes`, which is slow, but not where the shapes are equal."""
-    return shapes[0] if len(set(shapes)) == 1 else torch.broadcast_shapes(*shapes)
+    """:func:`torch.broadcast_shapes`, whose first call takes most of a second of imports."""
+    if len(set(shapes)) == 1:
+        return shapes[0]
+    return torch.Size(np.broadcast_shapes(*shapes))
 
 
 def cholesky(matrix: Tensor, name: str) -> Tensor:

@@ -192,7 +192,7 @@ class Controller:
         passed: float | Tensor = dt
         if isinstance(dt, Tensor):  # the follower has one time step for all
             increased = (dt > 0) & dt.isfinite()
-            passed = torch.where(increased, dt, 0.0)
+            passed = torch.where(increased, dt, 0.0).double()
             dt = float(dt[increased].median()) if bool(increased.any()) else 0.0
         if last is not None and not 0 < dt < math.inf:
             return self._refuse(last, f"time did not increase: dt = {dt} s")

@@ -188,7 +188,7 @@ class Operator(ABC):
         linear = (
             matrix if at.jacobian is None else gaussians.pseudo_inverse(at.jacobian) @ matrix
         )
-        batch = torch.broadcast_shapes(state.joints.shape[:-1], linear.shape[:-2])
+        batch = gaussians.common_shape(state.joints.shape[:-1], linear.shape[:-2])
         return linear.expand(*batch, *linear.shape[-2:])
 
     def offset(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.data.arrays import Array
 
-__all__ = ["within"]
+__all__ = ["step_within", "within"]
 
 #: So many robots are sooner solved one by one.
 FEW = 8
@@ -78,6 +79,58 @@ def within(mean: Tensor, covariance: Tensor, lower: Tensor, upper: Tensor) -> Te
     whole = mean.clone()
     whole[some] = torch.clamp(joints, lowers, uppers)  # but for rounding
     return whole
+
+
+def step_within(
+    joints: Tensor, vector: Tensor, precision: Tensor, lower: Tensor, upper: Tensor
+) -> Tensor:
+    """Where a quadratic cost is least within bounds: exact, for each robot of a batch.
+
+    What :func:`within` says of ``N(joints + precision^-1 vector, precision^-1)``, for those who
+    know the precision. On a processor each robot is solved by itself, so that it does not
+    depend on the others.
+
+    Parameters
+    ----------
+    joints, vector : Tensor of shape (..., n_joints)
+        Where the cost has that downhill gradient.
+    precision : Tensor of shape (..., n_joints, n_joints)
+        Its second derivative.
+    lower, upper : Tensor of shape (..., n_joints)
+        As for :func:`within`.
+
+    Raises
+    ------
+    DataError
+        If a precision is singular.
+    """
+    there, left = torch.empty_like(joints), np.ones(joints.shape[:-1], bool)
+    if joints.device.type == "cpu":
+        numbers = (joints, vector, precision, lower.expand_as(joints), upper.expand_as(joints))
+        q, v, p, low, high = (
+            x.numpy(force=True).astype(np.float64, copy=False) for x in numbers
+        )
+        with np.errstate(all="ignore"):  # what is no number is left
+            unit = 1 / np.sqrt(np.diagonal(p, axis1=-2, axis2=-1))
+            scaled = p * unit[..., :, None] * unit[..., None, :]
+            least, most = (np.minimum(low, high) - q) / unit, (high - q) / unit
+            downhill = v * unit
+        found = np.empty_like(q)
+        for row in np.ndindex(*left.shape):
+            solved = None
+            if np.isfinite(scaled[row]).all() and np.isfinite(downhill[row]).all():
+                solved = _solved(scaled[row], downhill[row], least[row], most[row])
+            left[row] = solved is None
+            found[row] = q[row] if solved is None else q[row] + unit[row] * solved[0]
+        there = torch.from_numpy(found.clip(np.minimum(low, high), high)).to(joints)
+    if left.any():
+        rows = torch.from_numpy(left)
+        factor = gaussians.cholesky(precision[rows], "the product")
+        step = torch.cholesky_solve(vector[rows].unsqueeze(-1), factor).squeeze(-1)
+        bounds = (bound.expand_as(joints)[rows] for bound in (lower, upper))
+        covariance = torch.cholesky_inverse(factor)
+        there[rows] = within(joints[rows] + step, covariance, *bounds)
+    return there
 
 
 def _standing(
@@ -146,14 +199,20 @@ def _sides_of_one(
     if not deviation.all():
         return None
     try:
-        precision = np.linalg.inv(c / np.outer(deviation, deviation))
+        precision: Array = np.linalg.inv(c / np.outer(deviation, deviation))
     except np.linalg.LinAlgError:
         return None
     low, high = (low - m) / deviation, (high - m) / deviation
-    zero, none = np.zeros_like(m), np.zeros((0, len(m)))
-    solution, _, flag, info = daqp.solve(precision, zero, none, high, low, primal_tol=1e-11)
-    fits = (solution <= high + 1e-9) & (solution >= low - 1e-9)
-    if flag != 1 or not fits.all():
-        return None
+    solved = _solved(precision, np.zeros_like(m), low, high)
     # its multipliers are positive at upper bounds
-    return torch.from_numpy(np.sign(info["lam"])).to(mean)
+    return None if solved is None else torch.from_numpy(np.sign(solved[1])).to(mean)
+
+
+def _solved(
+    precision: Array, vector: Array, low: Array, high: Array
+) -> tuple[Array, Array] | None:
+    """The ``x`` of least ``x^T precision x / 2 - vector^T x`` within bounds, multipliers."""
+    none = np.zeros((0, len(vector)))
+    x, _, flag, info = daqp.solve(precision, -vector, none, high, low, primal_tol=1e-11)
+    fits = (x <= high + 1e-9) & (x >= low - 1e-9)
+    return (x, info["lam"]) if flag == 1 and fits.all() else None

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Self
 
 import torch
@@ -38,15 +39,15 @@ from tpgmm_torch.operators import (
     Stack,
 )
 from tpgmm_torch.operators.base import Reference
-from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.regression.kalman_update import TASKS
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["PostureSearch"]
 
-#: Steps that are tried in one tick.
-TRIALS = 4
+#: Steps that are tried in one tick: the time that they take is all that trouble may cost.
+TRIALS = 2
 #: Components of a smaller weight do not count.
 NEGLIGIBLE = 1e-5
 #: Damping, as a share of the precision: at first after a step that failed, and at most.
@@ -58,7 +59,7 @@ PROMISE = 1e-9
 TRUST = 0.2
 #: Ticks for which a lower cost is looked for from one of so many other postures. It is gone to
 #: if it is lower by this factor, and by so much.
-LOOK, STARTS, BETTER, SLACK = 10, 8, 0.95, 50.0
+LOOK, STARTS, BETTER, SLACK = 20, 64, 0.95, 50.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +73,9 @@ class PostureSearch:
     ----------
     active : Tensor of bool, of shape (...), optional
         Robots whose regression is not trusted; None if there are none.
-    minima, damping : Tensor of shape (2, K, ..., n_joints) and (2, K, ...), optional
-        Where the components' searches are; then those that look elsewhere for a lower cost.
+    minima, damping : Tensor of shape (K + 1, ..., n_joints) and (K + 1, ...), optional
+        Where the components' searches are; behind them one that looks elsewhere for a lower
+        cost of the heaviest.
     age : Tensor of int, of shape (...), optional
         Ticks since each robot's search began.
     """
@@ -148,13 +150,14 @@ class PostureSearch:
         """Wanted joints, trust in the estimate's, minima, damping and age."""
         like, batch = estimate.joints, estimate.joints.shape[:-1]
         where: tuple[Any, ...] = rows.nonzero(as_tuple=True) if batch else (None,)
+        of_all = (slice(None), *where)
         weights = estimate.activation.expand(*batch, -1)[where]
-        weights = torch.where(weights > NEGLIGIBLE, weights, 0.0).mT
+        weights = torch.where(weights > NEGLIGIBLE, weights, 0.0).mT  # (K, R)
         count, index = len(weights), weights.any(-1).nonzero()[:, 0]
         lower, upper = (bound.expand_as(like)[where] for bound in bounds)
         # a search begins where the robot stands
-        minima = reference.expand(2, count, *batch, -1)
-        damping = like.new_zeros(2, count, *batch)
+        minima = reference.expand(count + 1, *batch, -1)
+        damping = like.new_zeros(count + 1, *batch)
         age = torch.zeros(batch, dtype=torch.long, device=like.device)
         if self.active is not None and self.minima is not None:
             assert self.damping is not None and self.age is not None
@@ -169,89 +172,92 @@ class PostureSearch:
             everyone[(slice(None), *where)] = joints
             return state_at(everyone)[(slice(None), *where)]
 
-        here, of_all = age[where], (slice(None), *where)
-        starts = torch.where(
-            (here % LOOK == 0).unsqueeze(-1), _starts(here // LOOK, lower, upper), torch.nan
-        )
-        found, damped = minima[0][index][of_all], damping[0][index][of_all]
-        looks = minima[1][index][of_all]
-        looks = torch.where(starts.isnan(), looks, starts)
+        # rows: the components' searches, a look elsewhere and a step from where the robot
+        # stands, both of the heaviest component
+        size, here, heaviest = len(index), age[where], weights.argmax(0, keepdim=True)
+        places = torch.cat((index, index.new_tensor([count])))
+        found, damped = minima[places][of_all], damping[places][of_all]
+        begins = here % LOOK == 0
+        starts = _starts(here // LOOK, lower, upper)
+        found[size] = torch.where(begins.unsqueeze(-1), starts, found[size])
+        damped[size] = torch.where(begins, 0.0, damped[size])
         cost = _Cost(
             regression,
-            torch.cat((index, index)),
+            torch.cat((index.unsqueeze(-1).expand(-1, len(here)), heaviest, heaviest)),
             time.expand(batch)[where] if time.ndim else time,
             reference[where],
             {name: frame.expand(batch)[where] for name, frame in frames.items()},
             state,
         )
-        relaxed = torch.where(here % LOOK == 0, 0.0, damping[1][index][of_all])
-        found, damped, height = _descended(
-            cost, torch.cat((found, looks)), torch.cat((damped, relaxed)), lower, upper
-        )
-        size = len(index)
-        # the heaviest component decides for all whether it is better elsewhere
-        heaviest = weights[index].argmax(0, keepdim=True)
-        low, other = (x.gather(0, heaviest) for x in (height[:size], height[size:]))
-        better = (here % LOOK == LOOK - 1) & (other < BETTER * low - SLACK)
-        goal = found[size:].gather(0, heaviest.unsqueeze(-1).expand(1, *found.shape[1:]))
-        nearest = torch.where(better.unsqueeze(-1), goal, found[:size])
-        # how much nearer to its minimum one step of the linearised problem leads
         begun = torch.clamp(reference[where], lower, upper)
-        _, vector, precision = cost(begun.expand_as(found))
-        stepped, _ = _stepped(begun, vector, precision, lower, upper)
-        chosen = heaviest.unsqueeze(-1).expand(1, *found.shape[1:])
-        step, goal = (x[:size].gather(0, chosen)[0] for x in (stepped, nearest))
+        found, damped, height, stepped = _descended(
+            cost,
+            torch.cat((found, begun.unsqueeze(0))),
+            torch.cat((damped, torch.zeros_like(damped[:1]))),
+            lower,
+            upper,
+        )
+        # the heaviest component decides for all whether it is better elsewhere
+        chosen = torch.searchsorted(index, heaviest)
+        low, other = height.gather(0, chosen), height[size]
+        better = (here % LOOK == LOOK - 1) & (other < BETTER * low[0] - SLACK)
+        nearest = torch.where(better.unsqueeze(-1), found[size], found[:size])
+        goal = nearest.gather(0, chosen.unsqueeze(-1).expand(1, *begun.shape))[0]
         shares = (weights[index] / weights.sum(0)).unsqueeze(-1)
         mixed = torch.clamp((shares * nearest).sum(0), lower, upper)
-        # out of reach, where components of little weight may lead astray, of the whole mixture
+        # how much nearer to its minimum one step of the linearised problem leads; out of
+        # reach, where components of little weight may lead astray, of the whole mixture
         reached = (low[0] < SLACK).unsqueeze(-1)
         goal = torch.where(reached, goal, mixed)
-        step = torch.where(reached, step, estimate.joints[where])
+        step = torch.where(reached, stepped[size + 1], estimate.joints[where])
         away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
         trust = like.new_ones(batch)
         trust[where] = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
         wanted = like.clone()
         wanted[where] = mixed
         # a component that counts only later begins where the others are
-        minima = wanted.expand(2, count, *batch, -1).clone()
+        counts = (weights[index] > 0).unsqueeze(-1)
+        minima = wanted.expand(count + 1, *batch, -1).clone()
         damping = torch.zeros_like(damping)
-        for k, joints in enumerate((nearest, found[size:])):
-            places = (k, index[:, None], *where) if batch else (k, index, None)
-            minima[places] = joints
-            damping[places] = damped[k * size : (k + 1) * size]
+        rows_of = (places[:, None], *where) if batch else (places, None)
+        minima[rows_of] = torch.cat((torch.where(counts, nearest, mixed), found[size:-1]))
+        damping[rows_of] = damped[:-1]
         return wanted, trust, minima, damping, age + 1
-
-
-def _stepped(
-    joints: Tensor, vector: Tensor, precision: Tensor, lower: Tensor, upper: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Where the quadratic model of the cost is least within bounds, and the step to it."""
-    factor = gaussians.cholesky(precision, "the product")
-    step = torch.cholesky_solve(vector.unsqueeze(-1), factor).squeeze(-1)
-    there = within(joints + step, torch.cholesky_inverse(factor), lower, upper)
-    return there, there - joints
 
 
 def _starts(number: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Postures (R, n) to look for a lower cost from: the middle of the limits, and others."""
-    generator = torch.Generator().manual_seed(0)
-    points = torch.rand(STARTS, lower.shape[-1], generator=generator, dtype=torch.float64)
-    points[0] = 0.5
     # joints without limits turn
     low, high = lower.clamp(min=-torch.pi), upper.clamp(max=torch.pi)
-    return torch.lerp(low, torch.maximum(low, high), points.to(lower)[number % STARTS])
+    shares = _shares(lower.shape[-1]).to(lower)[number % STARTS]
+    return torch.lerp(low, torch.maximum(low, high), shares)
+
+
+@cache
+def _shares(n_joints: int) -> Tensor:
+    """Where between their limits the joints begin, (STARTS, n)."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.inference_mode(False):
+        shares = torch.rand(STARTS, n_joints, generator=generator, dtype=torch.float64)
+        shares[0] = 0.5
+    return shares
 
 
 def _descended(
     cost: _Cost, joints: Tensor, damping: Tensor, lower: Tensor, upper: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """A few steps downhill within bounds from joints (A, ..., n), damping (A, ...), costs."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """A few steps downhill within bounds from joints (A, ..., n) with damping (A, ...).
+
+    Joints, damping and costs after them, and where the first step led.
+    """
     joints = torch.clamp(joints, lower, upper)
     here, vector, precision = cost(joints)
-    for _ in range(TRIALS):
+    first = joints
+    for trial in range(TRIALS):
         scale = precision.diagonal(dim1=-2, dim2=-1) * damping.unsqueeze(-1)
         damped = precision + torch.diag_embed(scale)
-        there, step = _stepped(joints, vector, damped, lower, upper)
+        there = step_within(joints, vector, damped, lower, upper)
+        first, step = there if trial == 0 else first, there - joints
         bend = (step.unsqueeze(-2) @ precision @ step.unsqueeze(-1))[..., 0, 0]
         promise = (vector * step).sum(-1) - 0.5 * bend
         tried = promise > PROMISE * (here + PROMISE)
@@ -268,11 +274,11 @@ def _descended(
         here = torch.where(taken, new, here)
         vector = torch.where(taken.unsqueeze(-1), new_vector, vector)
         precision = torch.where(taken[..., None, None], new_precision, precision)
-    return joints, damping, here
+    return joints, damping, here, first
 
 
 class _Cost:
-    """The costs F_i of some components at one instant, for states of joints (A, ..., n)."""
+    """The costs F_i of components (A, ...) at one instant, for states of joints (A, ..., n)."""
 
     def __init__(
         self,
@@ -283,18 +289,15 @@ class _Cost:
         frames: Mapping[str, Frame],
         state_at: Callable[[Tensor], RobotState],
     ) -> None:
-        self.regression, self.centre, self.frames = regression, centre, frames
+        self.centre, self.frames = centre, frames
         self.state_at, self.factors = state_at, list[Tensor]()
         self.local = []
-        ones = [1] * (centre.ndim - 1)
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
             chosen = one.select(index)
-            mean = chosen.at(time).movedim(-2, 0)  # (A, ..., D), or (A, D) of one time
-            if not time.ndim:
-                mean = mean.view(len(index), *ones, -1)
-            covariance = chosen.covariance
-            covariance = covariance.view(len(index), *ones, *covariance.shape[-2:])
-            self.local.append((_Residual.of(operator, regression), mean, covariance))
+            elapsed = (time - chosen.time_mean).unsqueeze(-1)
+            mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
+            term = _Residual.of(operator, regression)
+            self.local.append((term, mean, chosen.covariance))
         closed = any(operator.determines_joints for operator in regression.operators)
         self.prior = None if closed else torch.as_tensor(regression.prior_std).to(centre) ** -2
 
@@ -312,6 +315,7 @@ class _Cost:
                 precision + torch.diag_embed(self.prior.expand(n)),
             )
         first = not self.factors
+        factors = []
         for j, (term, mean, covariance) in enumerate(self.local):
             matrix, residual, jacobian, noise = term(mean, state, self.frames)
             if first:  # how far apart displacements are does not change within a tick
@@ -319,16 +323,23 @@ class _Cost:
                 if noise is not None:
                     spread = spread + noise.diag_embed()
                 name = "the covariance of a projected component"
-                self.factors.append(gaussians.cholesky(spread, name))
+                factor = gaussians.cholesky(spread, name)
+                # of the joints themselves the precision is all that is asked for
+                known = jacobian is None
+                factors.append(torch.cholesky_inverse(factor) if known else factor)
+            factor = factors[j] if first else self.factors[j]
             if jacobian is None:
-                jacobian = torch.eye(n, dtype=joints.dtype, device=joints.device)
-            jacobian = jacobian.expand(*residual.shape, n)
-            right = torch.cat((jacobian, residual.unsqueeze(-1)), -1)
-            white = torch.linalg.solve_triangular(self.factors[j], right, upper=False)
+                pull = (factor @ residual.unsqueeze(-1)).squeeze(-1)
+                cost = cost + 0.5 * (residual * pull).sum(-1)
+                vector, precision = vector + pull, precision + factor
+                continue
+            right = torch.cat((jacobian.expand(*residual.shape, n), residual.unsqueeze(-1)), -1)
+            white = torch.linalg.solve_triangular(factor, right, upper=False)
             gram = white.mT @ white
             cost = cost + 0.5 * gram[..., n, n]
             vector = vector + gram[..., :n, n]
             precision = precision + gram[..., :n, :n]
+        self.factors = self.factors or factors
         return cost, vector, precision
 
 
@@ -416,5 +427,5 @@ class _Residual:
 
 def _cross(vector: Tensor, matrix: Tensor) -> Tensor:
     """``v x M``, column by column."""
-    shape = torch.broadcast_shapes(vector.unsqueeze(-1).shape, matrix.shape)
+    shape = gaussians.common_shape(vector.unsqueeze(-1).shape, matrix.shape)
     return torch.linalg.cross(vector.unsqueeze(-1).expand(shape), matrix.expand(shape), dim=-2)

@@ -1,12 +1,14 @@
 """The most likely joints within bounds: exact, by two methods that are tested on each other."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from tests.support.mixtures import CASES, Problem, assert_close, times
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression import joint_limits
-from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.joint_limits import step_within, within
 
 
 def problems(count, n, seed=0, spread=1e-4):
@@ -149,3 +151,23 @@ def test_of_a_step_the_other_joints_take_over(width):
     lower, upper = problem.state.joints - width, problem.state.joints + width
     bounded = problem.regression().step(*now, bounds=(lower, upper)).joints
     assert_optimal(bounded, plain.joints, plain.covariance, lower, upper)
+
+
+def test_a_step_within_bounds_is_that_of_the_gaussian():
+    generator = torch.Generator().manual_seed(3)
+    random = partial(torch.randn, generator=generator, dtype=torch.float64)
+    factor, joints, vector = random(40, 6, 6), random(40, 6), 3 * random(40, 6)
+    precision = factor @ factor.mT + 0.1 * torch.eye(6)
+    lower, upper = joints - 0.3, joints + random(40, 6).abs()
+    upper[0, 2], lower[1] = lower[0, 2], upper[1] + 1  # no room, and a contradiction
+    together = step_within(joints, vector, precision, lower, upper)
+    mean = joints + torch.linalg.solve(precision, vector)
+    expected = within(mean, torch.linalg.inv(precision), lower, upper)
+    assert_close(together, expected, 1e-9)
+    assert bool((together <= upper).all())
+    for row in range(40):  # bit for bit what it is alone
+        one = slice(row, row + 1)
+        alone = step_within(joints[one], vector[one], precision[one], lower[one], upper[one])
+        assert torch.equal(alone, together[one])
+    with pytest.raises(DataError, match="the product is not positive definite"):
+        step_within(joints, vector, -precision, lower, upper)
