@@ -40,9 +40,10 @@ bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_A
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
-fuzz: $(VENV)/.installed-test ## Damage thousands of files and kill hundreds of saves: 15 minutes
+fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
 	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
-	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py $(PYTEST_ARGS)
+	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py \
+	    tests/tpgmm_torch/control/test_controller.py $(PYTEST_ARGS)
 
 mutants: $(VENV)/.installed-mutation ## Count changed lines that a room's tests notice: ROOM=operators
 	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python tests/mutants.py $(ROOM) $(MUTANTS_ARGS)

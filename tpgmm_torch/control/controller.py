@@ -35,6 +35,9 @@ __all__ = ["Controller"]
 
 #: For so long a robot that was moved is remembered to have been [s].
 PUSH_MEMORY = 0.5
+#: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
+#: another one for each size, ends there, before whoever follows enlarges it.
+GRID = 2.0**32
 
 
 class Controller:
@@ -129,7 +132,9 @@ class Controller:
         self._bounds, self._position_bounds = bounds, None
         if bounds is not None:
             self._follower = Follower.at(bounds, self.reference) if at_rest else None
-            self._position_bounds = bounds.lower, bounds.upper
+            # what is rounded keeps within them
+            low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
+            self._position_bounds = low / GRID, high / GRID
         self._search = PostureSearch()
         self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
@@ -237,11 +242,14 @@ class Controller:
         wanted = self._shifted(estimate.joints, shift)
         if self._follower is not None and last is not None and not self._follows(wanted, dt):
             wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
-        if ended is not None and bool(ended.any()):
+        if last is not None and ended is not None and bool(ended.any()):
+            # for them it is as if all had come to the end
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
         goal = None
         if measured is not None and self._trust is not None and last is not None:
-            goal = self._leading(estimate.joints, wanted, measured, time - before.time, passed)
+            waits = (time - before.time < 0.05 * passed).expand(self._led.shape)
+            waits = waits if ended is None else waits & ~ended
+            goal = self._leading(estimate.joints, wanted, measured, waits)
         return self._send(estimate, wanted, dt, halted, ended, goal)
 
     def copy(self) -> Self:
@@ -297,7 +305,11 @@ class Controller:
     def _shifted(self, joints: Tensor, shift: Tensor | None) -> Tensor:
         if shift is not None:
             joints = joints + shift
-        return self._regression.kinematics.retract(joints)
+        joints = self._regression.kinematics.retract(joints)
+        if self._bounds is None:
+            return joints
+        rounded = (joints.detach() * GRID).round() / GRID
+        return joints + (rounded - joints).detach() if joints.requires_grad else rounded
 
     def _follows(self, wanted: Tensor, dt: float) -> bool:
         """Whether all robots can be where they are wanted, as in an ordinary tick."""
@@ -395,11 +407,10 @@ class Controller:
         self._restart_fading(robots)
 
     def _leading(
-        self, asked: Tensor, wanted: Tensor, measured: Tensor, went: Tensor, passed: Any
+        self, asked: Tensor, wanted: Tensor, measured: Tensor, waits: Tensor
     ) -> Tensor | None:
         """Where robots are led that do not follow; None if all do."""
         assert self._trust is not None
-        waits = (went < 0.05 * passed).expand(self._led.shape)
         if bool(self._brought.any()):
             back = (asked - measured).abs().nan_to_num(0.0).amax(-1) <= 2 * self._trust.lead
             self._brought = self._brought & ~back
@@ -513,3 +524,13 @@ class Controller:
             self._impedance,
         )
         return self.command
+
+
+def _choose(where: Tensor, one: Estimate, other: Estimate) -> Estimate:
+    """One estimate for some robots (...), the other for the rest."""
+    mask = where.unsqueeze(-1)
+    return Estimate(
+        torch.where(mask, one.joints, other.joints),
+        torch.where(mask.unsqueeze(-1), one.covariance, other.covariance),
+        torch.where(mask, one.activation, other.activation),
+    )

@@ -55,6 +55,9 @@ ROUNDING = 1e-9
 MEMORY = 0.05
 #: Of the speed limit, how much a wanted posture is believed to move on with.
 CRUISE = 0.9
+#: What is planned for is a multiple of ``1 / GRID`` [rad or m]: a plan enlarges a difference of
+#: rounding ten million times.
+GRID = 2.0**20
 #: A wanted posture that is faster than this many seconds of full acceleration has jumped.
 HASTE = 0.5
 
@@ -288,12 +291,17 @@ class Moment(NamedTuple):
         """That step, with the joints that are asked on the fastest way to it."""
         limits, dt = bounds.arrays, exact.dt
         start = self.motion.select(asked)
-        speed, acceleration, jerk = (
+        speed, acceleration, jerk, low, high = (
             np.broadcast_to(x, asked.shape)[asked]
-            for x in (limits.velocity, limits.acceleration, limits.jerk)
+            for x in (
+                limits.velocity, limits.acceleration, limits.jerk, limits.lower, limits.upper,
+            )
+        )  # fmt: skip
+        target, before = (
+            np.clip(np.rint(x[asked] * GRID) / GRID, low, high)
+            for x in (exact.wanted, self.wanted)
         )
-        target = exact.wanted[asked]
-        drift, moved = self.drift[asked], (target - self.wanted[asked]) / dt
+        drift, moved = self.drift[asked], (target - before) / dt
         # what is faster than the joint is a jump, not a motion
         moves = np.abs(moved) <= np.minimum(speed, HASTE * acceleration)
         drift = drift + min(1.0, dt / MEMORY) * np.where(moves, moved - drift, 0.0)

@@ -199,10 +199,11 @@ def _sides_of_one(
     if not deviation.all():
         return None
     try:
-        precision: Array = np.linalg.inv(c / np.outer(deviation, deviation))
+        unit_precision = np.linalg.inv(c / np.outer(deviation, deviation))
     except np.linalg.LinAlgError:
         return None
     low, high = (low - m) / deviation, (high - m) / deviation
+    precision = np.asarray(unit_precision, dtype=np.float64)
     solved = _solved(precision, np.zeros_like(m), low, high)
     # its multipliers are positive at upper bounds
     return None if solved is None else torch.from_numpy(np.sign(solved[1])).to(mean)
