@@ -245,6 +245,7 @@ class Controller:
         if last is not None and ended is not None and bool(ended.any()):
             # for them it is as if all had come to the end
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
+            estimate = _choose(ended, last.estimate, estimate)
         goal = None
         if measured is not None and self._trust is not None and last is not None:
             waits = (time - before.time < 0.05 * passed).expand(self._led.shape)

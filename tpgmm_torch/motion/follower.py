@@ -239,9 +239,13 @@ class Moment(NamedTuple):
             return np.where(joints, new, old)
 
         behind = None if self.behind is None else self.behind & ~joints
+        slope, bend, wanted, drift = map(either, rest[1:5], self[1:5])
         return type(self)(
             Motion(*map(either, rest.motion, self.motion)),
-            *map(either, rest[1:5], self[1:5]),
+            slope,
+            bend,
+            wanted,
+            drift,
             behind if behind is not None and behind.any() else None,
             self.dt,
         )
