@@ -169,9 +169,7 @@ def _instants(at: Instants | None, demonstration: Demonstration) -> Tensor:
     if at is None:
         return time
     if isinstance(at, str):
-        if at not in demonstration.events:
-            raise UnknownNameError("event", at, "the demonstration", demonstration.events)
-        at = demonstration.events[at]
+        at = demonstration.event(at)
     elif callable(at):
         at = at(demonstration)
     instants = as_tensor(at, "an instant").to(time).reshape(-1)

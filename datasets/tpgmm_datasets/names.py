@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_groups
+from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups, quaternion_groups, words
 
 __all__ = ["POSE_PARTS", "match_names", "pose_groups", "quaternion_groups", "value_names"]
-
-_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
-_SILENT = {"k", "joint", "pos", "position", "motor"}
-_SIDES = {"l": "left", "r": "right"}
 
 
 def value_names(names: Any, width: int, distinct: bool = True) -> tuple[str, ...] | None:
@@ -49,13 +44,6 @@ def value_names(names: Any, width: int, distinct: bool = True) -> tuple[str, ...
     return tuple(names)
 
 
-def _words(name: str) -> tuple[str, ...]:
-    """Words of a name in any spelling: ``kLeftElbow``, ``left_elbow_joint``, ``l_elbow``."""
-    words = [word.lower() for word in _WORDS.findall(name)]
-    spoken = tuple(_SIDES.get(word, word) for word in words if word not in _SILENT)
-    return spoken or tuple(words)
-
-
 JOINT_NAMES = "Give joint_names={'name in the data set': 'joint of the robot', ...}"
 
 
@@ -79,7 +67,7 @@ def match_names(
     """
     matched: dict[str, str] = {}
     for name in wanted:
-        fits = [name] if name in present else [p for p in present if _words(p) == _words(name)]
+        fits = [name] if name in present else [p for p in present if words(p) == words(name)]
         fits = [fit for fit in fits if fit not in matched]
         if len(fits) != 1:
             what = f"fits several values, {fits}" if fits else "is none of the values"

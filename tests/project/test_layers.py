@@ -29,7 +29,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("robots", "alignment", "large_data"),
         ("operators", "mixture", "impedance"),
         ("training", "persistence", "metrics", "motion", "sensing", "plausibility"),
-        ("regression",),
+        ("regression", "events"),
         ("control",),
         ("estimator",),
         ("model_selection", "plotting", "viewing"),

@@ -92,7 +92,8 @@ class Demonstration(_PlainFrames):
     joint_names : sequence of str, optional
         Names of the columns of ``joints``; with them a robot may have another order.
     events : mapping of str to float, optional
-        Instants that matter, by name [s], for example ``{"grasp": 4.2}``.
+        Instants that matter, by name [s], for example ``{"grasp": 4.2}``. ``"start"`` and
+        ``"end"`` need not be given: they are the first and the last instant.
 
     Raises
     ------
@@ -168,6 +169,20 @@ class Demonstration(_PlainFrames):
         if name not in self.frames:
             raise UnknownNameError("frame", name, "the demonstration", self.frames)
         return self.frames[name]
+
+    def event(self, name: str) -> float:
+        """When the event of that name is [s]; every demonstration has a start and an end.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such event.
+        """
+        ends = {"start": float(self.time[0]), "end": float(self.time[-1])}
+        known = {**ends, **self.events}
+        if name not in known:
+            raise UnknownNameError("event", name, "the demonstration", known)
+        return known[name]
 
     def reordered(self, joint_names: Sequence[str]) -> Demonstration:
         """The same demonstration with its joint columns in the order of ``joint_names``.

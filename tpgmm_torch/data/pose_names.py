@@ -1,14 +1,25 @@
-"""Poses among named columns: ``bottle.x`` to ``bottle.qz`` are one."""
+"""Names of columns: their words, and poses, of which ``bottle.x`` to ``bottle.qz`` are one."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = ["POSE_PARTS", "pose_groups", "quaternion_groups"]
+__all__ = ["POSE_PARTS", "pose_groups", "quaternion_groups", "words"]
 
 #: How the parts of a pose are called after its own name: metres, and (w, x, y, z).
 POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+_WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[0-9]+")
+_SILENT = {"k", "joint", "pos", "position", "motor"}
+_SIDES = {"l": "left", "r": "right"}
+
+
+def words(name: str) -> tuple[str, ...]:
+    """Words of a name in any spelling: ``kLeftElbow``, ``left_elbow_joint``, ``l_elbow``."""
+    spelled = [word.lower() for word in _WORDS.findall(name)]
+    spoken = tuple(_SIDES.get(word, word) for word in spelled if word not in _SILENT)
+    return spoken or tuple(spelled)
 
 
 def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:

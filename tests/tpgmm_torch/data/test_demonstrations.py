@@ -31,6 +31,14 @@ def demonstration(**changes) -> Demonstration:
     return Demonstration(**(arguments | changes))
 
 
+def test_every_demonstration_has_a_start_and_an_end():
+    shown = Demonstration([1.0, 2.0, 4.0], [[0.0], [1.0], [2.0]], events={"close": 3.0})
+    assert [shown.event(name) for name in ("start", "close", "end")] == [1.0, 3.0, 4.0]
+    assert Demonstration(shown.time, shown.joints, events={"end": 3.5}).event("end") == 3.5
+    with pytest.raises(UnknownNameError, match=r"'open' .*\['close', 'end', 'start'\]"):
+        shown.event("open")
+
+
 def test_a_demonstration_knows_its_size():
     demo = demonstration()
     assert (len(demo), demo.n_joints, demo.duration) == (5, 2, 2.0)
