@@ -30,7 +30,13 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.em.column_moments import ColumnMoments
-from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.exceptions import (
+    DataError,
+    ModelFileError,
+    NotFittedError,
+    ShapeError,
+    UnknownNameError,
+)
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
@@ -173,7 +179,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     holds_ : tuple of Hold
         In the time of the skill.
     frame_names_ : tuple of str
-        Frames that a situation must have.
+        Frames that a situation must have; those at which a link was at the start of every
+        demonstration (``--frame start=l_hand@start``) follow from its start posture where
+        they are not given.
     time_ : Tensor of shape (T,)
         Time grid of a typical demonstration, the default of ``predict`` [s].
     acceleration_, jerk_ : Tensor of shape (n_joints,) or None
@@ -637,14 +645,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             each other. Nothing moves.
         """
         self._check_fitted()
+        frames = self._completed(joints, frames or {})
         for operator in self.operators_:
-            operator.check(self.kinematics_, frames or {})
+            operator.check(self.kinematics_, frames)
         if bounds or self._limited:
             if not isinstance(bounds, MotionBounds):
                 bounds = self.motion_bounds(**(bounds or {}))
         else:
             bounds = None
-        self._examine_tick(self.time_[0], joints, frames or {})
+        self._examine_tick(self.time_[0], joints, frames)
         return Controller(
             self.regression(),
             joints,
@@ -1132,12 +1141,31 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 f"the start posture has {len(given.joints)} joints, the model has "
                 f"{len(names)}: {names}"
             )
+        complete = self._completed(given.joints, given.frames)
         for operator in self.operators_:
-            operator.check(self.kinematics_, given.frames)
+            operator.check(self.kinematics_, complete)
         time = self.time_ if given.time is None else given.time.to(like)
-        present = given.frames_at(time)
+        present = {**complete, **given.frames_at(time)}
         frames = {name: present[name].to(like) for name in self.frame_names_}
         return Situation(given.joints.to(like), frames, time)
+
+    def _completed(self, joints: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
+        """Frames, and those that are not given but are where a link is in a start posture.
+
+        Raises
+        ------
+        UnknownNameError
+            If one that the model needs is missing all the same.
+        """
+        complete = dict(frames)
+        if self.shown_ is not None:
+            start = self.kinematics_.joint_tensor(joints)
+            complete |= self.shown_.start_frames(start, self.kinematics_, frames)
+        for name in self.frame_names_:
+            if name not in complete:
+                where = "the situation, which has to tell it (the event of one is yet to be)"
+                raise UnknownNameError("frame", name, where, complete)
+        return complete
 
     def _rows(self, X: Sequence[Demonstration]) -> list[NDArray[np.float64]]:
         self._check_fitted()

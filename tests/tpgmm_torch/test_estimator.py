@@ -1171,3 +1171,77 @@ def test_things_need_the_information_form():
         UnknownNameError,
         "link 'cup' is not in the robot or the frames",
     )
+
+
+def started(demonstration, link="l_hand"):
+    """With the frame ``start``, where a link is at first."""
+    state = upper_body().state(demonstration.joints[0])
+    start = Frame(state.position(link), state.orientation(link))
+    return replace(demonstration, frames={**demonstration.frames, "start": start})
+
+
+@pytest.fixture(scope="module")
+def starting():
+    """A model in which where the hand started matters, and a demonstration of it."""
+    shown = [started(one) for one in few_bottles()]
+    operators = [pose("l_hand", "bottle"), pose("l_hand", "start"), Canonical()]
+    model = TaskParameterizedGMM(4, operators, upper_body(), random_state=0, max_iter=5)
+    return model.fit(shown), shown[1]
+
+
+def test_where_a_link_starts_follows_from_the_start_posture(starting, tmp_path):
+    model, shown = starting
+    assert {name: f.link for name, f in model.shown_.frames.items()} == {
+        "bottle": None,
+        "start": "l_hand",
+    }
+    given = Situation(shown.joints[0], shown.frames)
+    bottle = {"bottle": shown.frames["bottle"]}
+    silent = Situation(shown.joints[0], bottle)
+    model.save(tmp_path / "model")
+    expected, found = model.predict([given, silent], candidates=False)
+    [loaded] = TaskParameterizedGMM.load(tmp_path / "model").predict([silent], candidates=False)
+    for other in (found, loaded):
+        torch.testing.assert_close(other.joints, expected.joints, rtol=0, atol=1e-9)
+    # a pose that is given counts
+    there = Frame(shown.frames["start"].position + 0.01, shown.frames["start"].orientation)
+    [other] = model.predict([replace(given, frames={**bottle, "start": there})])
+    assert (other.joints - expected.joints).abs().max() > 1e-3
+
+
+def test_a_controller_of_many_robots_knows_where_each_starts(starting):
+    model, shown = starting
+    starts = shown.joints[0] + torch.tensor([[0.0], [0.05], [-0.05]])
+    bottle = {"bottle": shown.frames["bottle"]}
+    together = model.controller(starts, bottle, clock="even")
+    alone = [
+        model.controller(
+            q, started(replace(shown, joints=q.repeat(len(shown), 1))).frames, clock="even"
+        )
+        for q in starts
+    ]
+    for _ in range(5):
+        together.step(0.05)
+        for n, one in enumerate(alone):
+            one.step(0.05)
+            torch.testing.assert_close(together.reference[n], one.reference, rtol=0, atol=1e-7)
+
+
+def test_a_frame_that_the_start_does_not_tell_has_to_be_given(starting):
+    model, shown = starting
+    for frames in ({}, {"start": shown.frames["start"]}):
+        for use in (
+            lambda f: model.predict([Situation(shown.joints[0], f)]),
+            lambda f: model.controller(shown.joints[0], f),
+        ):
+            with pytest.raises(
+                UnknownNameError, match=r"'bottle' is not in the situation.*event"
+            ):
+                use(frames)
+
+
+def test_batches_know_where_links_start_too(starting):
+    model, _ = starting
+    shown = [started(one) for one in few_bottles()]
+    again = clone(model).fit([shown[:2], shown[2:]])
+    assert again.shown_.frames["start"].link == "l_hand"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -34,6 +34,8 @@ FLAT = 0.02
 #: Fewer demonstrations say nothing about which coordinates go together.
 FEWEST = 6
 AXES = "xyz"
+#: A frame that is a link's pose at the start is so up to rounding, that of float32 too.
+ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,9 @@ class ShownFrame:
         Mean of its first orientations (w, x, y, z).
     angle : float
         How far one of them was turned from there, at most [rad].
+    link : str or None
+        The link of the robot that was there at the start of every demonstration: the frame of
+        a new situation then follows from its start posture.
     """
 
     low: Sequence[float]
@@ -60,6 +65,7 @@ class ShownFrame:
     covariance: Sequence[Sequence[float]]
     orientation: Sequence[float]
     angle: float
+    link: str | None = None
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,11 @@ class Shown:
         kinematics : Kinematics
         """
         starts = np.stack([e.path[0] for e in episodes])
+        state = kinematics.state(starts)
+        links = {
+            link: (as_array(state.position(link)), as_array(state.orientation(link)))
+            for link in kinematics.links
+        }
         frames = {}
         for name in episodes[0].frames:
             poses = [e.frames[name] for e in episodes]
@@ -103,6 +114,8 @@ class Shown:
             turns = np.stack([pose.orientations[0] for pose in poses])
             mean = mean_orientation(turns)
             covariance = np.cov(first.T) if len(first) > 1 else np.zeros((3, 3))
+            still = all(len(pose.positions) == 1 for pose in poses)
+            same = [link for link, pose in links.items() if _same(pose, (first, turns))]
             frames[name] = ShownFrame(
                 every.min(axis=0).tolist(),
                 every.max(axis=0).tolist(),
@@ -110,6 +123,7 @@ class Shown:
                 covariance.tolist(),
                 mean.tolist(),
                 float(angles_to(turns, mean).max()),
+                same[0] if still and same else None,
             )
         names, width = kinematics.joint_names, kinematics.n_joints
         compared = ~quaternion_columns(names, width, kinematics.quaternion_starts)
@@ -166,6 +180,31 @@ class Shown:
         if n == 1:
             return MOST_RANGES
         return float(min(MOST_RANGES, (CHANCE * (n + 1)) ** (-1 / (n - 1)) - 1))
+
+    def start_frames(
+        self, joints: Any, kinematics: Kinematics, given: Collection[str] = ()
+    ) -> dict[str, Frame]:
+        """The frames that follow from a start posture: where a link is then.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints)
+            Start postures.
+        kinematics : Kinematics
+        given : collection of str
+            Frames that are not wanted.
+
+        Returns
+        -------
+        dict of str to Frame
+            Of shape (...).
+        """
+        links = {name: f.link for name, f in self.frames.items() if name not in given}
+        wanted = {name: link for name, link in links.items() if link is not None}
+        if not wanted:
+            return {}
+        state = kinematics.state(joints)
+        return {n: Frame(state.position(x), state.orientation(x)) for n, x in wanted.items()}
 
     def distance(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
         """How far a state is from those that demonstrations began in; 1 is the limit.
@@ -339,3 +378,13 @@ class Shown:
 
 def _array(values: Any) -> Array:
     return as_array(values) if hasattr(values, "detach") else np.asarray(values, np.float64)
+
+
+def _same(pose: tuple[Array, Array], other: tuple[Array, Array]) -> bool:
+    """Whether two poses, of positions (N, 3) and orientations (N, 4), are equal."""
+    (position, turn), (there, turned) = pose, other
+    sign = np.sign((turn * turned).sum(axis=-1, keepdims=True))
+    return bool(
+        (np.abs(position - there) < ROUNDING).all()
+        and (np.abs(turn - sign * turned) < ROUNDING).all()
+    )
