@@ -13,6 +13,7 @@ __all__ = ["CHECKS", "DatasetError", "DatasetWarning", "summed_up"]
 #: The checks that ``relax`` may name, with what each of them refuses.
 CHECKS = {
     "duplicates": "an episode that is there twice",
+    "events": "an event that a frame is at and that is not found",
     "gaps": "a step of time longer than one and a half periods",
     "metadata": "lengths, names, rates and tasks that contradict each other",
     "missing": "a parquet file that is absent, truncated or corrupted",

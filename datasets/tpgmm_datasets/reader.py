@@ -9,16 +9,24 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from tpgmm_datasets.conversion.assembly import Assembly, EventSource, FrameSource, frame_sources
+from tpgmm_datasets.conversion.assembly import (
+    Assembly,
+    EventSource,
+    FrameSource,
+    event_sources,
+    frame_sources,
+)
 from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError, summed_up
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
+from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Unit, Units
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.events.detection import doubtful_events
 from tpgmm_torch.plausibility.check import episodes_report, summarize
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Report
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -47,26 +55,48 @@ class Recording:
     relax: Collection[str]
     plausibility: str = "warn"
 
-    def demonstrations(self) -> Iterator[Demonstration]:
+    def demonstrations(self, tell: bool = True) -> Iterator[Demonstration]:
         """Read the wanted episodes, one when it is asked for.
+
+        Parameters
+        ----------
+        tell : bool, default=True
+            Whether to act on events that were not found, after the last episode;
+            :meth:`examine` tells of them too.
 
         Raises
         ------
         DatasetError
             As :func:`load_lerobot`; also if every episode was left out.
+        PlausibilityError
+            If events were not found, and that is an error.
         """
         layout, features = self.assembly.layout, self.assembly.features
         policy, read = Relaxed(self.relax), 0
+        lost: list[DatasetError] = []  # all that have not the event that a frame is at
+        self.assembly.doubtful.clear()
         try:
             for rows in read_episodes(layout, self.episodes, features, policy):
+                try:
+                    demonstration = self.assembly.demonstration(rows)
+                except DatasetError as problem:
+                    if problem.check != "events":
+                        raise
+                    lost.append(problem)
+                    continue
                 read += 1
-                yield self.assembly.demonstration(rows)
+                yield demonstration
+            if lost:
+                policy(DatasetError("; ".join(summed_up(lost)), check="events"))
             if self.episodes and not read:
                 reasons = "; ".join(summed_up(policy.problems))
                 raise DatasetError(
                     f"none of the {len(self.episodes)} episodes is left by the checks that "
                     f"are relaxed, {sorted(self.relax)}: {reasons}"
                 )
+            if tell:
+                doubts = doubtful_events(self.assembly.doubtful, "episode")
+                Report.of(doubts, f"{read} episodes").act(self.plausibility)
         finally:
             policy.warn()
 
@@ -76,16 +106,18 @@ class Recording:
         Parameters
         ----------
         demonstrations : iterable of Demonstration
-            Of this recording, at least one; none is kept.
+            Of this recording, at least one, read to the last; none is kept.
         """
         robot = self.assembly.robot
         known = robot if isinstance(robot, Kinematics) else None
         episodes = [episode for d in demonstrations for episode in summarize([d], known)]
         report = episodes_report(episodes, known)
+        doubtful = doubtful_events(self.assembly.doubtful, "episode")
         joints = self.assembly.joints
         raw = {n for n, u in zip(joints.names or (), joints.units, strict=False) if u == "raw"}
         units = [f for f in report if f.check == "units" and set(f.names) <= raw]
-        return Report.of([f for f in report if f not in units], report.subject)
+        findings = [f for f in report if f not in units]
+        return Report.of([*findings, *doubtful], report.subject)
 
 
 def open_recording(
@@ -130,11 +162,14 @@ def open_recording(
     feature = layout.feature(joint_feature(layout, joints))
     if calibration is not None:
         units = _calibrated(feature, calibration, joint_names, units)
+    columns = JointColumns.choose(feature, joint_names, units, robot)
+    sources = frame_sources(layout, frames)
+    stored = [key.removeprefix(EVENT) for key in layout.features if key.startswith(EVENT)]
     assembly = Assembly(
         layout,
-        JointColumns.choose(feature, joint_names, units, robot),
-        frame_sources(layout, frames),
-        events or {},
+        columns,
+        sources,
+        event_sources(events, sources, stored, columns.names),
         robot,
         rate,
         trim,
@@ -260,12 +295,17 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     frames : mapping of str to str, FramePose, LinkPose or Frame, optional
         Where the pose of each frame is: in a feature (its name alone stands for x y z and a
         quaternion w x y z, constant from the first row on; if the feature names the poses
-        in it, the one of this name), where a link is at an event, or given. The default is
-        every pose that the names of ``observation.environment_state`` tell of (``bottle.x``
-        ... ``bottle.qz``), constant if it never changes.
-    events : mapping of str to callable, optional
-        Functions from the demonstration, with all values of the joint feature, to a time
-        [s]. Columns ``event.*`` are found by themselves.
+        in it, the one of this name), where a link is at an event (``"r_hand@close"``, a
+        :class:`LinkPose`), or given. The default is every pose that the names of
+        ``observation.environment_state`` tell of (``bottle.x`` ... ``bottle.qz``), constant
+        if it never changes.
+    events : mapping of str to str, Detector or callable, optional
+        How events are found, all values of the joint feature given: what
+        :func:`~tpgmm_torch.events.text.parse_event` takes, as ``"closing:*gripper*"``, or a
+        function from the demonstration to a time [s]. Columns ``event.*`` are found by
+        themselves, and so are ``close`` and ``open`` (of the gripper on the link's side, known
+        by its name) and ``stop`` where a frame is at them. What is found without confidence is
+        no event; it is told of, as ``plausibility`` says.
     episodes : slice, sequence of int, or str, optional
         Which: of all in order, by index, or those of a task. The default is all.
     rate : float, optional
@@ -304,7 +344,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     >>> again.joint_names, again.joints[:, 0].tolist()
     (('elbow',), [0.0, 0.5, 1.0])
     """
-    demonstrations = list(recording.demonstrations())
+    demonstrations = list(recording.demonstrations(tell=False))
     if demonstrations and recording.plausibility != "ignore":
         recording.examine(demonstrations).act(recording.plausibility, stacklevel=3)
     return demonstrations

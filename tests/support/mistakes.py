@@ -509,13 +509,13 @@ def a_robot_without_that_link(_):
     Robot.from_urdf(G1_PATH, ["hand"])
 
 
-@mistake("names", r"event 'close' is not in the demonstration")
+@mistake("names", r"event 'touch' is not in the demonstration")
 def a_frame_at_an_event_that_is_not_there(folder):
     root = folder / "set"
     items = [replace(sets.demonstration(0, 12), events={})]
     save_lerobot(items, root, fps=50, task="reach")
     robot = sets.Arm("left_elbow", "right_elbow")
-    load_lerobot(root, robot=robot, frames={"cup": LinkPose("hand", "close")})
+    load_lerobot(root, robot=robot, frames={"cup": LinkPose("hand", "touch")})
 
 
 # -- quaternions ---------------------------------------------------------------------------

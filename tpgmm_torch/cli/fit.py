@@ -53,6 +53,7 @@ def fit(
         ),
     ] = None,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -170,7 +171,7 @@ def fit(
     given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
     recordings = options.recordings(
-        dataset, kinematics, frame, episodes, units, joints, rate, plausibility
+        dataset, kinematics, frame, episodes, units, joints, rate, plausibility, event
     )
     links = kinematics.links if kinematics is not None else ()
     state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)

@@ -44,10 +44,21 @@ Frames = Annotated[
     of_data(
         "An object's pose, repeatable: NAME (found by the names in "
         "observation.environment_state), NAME=FEATURE, NAME=FEATURE\\[7:14], or "
-        "NAME=LINK@EVENT, where a link of the robot is at an event. Default: all poses that "
-        "the set names.",
+        "NAME=LINK@EVENT, where a link of the robot is at an event: one of the set, of "
+        "--event, 'close', 'open' or 'stop' of that link, 'start' or 'end'. Default: all poses "
+        "that the set names.",
         "--frame",
         metavar="NAME[=SOURCE]",
+    ),
+]
+Events = Annotated[
+    list[str] | None,
+    of_data(
+        "How an event is found, repeatable: NAME=closing:SIGNALS or opening:SIGNALS (when a "
+        "gripper's are low), contact: or release:SIGNALS (high), moving:FRAME, stop:LINK; "
+        "SIGNALS are names or patterns of joints, joined by commas.",
+        "--event",
+        metavar="NAME=HOW",
     ),
 ]
 Episodes = Annotated[
@@ -79,10 +90,10 @@ Plausibility = Annotated[
     ),
 ]
 AlignmentMethod = Annotated[
-    Literal["dtw", "barycenter", "linear", "none"],
+    Literal["dtw", "barycenter", "linear", "events", "none"],
     of_data(
         "Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, or not at all."
+        "their average, by stretching time, by stretching it between events, or not at all."
     ),
 ]
 RobotFile = Annotated[
@@ -119,6 +130,7 @@ def recordings(
     joints: str | None,
     rate: float | None,
     plausibility: str = "warn",
+    events: Sequence[str] | None = None,
 ) -> plugins.Recordings:
     """The ``dataset`` of which the options say the rest, not yet read.
 
@@ -128,11 +140,11 @@ def recordings(
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, episodes, units, joints, rate, plausibility
+    frames, episodes, units, joints, rate, plausibility, events
         The options as they were given.
     """
     reader = plugins.required(plugins.READERS, "lerobot")
-    given = frames, episodes, units, joints, rate, plausibility
+    given = frames, episodes, units, joints, rate, plausibility, events
     opened: plugins.Recordings = reader(dataset, robot, *given)
     return opened
 
@@ -203,12 +215,18 @@ def number_or_auto(text: str) -> float | str:
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
     """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
-    from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+    from tpgmm_torch.alignment import (
+        DynamicTimeWarping,
+        EventAlignment,
+        LinearTimeNormalization,
+    )
 
     if method == "none":
         return None
     if method == "linear":
         return LinearTimeNormalization(robot=robot)
+    if method == "events":
+        return EventAlignment(robot=robot)
     return DynamicTimeWarping("medoid" if method == "dtw" else method, robot=robot)
 
 

@@ -38,6 +38,7 @@ def plot(
         typer.Option(help="Also draw each operator's estimate of this joint; repeatable."),
     ] = None,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -61,7 +62,9 @@ def plot(
     for name in chosen:
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
-    recordings = options.recordings(dataset, kinematics, frame, episodes, units, joints, rate)
+    recordings = options.recordings(
+        dataset, kinematics, frame, episodes, units, joints, rate, events=event
+    )
     demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
     situation = Situation.of(demonstrations[0])
     [trajectory] = fitted.predict([situation])

@@ -45,6 +45,7 @@ def reproduce(
         typer.Option(help="Or a LeRobot data set: the situations of its episodes."),
     ] = None,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -71,7 +72,7 @@ def reproduce(
         wanted = [
             Situation.of(demonstration)
             for demonstration in options.recordings(
-                dataset, kinematics, frame, episodes, units, joints, rate
+                dataset, kinematics, frame, episodes, units, joints, rate, events=event
             ).demonstrations()
         ]
     elif situations is not None:

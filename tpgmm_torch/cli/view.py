@@ -51,6 +51,7 @@ def view(
         int, typer.Option(min=0, help="Which of the situations is shown, counted from 0.")
     ] = 0,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -102,7 +103,7 @@ def view(
     demonstrations = []
     if dataset is not None:
         demonstrations = options.recordings(
-            dataset, fitted.kinematics_, frame, episodes, units, joints, rate
+            dataset, fitted.kinematics_, frame, episodes, units, joints, rate, events=event
         ).demonstrations()
     if situations is not None:
         wanted = read_situations(situations, fitted.kinematics_.joint_names)

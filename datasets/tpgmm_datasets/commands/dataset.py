@@ -59,6 +59,7 @@ def check(
     robot_joint: options.RobotJoints = None,
     coordinate: options.Coordinates = None,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -84,10 +85,12 @@ def check(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    recordings = Recordings(path, kinematics, frame, episodes, units, joints, None)
+    recordings = Recordings(
+        path, kinematics, frame, episodes, units, joints, None, events=event
+    )
     recording = open_recording(path, **recordings.options)
     try:
-        report = recording.examine(recording.demonstrations())
+        report = recording.examine(recording.demonstrations(tell=False))
     except DatasetError as error:  # units that nobody said are no fault of the set
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
@@ -102,6 +105,7 @@ def plot(
     path: options.Dataset,
     out: Annotated[Path, typer.Option(metavar="FILE.png", help="Where the picture goes.")],
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -112,7 +116,7 @@ def plot(
 
     from tpgmm_torch.plotting import figure
 
-    recordings = Recordings(path, None, frame, episodes, units, joints, rate)
+    recordings = Recordings(path, None, frame, episodes, units, joints, rate, events=event)
     demonstrations = recordings.demonstrations()
     first = demonstrations[0]
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
@@ -176,6 +180,7 @@ def convert(
     robot_joint: options.RobotJoints = None,
     coordinate: options.Coordinates = None,
     frame: options.Frames = None,
+    event: options.Events = None,
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
@@ -191,7 +196,9 @@ def convert(
     from tpgmm_datasets.reader import open_recording
 
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    recordings = Recordings(source, kinematics, frame, episodes, units, joints, None)
+    recordings = Recordings(
+        source, kinematics, frame, episodes, units, joints, None, events=event
+    )
     recording = open_recording(source, **recordings.options)
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints

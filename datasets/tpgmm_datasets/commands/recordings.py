@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.large_data.processes import Processes
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Recordings", "parse_episodes", "parse_frames", "parse_units"]
+__all__ = ["Recordings", "parse_episodes", "parse_events", "parse_frames", "parse_units"]
 
 #: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
 FRAME = re.compile(
@@ -38,6 +38,8 @@ class Recordings(plugins.Recordings):
         None.
     joints, rate, plausibility
         As for :func:`tpgmm_datasets.load_lerobot`.
+    events
+        What :func:`parse_events` takes, or None.
 
     Raises
     ------
@@ -55,11 +57,13 @@ class Recordings(plugins.Recordings):
         joints: str | None,
         rate: float | None,
         plausibility: str = "warn",
+        events: Sequence[str] | None = None,
     ) -> None:
         self.dataset = dataset
         self.options: dict[str, Any] = {
             "robot": robot,
             "frames": parse_frames(frames or ()),
+            "events": parse_events(events or ()),
             "episodes": parse_episodes(episodes),
             **parse_units(units or ()),
             "joints": joints,
@@ -114,6 +118,25 @@ def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
             columns = slice(int(start), int(match["stop"])) if start else None
             frames[match["name"]] = FramePose(source, columns)
     return frames or None
+
+
+def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
+    """What ``load_lerobot`` takes as ``events``; None if nothing was given.
+
+    Each text is ``NAME=HOW``, and how is what ``parse_event`` takes; a DataError says so of
+    any other.
+    """
+    from tpgmm_torch.events.text import parse_event
+    from tpgmm_torch.exceptions import DataError
+
+    events: dict[str, Any] = {}
+    for text in texts:
+        name, equals, how = (part.strip() for part in text.partition("="))
+        if not name or not equals or name in events:
+            problem = "is given twice" if name in events else "is not NAME=HOW"
+            raise DataError(f"event {text!r} {problem}, as in close=closing:*gripper*")
+        events[name] = parse_event(how)
+    return events or None
 
 
 def parse_episodes(text: str | None) -> slice | list[int] | str | None:

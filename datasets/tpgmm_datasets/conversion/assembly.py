@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,14 @@ from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.events.detection import Detector
+from tpgmm_torch.events.text import parse_event, usual_event
+from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Assembly", "EventSource", "FrameSource", "frame_sources"]
+__all__ = ["Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources"]
 
 FrameSource = str | FramePose | LinkPose | Frame
-EventSource = Callable[[Demonstration], float]
+EventSource = str | Detector | Callable[[Demonstration], float]
 
 
 def frame_sources(
@@ -32,7 +35,7 @@ def frame_sources(
     """Where each frame is; None stands for those that the data set itself names."""
     if frames is not None:
         return {
-            name: FramePose(source) if isinstance(source, str) else source
+            name: _frame_source(layout, source) if isinstance(source, str) else source
             for name, source in frames.items()
         }
     feature = layout.features.get(ENVIRONMENT)
@@ -40,6 +43,66 @@ def frame_sources(
     return {
         name: FramePose(ENVIRONMENT, columns, constant=None) for name, columns in groups.items()
     }
+
+
+def _frame_source(layout: Layout, text: str) -> FramePose | LinkPose:
+    if "@" in text and text not in layout.features:
+        return LinkPose.parse(text)
+    return FramePose(text)
+
+
+def event_sources(
+    events: Mapping[str, EventSource] | None,
+    frames: Mapping[str, FramePose | LinkPose | Frame],
+    stored: Collection[str],
+    names: Sequence[str] | None,
+) -> dict[str, Detector | Callable[[Demonstration], float]]:
+    """How each event is found: as given, and where a frame is at one, by the event's name.
+
+    Parameters
+    ----------
+    events : mapping of str to str, Detector or callable, or None
+        Those that are given.
+    frames : mapping of str to FramePose, LinkPose or Frame
+        Which may be at others.
+    stored : collection of str
+        Events that are there already.
+    names : sequence of str or None
+        Of all signals.
+
+    Raises
+    ------
+    DatasetError
+        If frames of two links are at an event that each of them has for itself, or the
+        signals of a gripper are not known by their names.
+    DataError
+        If a text is no event.
+    """
+    sources = {
+        name: parse_event(source) if isinstance(source, str) else source
+        for name, source in (events or {}).items()
+    }
+    usual: dict[str, Detector] = {}
+    for name, pose in frames.items():
+        if not isinstance(pose, LinkPose) or not isinstance(pose.event, str):
+            continue
+        if pose.event in sources or pose.event in stored:
+            continue
+        try:
+            detector = usual_event(pose.event, pose.link, names or ())
+        except DataError as error:
+            raise DatasetError(
+                f"frame {name!r}: event {pose.event!r} is not in the data set, and {error}"
+            ) from error
+        if detector is None:
+            continue
+        if usual.setdefault(pose.event, detector) != detector:
+            raise DatasetError(
+                f"frame {name!r}: {pose.event!r} of {pose.link!r} is another event than "
+                f"{pose.event!r} of the other links; call it otherwise, as in "
+                f"events={{'{pose.event}_{pose.link}': 'closing:SIGNAL'}}"
+            )
+    return sources | usual
 
 
 @dataclass(frozen=True)
@@ -54,14 +117,18 @@ class Assembly:
         Where the joints are.
     frames : mapping of str to FramePose, LinkPose or Frame
         Where the pose of each frame is.
-    events : mapping of str to callable
-        Functions from the demonstration, with all values of the joint feature, to a time.
+    events : mapping of str to Detector or callable
+        Detectors, or functions from the demonstration, with all values of the joint feature,
+        to a time.
     robot : object with ``joint_names`` and ``state(joints)``, or None
         Gives the order of the joints, and the poses of links.
     rate : float or None
         Steps per second, if it is to be resampled.
     trim : float or None
         Speed below which starts and ends are idle, if they are to be cut off.
+    doubtful : list of (int, str, float)
+        Events that were looked for and not found with confidence: index of the episode,
+        event, confidence.
 
     Raises
     ------
@@ -72,10 +139,11 @@ class Assembly:
     layout: Layout
     joints: JointColumns
     frames: Mapping[str, FramePose | LinkPose | Frame]
-    events: Mapping[str, EventSource]
+    events: Mapping[str, Detector | Callable[[Demonstration], float]]
     robot: Any
     rate: float | None
     trim: float | None
+    doubtful: list[tuple[int, str, float]] = field(default_factory=list, compare=False)
 
     def __post_init__(self) -> None:
         for name, source in self.frames.items():
@@ -111,9 +179,9 @@ class Assembly:
             self._flagged(rows),
         )
         demonstration = self._with_events(demonstration, rows)
-        demonstration = self._with_links(demonstration, rows)
         if self.trim is not None:
             demonstration = trim(demonstration, self.trim, **rows.episode.where)
+        demonstration = self._with_links(demonstration, rows)
         if self.rate is not None:
             demonstration = resample(demonstration, self.rate)
         if self.robot is not None:
@@ -143,8 +211,13 @@ class Assembly:
 
     def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
         events = dict(demonstration.events)
-        for name, function in self.events.items():
-            at = float(function(demonstration))
+        for name, source in self.events.items():
+            if isinstance(source, Detector):
+                found = source.find(demonstration, self.robot)
+                if not found.certain:
+                    self.doubtful.append((rows.episode.index, name, found.confidence))
+                    continue
+            at = found.time if isinstance(source, Detector) else float(source(demonstration))
             if not 0 <= at <= demonstration.duration:
                 raise DatasetError(
                     f"event {name!r} was found at {at:.6g} s, outside the episode of "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import UNIT_NORM_TOLERANCE, Frame
+from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["FramePose", "LinkPose"]
 
@@ -149,24 +150,41 @@ class FramePose:
 class LinkPose:
     """A frame that is where a link of the robot is at an event.
 
-    Real recordings often carry no object pose; but where the hand closes, there is the object.
+    Real recordings often carry no object pose; but where the hand closes, there is the
+    object. In a new situation nothing has closed yet: the pose must come from elsewhere, a
+    tracker or a detector. Only the pose at the ``"start"`` is known then: a model that learned
+    it computes it from the start posture.
 
     Parameters
     ----------
     link : str
         Name of the link.
     event : str or callable
-        Name of an event of the demonstration, or a function from the demonstration to a
-        time [s].
+        Name of an event of the demonstration, ``"start"`` and ``"end"`` among them, or a
+        function from the demonstration to a time [s].
 
     Examples
     --------
-    >>> LinkPose("right_hand", "close")
+    >>> LinkPose.parse("right_hand@close")
     LinkPose(link='right_hand', event='close')
     """
 
     link: str
     event: str | Callable[[Demonstration], float]
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """What ``LINK@EVENT`` stands for.
+
+        Raises
+        ------
+        DatasetError
+            If it is no such text.
+        """
+        link, _, event = text.strip().rpartition("@")
+        if not link or not event or "@" in link:
+            raise DatasetError(f"a link at an event is LINK@EVENT, got {text!r}")
+        return cls(link, event)
 
     def time(self, demonstration: Demonstration, **where: Any) -> float:
         """When the event is [s].
@@ -178,14 +196,17 @@ class LinkPose:
         """
         if callable(self.event):
             return float(self.event(demonstration))
-        if self.event not in demonstration.events:
+        try:
+            return demonstration.event(self.event)
+        except UnknownNameError as error:
             raise DatasetError(
-                f"frame of link {self.link!r}: event {self.event!r} is not in the "
-                f"demonstration; it has {sorted(demonstration.events)}. Give "
-                "events={name: function of the demonstration to a time}",
+                f"frame of link {self.link!r}: {error}. Say how to find it, as in "
+                f"events={{{self.event!r}: 'closing:*gripper*'}} or --event "
+                f"{self.event}='closing:*gripper*'; episodes without it are left out by "
+                "relax=['events']",
+                check="events",
                 **where,
-            )
-        return demonstration.events[self.event]
+            ) from error
 
     def frame(self, demonstration: Demonstration, robot: Any, time: float) -> Frame:
         """The pose of the link at the step nearest to ``time``."""

@@ -2,7 +2,14 @@
 
 import pytest
 
-from tpgmm_datasets.commands.recordings import parse_episodes, parse_frames, parse_units
+from tpgmm_datasets.commands.recordings import (
+    parse_episodes,
+    parse_events,
+    parse_frames,
+    parse_units,
+)
+from tpgmm_torch.events.movement import Stop
+from tpgmm_torch.events.signals import SignalEvent
 from tpgmm_torch.exceptions import DataError
 
 
@@ -34,6 +41,33 @@ def test_episodes_units_and_frames_are_read_from_text():
 def test_a_frame_that_is_none_is_refused(texts):
     with pytest.raises(DataError, match="is none of NAME, NAME=FEATURE"):
         parse_frames(texts)
+
+
+def test_events_are_read_from_text():
+    assert parse_events([]) is None
+    found = parse_events(["close=closing:*gripper*, thumb", "still=stop:l_hand:2"])
+    assert found == {
+        "close": SignalEvent(("*gripper*", "thumb"), "begin", "low"),
+        "still": Stop("l_hand", 2),
+    }
+
+
+@pytest.mark.parametrize(
+    "texts, told",
+    [
+        (["close"], "not NAME=HOW"),
+        (["=closing:a"], "not NAME=HOW"),
+        (["a=stop:x", "a=stop:y"], "given twice"),
+        (["a=closing"], "none that can be found. There are closing:SIGNALS"),
+        (["a=closing:b,"], "needs their names"),
+        (["a=shutting:b"], "none that can be found"),
+        (["a=stop:x:0"], "counted from 1"),
+        (["a=stop:x:second"], "none that can be found"),
+    ],
+)
+def test_an_event_that_is_none_is_refused(texts, told):
+    with pytest.raises(DataError, match=told):
+        parse_events(texts)
 
 
 @pytest.mark.parametrize("texts", [["deg", "rad"], ["deg", "a=rad"], ["a="], ["=deg"]])

@@ -100,7 +100,9 @@ def test_an_unknown_rotation_is_refused():
 
 def test_a_link_at_an_unknown_event_is_refused(root):
     frames = {"cup": LinkPose("hand", "open")}
-    with pytest.raises(DatasetError, match=r"event 'open' is not .*\['close'\]"):
+    with pytest.raises(
+        DatasetError, match=r"event 'open' is not .*\['close', 'end', 'start'\]"
+    ):
         load_lerobot(root, robot=Arm("left_elbow"), frames=frames)
 
 
