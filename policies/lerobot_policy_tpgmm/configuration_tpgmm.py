@@ -11,6 +11,7 @@ from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from tpgmm_datasets.bottle.skill import HANDS
+from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
     Hold,
@@ -22,6 +23,7 @@ from tpgmm_torch import (
     Trust,
     parse_clock,
 )
+from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
@@ -38,7 +40,7 @@ HYPERPARAMETERS = (
 
 CHOICES = {
     "feedback": ("reference", "observation"),
-    "alignment": ("dtw", "barycenter", "linear", "none"),
+    "alignment": ("dtw", "barycenter", "linear", "events", "none"),
     "learn_from": ("measured", "commanded"),
     "loss": ("likelihood", "imitation"),
 }
@@ -136,6 +138,14 @@ class TPGMMConfig(StatePolicyConfig):
         ``observation.environment_state``, or names of entries of it or of
         ``observation.state``. By default names like ``bottle.x`` tell, else the frames follow
         one another in ``observation.environment_state``.
+    link_frames : dict of str to str, optional
+        Frames that training takes from a link at an event, ``{"bottle": "r_hand@close"}``:
+        ``LINK@EVENT`` as for :func:`tpgmm_datasets.load_lerobot`. When it runs, the policy has
+        to be told them like any frame, but for those at ``start``: they follow from the joints.
+    events : dict of str to str, optional
+        How training finds events, ``{"close": "closing:*gripper*"}``, as
+        :func:`tpgmm_torch.events.text.parse_event` takes it. ``close``, ``open`` and ``stop``
+        of a link at which a frame is are found by themselves.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
     follow_frames : bool, default=True
@@ -165,8 +175,8 @@ class TPGMMConfig(StatePolicyConfig):
         or the unit is wrong then, or the robot does not stand where the skill begins.
     chunk_size : int, default=50
         Number of steps of ``predict_action_chunk``.
-    alignment : {"dtw", "barycenter", "linear", "none"}, default="dtw"
-        How training brings episodes onto one clock.
+    alignment : {"dtw", "barycenter", "linear", "events", "none"}, default="dtw"
+        How training brings episodes onto one clock; ``"events"`` anchors them at all events.
     alignment_features : list of str, optional
         What ``"dtw"`` and ``"barycenter"`` compare, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`; ``["directions"]`` suits rhythms.
@@ -222,6 +232,8 @@ class TPGMMConfig(StatePolicyConfig):
     environment_names: list[str] | None = None
     units: dict[str, list[float] | str] | str | None = None
     frames: dict[str, list[int | str]] | None = None
+    link_frames: dict[str, str] = field(default_factory=dict)
+    events: dict[str, str] = field(default_factory=dict)
     default_environment_state: list[float] | None = None
     follow_frames: bool = True
     closed_loop: bool = True
@@ -270,6 +282,9 @@ class TPGMMConfig(StatePolicyConfig):
                 "the imitation error is that of actions that follow measured joints: "
                 "--policy.learn_from=commanded goes with --policy.loss=likelihood"
             )
+        self.link_poses()
+        for text in self.events.values():
+            parse_event(text)
         self.control()
         self.estimator(None, ()).check_parameters()
 
@@ -297,6 +312,10 @@ class TPGMMConfig(StatePolicyConfig):
             "feedback": "measured" if self.feedback == "observation" else "reference",
             "bounds": {name: limit for name, limit in limits.items() if limit is not None},
         }
+
+    def link_poses(self) -> dict[str, LinkPose]:
+        """What ``link_frames`` stands for."""
+        return {name: LinkPose.parse(text) for name, text in self.link_frames.items()}
 
     def kinematics(self) -> Kinematics | None:
         """The robot that ``robot`` describes, None for joints alone."""

@@ -11,7 +11,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch import Kinematics
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators
 from tpgmm_torch.robots.joint_space import JointSpace
 
@@ -55,11 +56,28 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
                 "without a robot the policy learns the joints alone, wherever the objects of "
                 f"{OBS_ENV_STATE} are: --policy.robot=URDF --policy.links='[...]' tells of one"
             )
+    _check_links(config, kinematics)
     operators = config.decoded_operators()
     if operators is None:
         frames = _frames(config) if kinematics.links else []
         operators = default_operators(kinematics.links, frames)
     config.describe(kinematics, operators)
+
+
+def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
+    """Whether frames at links can be made, and where they are observed later is clear."""
+    for name, pose in config.link_poses().items():
+        if pose.link not in kinematics.links:
+            raise UnknownNameError(
+                "link", pose.link, f"the robot (frame {name!r})", kinematics.links
+            )
+        told = pose.event == "start" or config.environment_names or not config.frames
+        if not told and name not in (config.frames or ()):
+            raise DataError(
+                f"frame {name!r} is at {config.link_frames[name]!r} in the episodes; say "
+                "where a running policy is told it, too: --policy.frames="
+                f"""'{{"{name}": [0, 1, 2, 3, 4, 5, 6], ...}}'"""
+            )
 
 
 def check_dataset(config: TPGMMConfig, dataset: Any) -> None:
@@ -107,11 +125,11 @@ def _units(features: Mapping[str, Any]) -> dict[str, list[float] | str]:
 def _frames(config: TPGMMConfig) -> list[str]:
     """The frames that there are, for operators that nobody named."""
     if config.frames:
-        return list(config.frames)
+        return list(dict.fromkeys((*config.frames, *config.link_frames)))
     groups = pose_groups(config.environment_names) if config.environment_names else {}
     if not groups and config.env_state_feature is not None:
         raise DataError(
             f"the names of {OBS_ENV_STATE} tell of no pose: name the frames, "
             """--policy.frames='{"bottle": [0, 1, 2, 3, 4, 5, 6]}'"""
         )
-    return list(groups)
+    return list(dict.fromkeys((*groups, *config.link_frames)))

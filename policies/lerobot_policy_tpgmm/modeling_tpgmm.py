@@ -24,7 +24,12 @@ from lerobot_policy_tpgmm.configuration_tpgmm import (
 from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
-from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures, poses_named
+from lerobot_policy_tpgmm.observations import (
+    FrameFeatures,
+    JointFeatures,
+    observed_frames,
+    poses_named,
+)
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import Controller, TaskParameterizedGMM
@@ -152,23 +157,23 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._check_size("action_names", action_names, config.action_feature)
         self.joints = JointFeatures(names, state_names, action_names, config.units)
         environment = config.env_state_feature
-        self.frames = FrameFeatures(
-            required,
-            config.frames,
-            config.environment_names,
-            state_names,
-            config.default_environment_state,
-            environment.shape[0] if environment else None,
-        )
+        width = environment.shape[0] if environment else None
+        named = config.environment_names, state_names
+        told = observed_frames(config, required)
+        default = config.default_environment_state
+        self.frames = FrameFeatures(told, config.frames, *named, default, width)
         self._learner: Learner | None = None
         if dataset_meta is not None:
+            recorded = [name for name in required if name not in config.link_frames]
+            places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
+            shown = FrameFeatures(recorded, places, *named, default, width)
             self._learner = Learner(
                 config,
                 self.kinematics,
                 self.operators,
                 self.mixture,
                 self.joints,
-                self.frames,
+                shown,
                 dataset_meta,
             )
         self.reset()
@@ -236,9 +241,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
         config.describe(kinematics, model.operators_)
-        poses = FrameFeatures(
-            model.frame_names_, config.frames, environment_names, config.state_names, None
-        )
+        told = observed_frames(config, model.frame_names_)
+        poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
         policy = cls(config)

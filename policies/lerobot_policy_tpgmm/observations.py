@@ -14,12 +14,14 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.names import match_names, pose_groups
 from tpgmm_datasets.units import Scale, as_scale
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.plausibility import Shown
 
-__all__ = ["FrameFeatures", "JointFeatures", "poses_named"]
+__all__ = ["FrameFeatures", "JointFeatures", "observed_frames", "poses_named"]
 
 REMEDY = (
     "Does the robot have joints that the data have not? --policy.joints='left_*,right_*' names "
@@ -236,6 +238,21 @@ class FrameFeatures:
                 "--policy.default_environment_state='[x,y,z,qw,qx,qy,qz]'"
             )
         return values.to(torch.float64)
+
+
+def observed_frames(config: TPGMMConfig, required: Sequence[str]) -> list[str]:
+    """Those of the ``required`` frames that a running policy is told.
+
+    Where a link is at the start follows from the joints, unless the names of the entries of
+    ``config`` tell of the frame.
+    """
+    start = {name for name, pose in config.link_poses().items() if pose.event == "start"}
+    if config.shown is not None:
+        frames = Shown.from_config(config.shown).frames
+        start |= {name for name, shown in frames.items() if shown.link is not None}
+    placed = {*(config.frames or ()), *poses_named(config.environment_names)}
+    placed |= {*poses_named(config.state_names)}
+    return [name for name in required if name not in start or name in placed]
 
 
 def _scale(units: Any, name: str, joint: str) -> Scale:

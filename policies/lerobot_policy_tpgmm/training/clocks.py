@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import Kinematics
-from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.alignment import (
+    DynamicTimeWarping,
+    EventAlignment,
+    LinearTimeNormalization,
+)
 from tpgmm_torch.alignment.base import Alignment
 
 __all__ = ["Clock", "alignment"]
@@ -31,6 +35,8 @@ def alignment(
         return None
     if method == "linear":
         return LinearTimeNormalization(robot=kinematics)
+    if method == "events":
+        return EventAlignment(robot=kinematics)
     reference = "medoid" if method == "dtw" else method
     return DynamicTimeWarping(reference, features=features, robot=kinematics)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,9 +31,11 @@ from lerobot_policy_tpgmm.training.losses import (
     local_points,
     regression,
 )
+from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
+from tpgmm_torch.events.detection import Detector, find_events
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
@@ -135,13 +138,15 @@ class Learner:
                 f"there is nothing to evaluate before the first epoch is over: {recorder}. "
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
-        if self._config.holds:
-            # frames by themselves do not tell where an object was last free
+        if self._config.holds or self._config.link_frames:
+            # frames by themselves do not tell where an object was last free, nor where a
+            # link is at an event of the episode
             if not self._told:
+                why = "objects are held" if self._config.holds else "frames are at events"
                 log.warning(
-                    "objects are held, %s: the mixture stays as EM fitted it, and more steps "
-                    "change nothing",
-                    ", ".join(self._config.holds),
+                    "%s, %s: the mixture stays as EM fitted it, and more steps change nothing",
+                    why,
+                    ", ".join(self._config.holds or self._config.link_frames.values()),
                 )
             self._told = True
             return torch.zeros((), requires_grad=True)
@@ -176,8 +181,10 @@ class Learner:
         config, mixture = self._config, self._mixture
         episodes = recorder.episodes
         numbers = sorted(episodes)
-        demonstrations = [self._demonstration(episodes[number]) for number in numbers]
         kinematics = self._kinematics.to(device="cpu")
+        demonstrations = self._linked(
+            {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
+        )
         aligner = alignment(config.alignment, kinematics, config.alignment_features)
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(numbers))
@@ -212,6 +219,35 @@ class Learner:
             likelihood.item(),
             unit,
         )
+
+    def _linked(
+        self, shown: Mapping[int, Demonstration], kinematics: Kinematics
+    ) -> list[Demonstration]:
+        """Demonstrations with the events and the frames at links that are asked for."""
+        config, poses = self._config, self._config.link_poses()
+        sources = event_sources(config.events, poses, (), kinematics.joint_names)
+        detectors = {name: s for name, s in sources.items() if isinstance(s, Detector)}
+        found = list(shown.values())
+        if detectors:
+            log.info("finding events: %s", ", ".join(detectors))
+            found = find_events(found, detectors, kinematics, plausibility=config.plausibility)
+        for event in {pose.event for pose in poses.values()} - {"start", "end"}:
+            lost = [n for n, d in zip(shown, found, strict=True) if event not in d.events]
+            if lost:
+                raise DataError(
+                    f"event {event!r}, at which a frame is, is not found in episodes {lost}: "
+                    "say how, --policy.events='{...}', or leave them out, --dataset.episodes"
+                )
+        return [
+            replace(
+                one,
+                frames={
+                    **one.frames,
+                    **{n: p.frame(one, kinematics, p.time(one)) for n, p in poses.items()},
+                },
+            )
+            for one in found
+        ]
 
     def _watch(self, loss: float, count: int) -> None:
         """Say once that the loss of an epoch is hardly lower than that of the one before."""

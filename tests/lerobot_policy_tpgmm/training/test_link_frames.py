@@ -1,0 +1,124 @@
+"""Frames where a link is at an event: in training, and when the policy runs."""
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.skills import same
+from tests.support.training import dataset, epoch, fresh, trained
+from tpgmm_datasets import load_lerobot, save_lerobot
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import Canonical, Demonstration, Robot, TaskParameterizedGMM
+from tpgmm_torch.alignment import EventAlignment
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators.text import parse_operator
+
+FPS, LENGTH, CLOSINGS = 10, 60, (2.0, 2.4, 1.8, 2.9)
+AT_LINKS = {"bottle": "l_hand@close", "start": "l_hand@start"}
+OPTIONS = {
+    "robot": "upper_body",
+    "links": ["l_hand"],
+    "coordinates": ["l_gripper"],
+    "n_components": 3,
+    "random_state": 0,
+    "alignment": "events",
+    "plausibility": "ignore",
+}
+OPERATORS = ["pose:l_hand@bottle + pose:l_hand@start", "canonical"]
+
+
+def robot():
+    return Robot.from_urdf(upper_body_urdf(), ["l_hand"], coordinates=["l_gripper"])
+
+
+def shown(seed, closing):
+    """All joints swing; the gripper closes, if it does."""
+    rng, time = np.random.default_rng(seed), np.arange(LENGTH) / FPS
+    swing = 0.2 * np.sin(time[:, None] + np.arange(17)) + 0.1 * rng.normal(size=17)
+    gripper = np.full(LENGTH, 1.0)
+    if closing is not None:
+        gripper[(time >= closing) & (time < 5)] = 0.1
+    gripper += 0.01 * rng.normal(size=LENGTH)
+    joints = np.concatenate([swing, gripper[:, None]], axis=1)
+    return Demonstration(time, joints, joint_names=robot().joint_names)
+
+
+def written(path, closings):
+    episodes = [shown(seed, closing) for seed, closing in enumerate(closings)]
+    return save_lerobot(episodes, path, fps=FPS, task="grip", units={"l_gripper": "raw"})
+
+
+@pytest.fixture(scope="module")
+def grips(tmp_path_factory):
+    return dataset(written(tmp_path_factory.mktemp("grips") / "set", CLOSINGS))
+
+
+@pytest.fixture(scope="module")
+def policy(grips):
+    return trained(grips, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
+
+
+def test_training_learns_what_the_loader_and_the_estimator_do(policy, grips):
+    read = load_lerobot(grips.root, robot=robot(), frames=AT_LINKS, plausibility="ignore")
+    assert [one.events["close"] for one in read] == pytest.approx(list(CLOSINGS), abs=0.11)
+    aligned = EventAlignment(robot=robot()).fit_transform(read)
+    operators = [parse_operator(OPERATORS[0]), Canonical()]
+    model = TaskParameterizedGMM(3, operators, robot(), random_state=0, plausibility="ignore")
+    same(policy.to_estimator(), model.fit(aligned), 1e-6)
+
+
+def test_a_running_policy_is_told_the_object_and_computes_the_start(policy, grips, tmp_path):
+    assert policy.frames.frame_names == ("bottle",)
+    policy.save_pretrained(tmp_path / "policy")
+    [read, *_] = load_lerobot(grips.root, robot=robot(), frames=AT_LINKS, plausibility="ignore")
+    bottle = read.frames["bottle"]
+    pose = torch.cat((bottle.position, bottle.orientation))
+    observation = {
+        "observation.state": read.joints[:1],
+        "observation.environment_state": pose[None],
+    }
+    [expected] = policy.to_estimator().predict([read], candidates=False)
+    loaded = TPGMMPolicy.from_pretrained(tmp_path / "policy")
+    for one in (policy, loaded, TPGMMPolicy.from_estimator(loaded.to_estimator())):
+        one.reset()
+        action = one.select_action(observation)
+        torch.testing.assert_close(action[0].double(), expected.joints[0], rtol=0, atol=2e-2)
+    policy.reset()
+    del observation["observation.environment_state"]
+    with pytest.raises(DataError, match=r"the pose of 'bottle' is missing.*environment_state"):
+        policy.select_action(observation)
+
+
+def test_operators_that_nobody_names_see_the_frames_too(grips):
+    config = fresh(grips, link_frames=AT_LINKS, **OPTIONS).config
+    assert "position:l_hand@start" in config.operators[0]
+    assert "position:l_hand@bottle" in config.operators[0]
+
+
+def test_more_steps_change_nothing_and_say_so(policy, grips, caplog):
+    learner = fresh(grips, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
+    for batch in epoch(grips, 32):
+        learner.forward(batch)
+    with caplog.at_level("WARNING"):
+        loss, _ = learner.forward(epoch(grips, 32)[0])
+    assert loss.item() == 0
+    assert "frames are at events, l_hand@close, l_hand@start" in caplog.text
+
+
+def test_episodes_without_the_event_are_named(tmp_path):
+    data = dataset(written(tmp_path / "set", (2.0, None, 1.8, None)))
+    learner = fresh(data, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
+    with pytest.raises(DataError, match=r"'close', .* is not found in episodes \[1, 3\]"):
+        for batch in [*epoch(data, 32), *epoch(data, 32)]:
+            learner.forward(batch)
+
+
+def test_texts_and_links_that_are_none_are_refused(grips):
+    with pytest.raises(DataError, match="LINK@EVENT"):
+        TPGMMConfig(device="cpu", link_frames={"bottle": "l_hand"})
+    with pytest.raises(DataError, match="none that can be found"):
+        TPGMMConfig(device="cpu", events={"close": "l_gripper"})
+    with pytest.raises(UnknownNameError, match=r"'foot'.*l_hand"):
+        fresh(grips, link_frames={"bottle": "foot@close"}, **OPTIONS)
