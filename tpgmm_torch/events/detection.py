@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.plausibility.findings import Finding, Report, listed
+from tpgmm_torch.plausibility.findings import Finding, Report
 
 __all__ = [
     "LEAST_CONFIDENCE",
@@ -143,16 +143,18 @@ def doubtful_events(
     findings = []
     for name in dict.fromkeys(name for _, name, _ in doubtful):
         where = [(index, confidence) for index, other, confidence in doubtful if other == name]
-        places = listed([f"{among} {index} (confidence {sure:.2f})" for index, sure in where])
+        numbers = ", ".join(str(index) for index, _ in where)
+        lowest, highest = min(sure for _, sure in where), max(sure for _, sure in where)
         findings.append(
             Finding(
                 "events",
                 "unlikely",
-                f"{name!r} is not found with confidence {LEAST_CONFIDENCE} in {places}",
+                f"{name!r} is not found with confidence {LEAST_CONFIDENCE} in {among}s "
+                f"{numbers} (there {lowest:.3f} to {highest:.3f})",
                 "Leave them out, look for it in other signals, or say when it is",
                 (name,),
                 tuple(index for index, _ in where),
-                min(sure for _, sure in where),
+                lowest,
             )
         )
     return findings

@@ -202,8 +202,8 @@ class LinkPose:
             raise DatasetError(
                 f"frame of link {self.link!r}: {error}. Say how to find it, as in "
                 f"events={{{self.event!r}: 'closing:*gripper*'}} or --event "
-                f"{self.event}='closing:*gripper*'; episodes without it are left out by "
-                "relax=['events']",
+                f"{self.event}='closing:*gripper*'; leave episodes without it "
+                "out by relax=['events'] or --episodes",
                 check="events",
                 **where,
             ) from error

@@ -112,12 +112,12 @@ def test_events_alone_that_were_not_found_are_told_of_once(gripping):
     given = {"robot": ARM, "frames": {}, "events": {"close": "closing:gripper"}}
     for read in (load_lerobot, lambda *a, **k: list(iter_lerobot(*a, **k))):
         with pytest.warns(
-            PlausibilityWarning, match=r"'close' .*episode 2 \(confidence"
+            PlausibilityWarning, match=r"'close' .*in episodes 2 \(there 0"
         ) as told:
             found = read(gripping, **given)
         assert len(told) == 1
         assert [len(shown.events) for shown in found] == [1, 1, 0, 1, 1]
-        with pytest.raises(PlausibilityError, match="episode 2"):
+        with pytest.raises(PlausibilityError, match="episodes 2"):
             read(gripping, plausibility="error", **given)
         assert len(read(gripping, plausibility="ignore", **given)) == 5
 

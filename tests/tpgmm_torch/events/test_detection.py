@@ -57,8 +57,8 @@ def test_doubtful_events_are_left_out_and_named_in_one_warning():
     assert [sorted(d.events) for d in found] == [["close"], [], ["close"], [], ["close"]]
     [message] = [str(warning.message) for warning in told]
     assert "'close'" in message
-    assert "demonstration 1 (confidence 0." in message and "demonstration 3" in message
-    with pytest.raises(PlausibilityError, match="demonstration 1 "):
+    assert "in demonstrations 1, 3 (there 0." in message
+    with pytest.raises(PlausibilityError, match="demonstrations 1, 3"):
         find_events(shown, CLOSE, plausibility="error")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
