@@ -230,13 +230,13 @@ class Controller:
         if self._measured_feedback and measured is not None:
             at = torch.where(measured.isnan(), at, measured)
         seen = None if frames is None else dict(self._frames)
+        stands = at if measured is None else torch.where(measured.isnan(), at, measured)
         if self._inputs is not None and self._inputs.poses and not told:
-            stands = at if measured is None else torch.where(measured.isnan(), at, measured)
             known = {hold.frame for hold in self.holding.holds}  # from when to when
             self._watch, self.holding, seen = self._watch.look(
                 self._inputs.poses.keys() - known, self._frames, stands, self.holding, dt
             )
-        self.holding = self.holding.advance(time, at, seen, told)
+        self.holding = self.holding.advance(time, stands, seen, told)
         estimate = self._estimated(time, at)
         shift = self._fade(estimate.joints, 0.0 if last is None else dt)
         wanted = self._shifted(estimate.joints, shift)

@@ -11,19 +11,16 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.control.holding import Holding, choose
+from tpgmm_torch.control.holding import MOVED, PERHAPS, TURNED, Holding, choose
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["HoldWatch", "Rest"]
 
-#: The unit of motions [m], [rad]: what moved by one with a link is carried.
-MOVED, TURNED = 0.01, math.radians(5)
 #: What moved by less rests.
 RESTING = 0.1
-#: It moves with a link if its pose there changes by less than this share of the motion; up to
-#: the second it is not clear yet.
-WITH, PERHAPS = 0.4, 0.7
+#: It moves with a link if its pose there changes by less than this share of the motion.
+WITH = 0.4
 #: A link has lost what is so far from where it would have it [m], [rad], for so long [s].
 LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
 #: How often that is looked at [s].

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -18,6 +19,11 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Held", "Holding", "choose"]
 
+#: The unit of motions [m], [rad]: what moved by one with a link is carried.
+MOVED, TURNED = 0.01, math.radians(5)
+#: It may be that it moves with a link if its pose there changes by less than this share of it.
+PERHAPS = 0.7
+
 
 @dataclass(frozen=True, eq=False)
 class Held:
@@ -33,12 +39,16 @@ class Held:
         Where it was when it was taken.
     told : bool, or Tensor of bool, of shape (...)
         Whether what was told at run time counts, and no longer the holds of the model.
+    stood : Frame, optional
+        Where the link was when the object was last seen not to move with it: NaN if it was not
+        seen since it was taken, infinite once it moves with the link; None if so for all.
     """
 
     carrier: int | Tensor = -1
     grasp: Frame | None = None
     taken: Frame | None = None
     told: bool | Tensor = False
+    stood: Frame | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +57,9 @@ class Holding:
 
     While an object is free, its frame is where it is seen. From the tick at which a link takes
     it, its frame, as a place, stays as it was, and, as a thing, it moves with the link; when
-    the link lets go, it stays where that was, until it is seen elsewhere.
+    the link lets go, it stays where that was, until it is seen elsewhere. A hand that closes
+    may shift what it holds: until that has moved by 1 cm or 5 degrees with the link, how it is
+    held is seen anew.
 
     Parameters
     ----------
@@ -153,6 +165,11 @@ class Holding:
                 places[name] = choose(_held(carrier), place, pose)
                 if is_told is not before.told:
                     held[name] = replace(before, told=is_told)
+                if before.stood is not None and before.taken is not None and name in seen:
+                    live = _held(carrier) & ~_same(seen[name], before.taken)
+                    if bool(live.any()):
+                        state = self.kinematics.state(joints) if state is None else state
+                        held[name] = self._shifted(held[name], seen[name], live, state)
                 continue
             state = self.kinematics.state(joints) if state is None else state
             now = self._now(name, place, before, seen.get(name), state)
@@ -182,12 +199,13 @@ class Holding:
             Where the object was when it was last free; its pose in the link now.
         """
         before = self.held.get(name, FREE)
-        old = grasp if before.grasp is None else before.grasp
+        old, stood = grasp if before.grasp is None else before.grasp, before.stood
         now = Held(
             _choose_index(where, index, before.carrier),
             choose(where, grasp, old),
             choose(where, place, place if before.taken is None else before.taken),
             where | torch.as_tensor(before.told),
+            None if stood is None else choose(where, _constant(stood, math.inf), stood),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
@@ -250,18 +268,35 @@ class Holding:
         state: RobotState,
     ) -> Held:
         """Who holds an object from now on, and how."""
-        grasp = before.grasp
+        grasp, stood = before.grasp, before.stood
         for index in _indices(carrier):
             other = now.seen_from(state.pose(self.kinematics.links[index]))
-            if grasp is None:
-                grasp = other
+            grasp = other if grasp is None else grasp
+            stood = _constant(other, math.inf) if stood is None else stood
             news = torch.as_tensor(carrier == index) & torch.as_tensor(before.carrier != index)
             grasp = choose(news, other, grasp)
+            stood = choose(news, _constant(stood, math.nan), stood)
         taken = now
         if before.taken is not None:
             still = _held(before.carrier) | ~torch.as_tensor(_held(carrier))
             taken = choose(still, before.taken, now)
-        return Held(carrier, grasp, taken, told)
+        return Held(carrier, grasp, taken, told, stood)
+
+    def _shifted(self, held: Held, seen: Frame, live: Tensor, state: RobotState) -> Held:
+        """The same after a look at what may be shifted in its link, for robots that see it."""
+        assert held.grasp is not None and held.stood is not None
+        grasp, stood = held.grasp, held.stood
+        for index in _indices(held.carrier):
+            link = state.pose(self.kinematics.links[index])
+            now = seen.seen_from(link)
+            moved = held.stood.change(link, MOVED, TURNED)
+            along = held.grasp.change(now, MOVED, TURNED) < PERHAPS * moved  # false of NaN
+            here = live & torch.as_tensor(held.carrier == index)
+            grasp = choose(here & ~along, now, grasp)
+            stood = choose(here & ~along, link, stood)
+            stood = choose(here & along & (moved >= 1), _constant(stood, math.inf), stood)
+        carried = stood.position.isinf().all(-1) | torch.as_tensor(held.carrier < 0)
+        return replace(held, grasp=grasp, stood=None if bool(carried.all()) else stood)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""
@@ -277,6 +312,11 @@ class Holding:
 
 
 FREE = Held()
+
+
+def _constant(like: Frame, value: float) -> Frame:
+    """No pose, but a number in place of its position."""
+    return Frame._from(torch.full_like(like.position, value), like.orientation)
 
 
 def _indices(carrier: int | Tensor) -> list[int]:
@@ -304,8 +344,13 @@ def _unless(stale: Frame | None, seen: Frame, known: Frame) -> Frame:
     """What is seen; what is known where that is exactly a pose of before."""
     if stale is None or seen is known:
         return seen
-    same = (seen.position == stale.position).all(-1)
-    return choose(same & (seen.orientation == stale.orientation).all(-1), known, seen)
+    return choose(_same(seen, stale), known, seen)
+
+
+def _same(one: Frame, other: Frame) -> Tensor:
+    """Where poses are exactly the same."""
+    same = (one.position == other.position).all(-1)
+    return same & (one.orientation == other.orientation).all(-1)
 
 
 def choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:

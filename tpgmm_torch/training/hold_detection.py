@@ -55,10 +55,12 @@ def find_holds(
 ) -> tuple[Hold, ...]:
     """Find from when to when objects move rigidly with a link, alike in the demonstrations.
 
-    A hold begins between the instant from which the object's pose in the link is constant and
-    the one at which it starts to move, in the middle; it ends likewise. Over demonstrations,
-    which should be aligned in time, the median counts. Where two hands carry an object, the
-    holder is the one in which it is steadier in most demonstrations.
+    A hold begins when the link touches the object: at the instant from which it stands as it
+    does when the object starts to move with it. Meanwhile a hand that closes may shift the
+    object by up to three tolerances. It ends in the middle between the instant at which the
+    object is put down and the one at which the link leaves it. Over demonstrations, which
+    should be aligned in time, the median counts. Where two hands carry an object, the holder is
+    the one in which it is steadier in most demonstrations.
 
     Parameters
     ----------
@@ -193,9 +195,7 @@ class _Motion:
 
     def holds(self, name: str, pose: Frame, change: Change) -> list[Hold]:
         """The holds of an object that had these poses (T,), in the order of time."""
-        later = torch.searchsorted(self.time, self.time + WINDOW / 2)
-        later = later.clamp(max=len(self.time) - 1)
-        sooner = torch.searchsorted(self.time, self.time - WINDOW / 2)
+        sooner, later = self._window()
         speed = change(pose[sooner], pose[later])
         found: list[tuple[int, int, Hold]] = []
         while float(speed.max()) > FINEST:
@@ -216,6 +216,12 @@ class _Motion:
             elif before.begin < hold.begin < hold.end:  # from hand to hand
                 holds[-1:] = [replace(before, end=hold.begin), hold]
         return holds
+
+    def _window(self) -> tuple[Tensor, Tensor]:
+        """For each instant, those between which its motion is measured."""
+        later = torch.searchsorted(self.time, self.time + WINDOW / 2)
+        later = later.clamp(max=len(self.time) - 1)
+        return torch.searchsorted(self.time, self.time - WINDOW / 2), later
 
     def _span(
         self, name: str, pose: Frame, seed: int, change: Change
@@ -244,14 +250,33 @@ class _Motion:
         # steady in the hand from `first` to `last`, in motion from `lifted` to `put`
         first, last = _run(slip <= finest, seed)
         at_rest = change(pose[first : first + 1], pose) <= finest
-        lifted = first + int((~at_rest[first : seed + 1]).int().argmax()) - 1
+        lifted = first + max(int((~at_rest[first : seed + 1]).int().argmax()) - 1, 0)
         at_rest = change(pose[last : last + 1], pose) <= finest
         put = last - int((~at_rest[seed : last + 1]).flip(0).int().argmax()) + 1
-        begin = float(self.time[first] + self.time[max(lifted, first)]) / 2
+        begin = float(self.time[self._touched(link, pose, first, lifted, finest, change)])
         end = float(self.time[last] + self.time[min(put, last)]) / 2
         if last == len(self.time) - 1:
             end = math.inf
         return (first, last, Hold(name, link, begin, end)) if begin < end else None
+
+    def _touched(
+        self, link: str, pose: Frame, first: int, lifted: int, finest: float, change: Change
+    ) -> int:
+        """The instant since which a link stands as it does before it lifts an object."""
+        hand = self.links[link]
+        sooner, later = self._window()
+        close, _ = _run(change(hand[lifted : lifted + 1], hand) <= TRAVEL, lifted)
+        speed = change(hand[sooner], hand[later])[close : lifted + 1]
+        # the last of the slowest: commanded links are ahead of what they lift
+        rests = lifted - int(speed.flip(0).argmin())
+        still = change(hand[rests : rests + 1], hand) <= finest
+        if link in self.grippers:
+            opening = self.grippers[link]
+            still &= (opening - opening[lifted]).abs() <= 1
+        stood, _ = _run(still, rests)
+        # a hand that closes shifts an object a little; what comes further, somebody else brings
+        near = change(pose[lifted : lifted + 1], pose[stood : lifted + 1]) <= TRAVEL
+        return min(stood, first) if bool(near.all()) else first
 
 
 def _run(true: Tensor, seed: int) -> tuple[int, int]:

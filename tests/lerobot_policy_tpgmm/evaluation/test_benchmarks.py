@@ -2,16 +2,17 @@
 
 import numpy as np
 import pytest
-import torch
+from lerobot.envs import preprocess_observation
 
 from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
 from lerobot_policy_tpgmm.evaluation import jobs
 from lerobot_policy_tpgmm.evaluation.benchmarks import CarryBenchmark
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.carrying import slid
-from tpgmm_torch import Frame, TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 
 KINEMATIC = {"mode": "kinematic"}
@@ -63,49 +64,36 @@ def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
     assert np.ptp([slid(motion)[0] for motion in motions[:DEMONSTRATIONS]]) > 0.01
 
 
-def carried(model, env, seed):
-    """How far from its place a controller that looks at all times puts the bottle [mm]."""
-
-    def frames(observation):
-        seen = torch.from_numpy(observation["environment_state"])
-        return {
-            name: Frame(pose[:3], pose[3:])
-            for name, pose in zip(CarryBenchmark.objects, seen.split(7), strict=True)
-        }
-
-    observation, _ = env.reset(seed=seed)
-    controller = model.controller(
-        torch.from_numpy(observation["agent_pos"]), frames(observation)
-    )
-    over = False
-    while not over:
-        controller.step(1 / env.fps, None, frames(observation))
-        observation, _, _, over, info = env.step(controller.reference.numpy())
-    return info["put_mm"]
-
-
-def test_what_is_held_can_be_put_exactly_and_places_leave_the_error_of_the_grasp(
-    folder, settings
-):
+def test_places_leave_the_error_of_the_grasp(folder, settings):
     cell = Cell("carry_and_put", "tpgmm-places", DEMONSTRATIONS, 0)
     jobs.run(folder, settings, [cell])
     result = Results(folder / "cells").read(cell)
     errors = [row["put_mm"] for row in result["episodes"]]
     assert np.median([row["grasp_mm"] for row in result["episodes"]]) < 10
-    assert np.median(errors) > 5
+    assert min(errors) > 3 and np.median(errors) > 5
     assert {"put_deg", "standing", "peak_speed"} <= set(result["episodes"][0])
 
-    benchmark = settings.benchmark()
-    demonstrations = load_lerobot(
-        folder / "episodes" / "training", robot=benchmark.robot, joints="action"
+
+def test_what_is_held_is_put_exactly_however_it_slid():
+    benchmark = CarryBenchmark(rate=25)
+    demonstrations = DynamicTimeWarping(features=["directions"]).fit_transform(
+        benchmark.skill.demonstrations(10, seed=0)
     )
     model = TaskParameterizedGMM(
-        settings.n_components, benchmark.operators(orientation=True), benchmark.robot
-    ).fit(DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations))
+        benchmark.n_components, benchmark.operators(orientation=True), benchmark.robot
+    ).fit(demonstrations)
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("bottle", "l_hand")
-    env = CarryAndPutEnv(fps=settings.rate, **KINEMATIC)
-    held = [carried(model, env, seed) for seed in settings.seeds]
-    # where the bottle stays in the hands it is put exactly; places never do that. That the
-    # hands lose it in other episodes is open: it is carried before the hold that was found
-    assert min(held) < 0.5 < 3 < min(errors)
+    policy, env = TPGMMPolicy.from_estimator(model), CarryAndPutEnv(fps=benchmark.rate)
+    slides = []
+    for seed in (10_000, 10_003):
+        policy.reset()
+        observation, _ = env.reset(seed=seed)
+        slides.append(1e3 * abs(env._start.slide[0]))
+        over = False
+        while not over:
+            action = policy.select_action(preprocess_observation(observation))
+            observation, _, _, over, info = env.step(action[0].numpy())
+        # 0.5 mm; more where hands that open, just above the tray, let it land on its edge
+        assert info["put_mm"] < 3 < min(slides) and info["put_deg"] < 1
+        assert info["is_success"]

@@ -50,13 +50,78 @@ def test_a_place_is_where_the_object_was_last_free():
     held = seen.advance(HELD.begin, joints)
     assert held.frames["bottle"] is LATER and held.carries
     moved = joints + 0.1
-    for seen_now in (None, {"bottle": hand(moved)}):
+    with_the_hand = hand(moved).compose(LATER.seen_from(hand(joints)))
+    for seen_now, there in (
+        (None, with_the_hand),
+        ({"bottle": LATER}, with_the_hand),  # nothing new
+        ({"bottle": hand(moved)}, hand(moved)),
+    ):
         carried = held.advance(3.0, moved, seen_now)
         assert carried.frames["bottle"] is LATER
-        assert_at(
-            carried.state(upper_body().state(moved)).pose("bottle"),
-            hand(moved).compose(LATER.seen_from(hand(joints))),
-        )
+        assert_at(carried.state(upper_body().state(moved)).pose("bottle"), there)
+
+
+SHIFT = Frame([0.03, 0.0, 0.005], [np.cos(0.1), 0.0, 0.0, np.sin(0.1)])
+
+
+def closing(holding, joints, *, shifts, carries):
+    """A hand that takes the bottle and closes around it, which shifts it; then it moves."""
+    grasp = holding.frames["bottle"].seen_from(hand(joints))
+    shifted = grasp.compose(SHIFT) if shifts else grasp
+    before = joints + 0.002  # not quite there yet
+    holding = holding.advance(HELD.begin, before, holding.frames)
+    holding = holding.advance(HELD.begin, joints, holding.frames)
+    for way in (0.0, 0.002, 0.01, 0.05, 0.1):
+        now = joints + way * carries
+        holding = holding.advance(HELD.begin, now, {"bottle": hand(now).compose(shifted)})
+    return holding, shifted
+
+
+@pytest.mark.parametrize("shifts", [False, True])
+def test_until_it_moves_with_the_hand_it_is_held_as_it_is_seen(shifts):
+    holding, joints = begun()
+    place = holding.frames["bottle"]
+    held, shifted = closing(holding, joints, shifts=shifts, carries=0.0)
+    assert held.frames["bottle"] is place
+    assert_at(held.held["bottle"].grasp, shifted)
+    carried, _ = closing(holding, joints, shifts=shifts, carries=1.0)
+    assert carried.frames["bottle"] is place
+    assert_at(carried.held["bottle"].grasp, shifted)
+    # from then on what is seen may be late, or wrong
+    late = carried.advance(3.0, joints + 0.2, {"bottle": LATER})
+    assert_at(late.held["bottle"].grasp, shifted)
+    again = held.advance(3.0, joints, {"bottle": LATER})
+    assert_at(again.held["bottle"].grasp, LATER.seen_from(hand(joints)))
+
+
+def test_each_robot_of_a_batch_sees_how_it_holds():
+    holding, joints = begun(3)
+    rates = torch.tensor([[0.0], [1.0], [1.0]])
+    together, _ = closing(holding, joints, shifts=True, carries=rates)
+    seen = {"bottle": LATER.expand((3,))}
+    later = together.advance(HELD.begin, joints + 0.2 * rates, seen)
+    for row in range(3):
+        alone = Holding.start(upper_body(), operators(), [HELD], scenes(3, 3)[row].frames)
+        alone, _ = closing(alone, joints[row], shifts=True, carries=rates[row])
+        assert_at(together.held["bottle"].grasp[row], alone.held["bottle"].grasp)
+        alone = alone.advance(HELD.begin, joints[row] + 0.2 * rates[row], {"bottle": LATER})
+        assert_at(later.held["bottle"].grasp[row], alone.held["bottle"].grasp)
+
+
+def test_what_was_shifted_moves_with_the_joints_by_its_jacobian():
+    held, joints = closing(*begun(), shifts=True, carries=1.0)[0], begun()[1]
+
+    def position(q):
+        return held.state(upper_body().state(q)).position("bottle")
+
+    numeric = torch.autograd.functional.jacobian(position, joints)
+    steps = 1e-6 * torch.eye(len(joints), dtype=joints.dtype)
+    differences = torch.stack(
+        [(position(joints + step) - position(joints - step)) / 2e-6 for step in steps], -1
+    )
+    state = held.state(upper_body().state(joints))
+    torch.testing.assert_close(state.linear_jacobian("bottle"), differences, rtol=0, atol=1e-8)
+    torch.testing.assert_close(numeric, differences, rtol=0, atol=1e-8)
 
 
 def test_after_the_release_it_stays_where_it_was_let_go():
@@ -166,7 +231,7 @@ def test_what_is_carried_is_put_exactly_however_it_was_grasped():
     # of places alone, the grasp's error remains
     assert float(placed(places, scene, slips).median()) > 0.02
     # what follows the bottle in its own hand goes nowhere
-    assert float(placed(live, scene, slips).median()) > 0.1
+    assert float(placed(live, scene, slips).median()) > 0.05
 
 
 def test_a_prediction_carries_what_it_holds():
@@ -216,7 +281,8 @@ def test_frames_that_live_to_the_end_change_nothing(texts):
     )
     situation = Situation(scene.start, {**scene.frames, "bottle": moving}, model.time_)
     [followed] = model.predict([situation])
-    assert torch.equal(followed.joints[:put], nominal.joints[:put])
+    # as a thing it is held as it is seen, to rounding
+    torch.testing.assert_close(followed.joints[:put], nominal.joints[:put], rtol=0, atol=1e-6)
     # where it was let go, it is seen to rounding, which precise operators enlarge, and which
     # decides whether a reference is just within bounds
     torch.testing.assert_close(followed.joints, nominal.joints, rtol=0, atol=1e-2)
