@@ -68,6 +68,7 @@ def test_gradients_equal_finite_differences(handlings, loss, fusion):
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_solution_of_em_is_stationary(waves, monkeypatch):
     options = {**WAVES, "alignment": "none", "responsibilities": "point"}
+    options["covariance_shrinkage"] = 0.0
     policy = trained(waves, tol=1e-13, max_iter=5000, **options).train()
     slopes = gradient(policy, whole(waves))
     assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
@@ -110,6 +111,7 @@ def train(policy, batches: list[dict], steps: int) -> list[float]:
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_the_likelihood_rises_where_em_stopped_early(waves):
     options = {**WAVES, "alignment": "none", "responsibilities": "point"}
+    options["covariance_shrinkage"] = 0.0
     policy = fresh(waves, tol=10.0, optimizer_lr=1e-2, **options)
     batch = whole(waves)
     assert train(policy, [batch], 1) == [0.0]
