@@ -49,6 +49,7 @@ from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
 from tpgmm_torch.plausibility.check import learning_report, summarize, summarized
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY
+from tpgmm_torch.plausibility.outlying_demonstrations import left_out, outlying_demonstrations
 from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
@@ -153,6 +154,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         (``find_holds``); what was recorded once, or
         never moves, is never held. While an object is held, its frame as a place is where it
         was last free, for learning and for reproducing alike.
+    robust : bool, default=True
+        Whether to leave out demonstrations that are unlike the others where these agree, up
+        to a third of five or more, with a warning that names them
+        (``outlying_demonstrations``). Demonstrations in
+        batches or in several processes are not looked at together, and all are learned from.
     plausibility : {"warn", "error", "ignore"}, default="warn"
         What is done about recordings and situations that are unlikely to be what they are
         taken for (units, order, clock, places far from those shown): one
@@ -193,6 +199,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Mean log-likelihood per time step at the end of EM, before covariances are shrunk.
     mixture_ : BlockGaussianMixture
         Of the local data of all operators side by side.
+    demonstration_weights_ : Tensor of shape (M,) or None
+        1 for each demonstration that was learned from, 0 for each that was left out; the
+        mixing coefficients are ``weights_``. None for demonstrations in batches or in several
+        processes, and for a model that was loaded or made from parameters.
     shown_ : Shown or None
         What the demonstrations showed: ranges of start postures and frames. None for a model
         that was made from parameters.
@@ -236,6 +246,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "blend": [Interval(Real, 0, None, closed="left")],
         "keep_limits": ["boolean"],
         "holds": [StrOptions({"auto"}), "array-like", tuple, None],
+        "robust": ["boolean"],
         "plausibility": [StrOptions(set(PLAUSIBILITY))],
         "random_state": ["random_state"],
         "warm_start": ["boolean"],
@@ -245,6 +256,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     }
 
     shown_: Shown | None
+    demonstration_weights_: Tensor | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
 
@@ -275,6 +287,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         blend: float = 1.0,
         keep_limits: bool = True,
         holds: str | Sequence[Hold] | None = "auto",
+        robust: bool = True,
         plausibility: str = "warn",
         random_state: int | np.random.RandomState | None = None,
         warm_start: bool = False,
@@ -301,6 +314,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.blend = blend
         self.keep_limits = keep_limits
         self.holds = holds
+        self.robust = robust
         self.plausibility = plausibility
         self.random_state = random_state
         self.warm_start = warm_start
@@ -364,7 +378,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
             kinematics = self._kinematics_for(known, operators)
-            shown = self._examine(summarize(known, kinematics), operators, kinematics)
+            weights, shown = self._examined(known, operators, kinematics)
+            known = [each for each, weight in zip(known, weights, strict=True) if weight > 0]
             holds = holds_for(self.holds, known, operators, kinematics)
             gathered = rows_in_memory(
                 known,
@@ -374,7 +389,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 holds=holds,
             )
             self._learn(gathered, operators, kinematics, checkpoint, holds)
-            self.shown_ = shown
+            self.shown_, self.demonstration_weights_ = shown, weights
             peaks = demonstrated_peaks(known, kinematics.joint_names)
             return self._set_peaks(*peaks)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -871,7 +886,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_iter_ = getattr(mixture, "n_iter_", 0)
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
-        self.shown_ = None
+        self.shown_ = self.demonstration_weights_ = None
         self._untried = True
         return self
 
@@ -1094,14 +1109,35 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
 
+    def _examined(
+        self,
+        demonstrations: Sequence[Demonstration],
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+    ) -> tuple[Tensor, Shown]:
+        """Act on what is implausible; weights (M,) of demonstrations, and what these showed."""
+        episodes = summarize(demonstrations, kinematics)
+        family = self.covariance_type, self.covariance_shrinkage
+        report = learning_report(episodes, operators, kinematics, *family)
+        weights = torch.ones(len(demonstrations), dtype=torch.float64)
+        if self.robust and (not report.errors() or self.plausibility == "ignore"):
+            holds = holds_for(self.holds, demonstrations, operators, kinematics)
+            outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
+            if outlying:
+                report = report.and_also(left_out(outlying, len(demonstrations)))
+                weights[[one.episode for one in outlying]] = 0.0
+        report.act(self.plausibility, stacklevel=3)
+        kept = [each for each, weight in zip(episodes, weights, strict=True) if weight > 0]
+        return weights, Shown.of(kept, kinematics)
+
     def _examine(
         self,
         episodes: Sequence[EpisodeSummary],
         operators: Sequence[Operator],
         kinematics: Kinematics,
-        rank: int = 0,
+        rank: int,
     ) -> Shown:
-        """Act on what is implausible about demonstrations; what they showed."""
+        """Act on what is implausible about demonstrations in batches; what they showed."""
         report = learning_report(
             episodes, operators, kinematics, self.covariance_type, self.covariance_shrinkage
         )

@@ -13,6 +13,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.metrics import check_scoring
@@ -25,6 +26,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import fit_subsets
 from tpgmm_torch.plausibility.check import learning_report, summarize
+from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
@@ -141,7 +143,13 @@ def fit_folds(
         and not share_one_grid(demonstrations)
         and any(map(share_one_grid, shown))
     )
-    if twice or mixed or len(holds) != 1:
+    together = not (twice or mixed) and len(holds) == 1
+    if together and estimator.robust:  # what a fold leaves out, it leaves out alone
+        [held] = holds
+        together = not any(
+            outlying_demonstrations(own, operators, kinematics, held) for own in shown
+        )
+    if not together:
         return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     episodes = summarize(demonstrations, kinematics)
     family = estimator.covariance_type, estimator.covariance_shrinkage
@@ -175,6 +183,7 @@ def fit_folds(
         time = typical_time(own).to(learning.time)
         model.set_mixture(mixture, operators, kinematics, time, held)
         model.shown_ = Shown.of([episodes[index] for index in fold], kinematics)
+        model.demonstration_weights_ = torch.ones(len(fold), dtype=torch.float64)
     return models
 
 

@@ -35,7 +35,8 @@ __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 HYPERPARAMETERS = (
     "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
     "n_init", "init_params", "responsibilities", "fusion", "activation", "epsilon",
-    "prior_std", "negligible", "blend", "keep_limits", "plausibility", "random_state", "dtype",
+    "prior_std", "negligible", "blend", "keep_limits", "robust", "plausibility", "random_state",
+    "dtype",
 )  # fmt: skip
 
 CHOICES = {
@@ -98,7 +99,7 @@ class TPGMMConfig(StatePolicyConfig):
     ----------
     n_components, covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, \
     init_params, responsibilities, fusion, activation, epsilon, prior_std, negligible, blend, \
-    keep_limits, random_state, dtype
+    keep_limits, robust, random_state, dtype
         As for :class:`tpgmm_torch.TaskParameterizedGMM`.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
@@ -212,6 +213,7 @@ class TPGMMConfig(StatePolicyConfig):
     negligible: float = 1e-9
     blend: float = 1.0
     keep_limits: bool = True
+    robust: bool = True
     plausibility: str = "warn"
     random_state: int | None = None
     dtype: str = "float64"

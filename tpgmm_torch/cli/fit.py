@@ -121,6 +121,13 @@ def fit(
             "by itself; 'auto' is 'instant' after alignment."
         ),
     ] = "auto",
+    robust: Annotated[
+        bool,
+        learning(
+            "Leave out episodes that are unlike the others where these agree, with a warning; "
+            "not with --batch-episodes."
+        ),
+    ] = True,
     random_state: Annotated[int, learning("Seed of what is random.")] = 0,
     checkpoint: Annotated[
         Path | None,
@@ -191,6 +198,7 @@ def fit(
             n_init=n_init,
             init_params=init_params,
             responsibilities=responsibilities,
+            robust=robust,
             random_state=random_state,
             fusion=fusion,
             activation=activation,

@@ -82,6 +82,10 @@ class Report:
         """The report with errors first."""
         return cls(tuple(sorted(findings, key=lambda f: f.severity != "error")), subject)
 
+    def and_also(self, finding: Finding) -> Report:
+        """The report with one more finding."""
+        return Report.of([*self.findings, finding], self.subject)
+
     def __iter__(self) -> Iterator[Finding]:
         """One finding after the other."""
         return iter(self.findings)

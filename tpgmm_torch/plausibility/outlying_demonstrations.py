@@ -1,0 +1,164 @@
+"""Which demonstrations are unlike the others, as the operators see them.
+
+A frame that was seen in a wrong place, or at a wrong time, is plain where all others agree: the
+hand is at the object then, and in this demonstration alone it is far away. One such
+demonstration widens the covariances of exactly those instants that the skill is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.operators import Operator, Stack
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.plausibility.findings import Finding, listed
+from tpgmm_torch.plausibility.outliers import CONSISTENT, FAR
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.training_rows import typical_time
+
+__all__ = ["Outlying", "left_out", "outlying_demonstrations"]
+
+#: Fewer demonstrations do not show how far they differ.
+FEWEST = 5
+#: What is nearer to the median is like the others: a share of the range of coordinates,
+NEAR = 0.02
+#: and an angle [rad].
+NEAR_ANGLE = 0.05
+#: It has to be unlike them for so long [s].
+LONG = 0.2
+
+
+@dataclass(frozen=True)
+class Outlying:
+    """One demonstration that is unlike the others.
+
+    Parameters
+    ----------
+    episode : int
+        Which one, counted from 0.
+    operator : Operator
+        That sees it most.
+    time : float
+        When it is seen most [s].
+    ratio : float
+        How far the demonstration is from the median there, in robust standard deviations of
+        all.
+    """
+
+    episode: int
+    operator: Operator
+    time: float
+    ratio: float
+
+
+def outlying_demonstrations(
+    demonstrations: Sequence[Demonstration],
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    holds: Sequence[Hold] = (),
+) -> tuple[Outlying, ...]:
+    """Demonstrations far from the median of all, at instants at which the others agree.
+
+    In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
+    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than six
+    times 1.4826 times the median distance from the median, for 0.2 s in all. Where the others
+    agree to less than 2 % of the range of an operator's coordinates, or 0.05 rad, that counts
+    as their distance.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        Aligned; what has other time grids is compared at equal phase. Fewer than five have
+        none that are unlike the others, and where it would be more than a third of them, they
+        show several ways rather than mistakes.
+    operators : sequence of Operator
+    kinematics : Kinematics
+    holds : sequence of Hold, default=()
+        Objects that the robot held.
+
+    Returns
+    -------
+    tuple of Outlying
+        In the order of the demonstrations.
+    """
+    if len(demonstrations) < FEWEST:
+        return ()
+    time = typical_time(demonstrations)
+    rows = local_data(demonstrations, operators, kinematics, holds=holds)
+    phase = torch.linspace(0, 1, len(time))
+    data = torch.stack([row[((len(row) - 1) * phase).round().long()] for row in rows])
+    step = float(time[-1] - time[0]) / max(len(time) - 1, 1)
+    count = min(max(round(LONG / step), 1), len(time)) if step > 0 else 1
+    found: dict[int, Outlying] = {}
+    for operator, local, near in _coordinates(data, operators, kinematics):
+        distance = torch.linalg.vector_norm(local - local.median(0).values, dim=-1)  # (M, T)
+        usual = distance.median(0).values.clamp(min=near)
+        ratios, instants = (distance / (CONSISTENT * usual)).topk(count, dim=1)
+        for episode in (ratios[:, -1] > FAR).nonzero()[:, 0].tolist():
+            ratio, instant = float(ratios[episode, -1]), int(instants[episode, -1])
+            if episode not in found or ratio > found[episode].ratio:
+                found[episode] = Outlying(episode, operator, float(time[instant]), ratio)
+    if len(found) > len(demonstrations) // 3:
+        return ()
+    return tuple(found[episode] for episode in sorted(found))
+
+
+def _coordinates(
+    data: Tensor, operators: Sequence[Operator], kinematics: Kinematics
+) -> Iterator[tuple[Operator, Tensor, float]]:
+    """Coordinates (M, T, D) that have one unit, by operator, and what is near in it."""
+    column = 0
+    for operator in operators:
+        column += 1  # time
+        for leaf in operator.leaves if isinstance(operator, Stack) else (operator,):
+            width = leaf.dimension(kinematics)
+            local = data[..., column : column + width]
+            column += width
+            others = torch.ones(width, dtype=torch.bool)
+            for start in leaf.quaternion_starts(kinematics):
+                others[start : start + 4] = False
+                yield leaf, 2 * local[..., start : start + 4], NEAR_ANGLE
+            local = local[..., others]
+            spread = local.flatten(0, 1).amax(0) - local.flatten(0, 1).amin(0)
+            if not bool((spread > 0).any()):
+                continue
+            if leaf.determines_joints:  # of which each has a unit of its own
+                local = local[..., spread > 0] / spread[spread > 0]
+                yield leaf, local, NEAR * local.shape[-1] ** 0.5
+            else:
+                yield leaf, local, NEAR * float(torch.linalg.vector_norm(spread))
+
+
+def left_out(outlying: Sequence[Outlying], count: int) -> Finding:
+    """What to say of demonstrations that were left out.
+
+    Parameters
+    ----------
+    outlying : sequence of Outlying
+        At least one.
+    count : int
+        How many demonstrations there were.
+    """
+    worst = max(outlying, key=lambda one: one.ratio)
+    places = [
+        f"demonstration {one.episode} ({format_operator(one.operator)} at {one.time:.2f} s, "
+        f"{one.ratio:.0f} robust standard deviations from the median)"
+        for one in sorted(outlying, key=lambda one: -one.ratio)
+    ]
+    return Finding(
+        "left out",
+        "unlikely",
+        f"{len(outlying)} of {count} are unlike the others and were not learned from: "
+        f"{listed(places)}",
+        "Is the frame right, and the event's time? robust=False learns from all",
+        (format_operator(worst.operator),),
+        tuple(one.episode for one in outlying),
+        worst.ratio,
+    )
