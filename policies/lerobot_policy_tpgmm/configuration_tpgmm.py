@@ -180,7 +180,8 @@ class TPGMMConfig(StatePolicyConfig):
         How training brings episodes onto one clock; ``"events"`` anchors them at all events.
     alignment_features : list of str, optional
         What ``"dtw"`` and ``"barycenter"`` compare, as for
-        :class:`tpgmm_torch.alignment.DynamicTimeWarping`; ``["directions"]`` suits rhythms.
+        :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
+        of the links and the joints.
     learn_from : {"measured", "commanded"}, default="measured"
         Whether the joints of a demonstration are its states or its actions. Measured joints
         lag behind commanded ones, by which a skill learned from them misses.

@@ -126,6 +126,7 @@ def test_an_example_draws_and_its_text_is_true(script, pyplot, monkeypatch):
 
 
 @pytest.mark.skipif(not RECORDINGS.is_dir(), reason="the recordings are not here")
+@pytest.mark.filterwarnings("ignore:left on linear time")
 def test_a_real_recording_can_be_given(pyplot, monkeypatch):
     variables = run("plot_07_lerobot_dataset.py", monkeypatch, RECORDINGS / "g1_bottle")
     assert len(variables["demonstrations"]) == 10

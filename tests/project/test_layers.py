@@ -61,7 +61,6 @@ MOST_FILES_IN_A_ROOM = 11
 
 # Loaded inside the functions that need them, so that `import tpgmm_torch` needs none.
 LATE = {
-    "dtaidistance",
     "lerobot",
     "matplotlib",
     "mujoco",

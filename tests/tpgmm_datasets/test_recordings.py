@@ -137,6 +137,7 @@ def test_the_angle_between_orientations_ignores_the_sign_of_quaternions(example)
 
 
 @needs_recordings
+@pytest.mark.filterwarnings("ignore:left on linear time")
 def test_g1_grasps_an_unseen_bottle_an_order_better_than_both_baselines(example):
     recording = example.load_g1(DATA / "g1_bottle")
     models = {name: recording.models[name] for name in ("TP-GMM", "TP-GMM, place known")}
@@ -168,6 +169,7 @@ def test_g1_approaches_better_if_the_start_of_the_hand_is_a_frame(example):
 
 
 @needs_recordings
+@pytest.mark.filterwarnings("ignore:left on linear time")
 def test_honeytea_pours_into_an_unseen_cup_better_than_both_baselines(example):
     recording = example.load_honeytea(DATA / "honeytea_bimanual")
     first, *_ = recording.models.items()
@@ -180,6 +182,7 @@ def test_honeytea_pours_into_an_unseen_cup_better_than_both_baselines(example):
 
 
 @needs_recordings
+@pytest.mark.filterwarnings("ignore:left on linear time")
 def test_the_example_prints_its_table(example, capsys):
     example.main([str(DATA / "honeytea_bimanual"), "--set", "honeytea", "--folds", "1"])
     lines = capsys.readouterr().out.splitlines()

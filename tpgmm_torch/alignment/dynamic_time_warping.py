@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
@@ -22,12 +23,16 @@ from tpgmm_torch.alignment.warping_paths import (
 )
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 __all__ = ["DynamicTimeWarping"]
 
 #: Warping runs on at most this many steps; its memory and time grow with their square.
 LARGEST_GRID = 2000
+#: A warp has to lower the spread of features that it did not use by this fraction,
+LEAST_GAIN = 0.05
+#: unless it differs from linear time by less than this fraction of the duration.
+NEARLY_LINEAR = 0.02
 
 
 class DynamicTimeWarping(Alignment):
@@ -35,7 +40,8 @@ class DynamicTimeWarping(Alignment):
 
     Each demonstration is matched with a reference by dynamic time warping on features of
     several kinds; the matching becomes a smooth increasing function of time along which
-    joints, frames and events are taken over.
+    joints, frames and events are taken over. A demonstration whose warp does not bring other
+    features, which were not used, nearer to the reference is left on linear time.
 
     Parameters
     ----------
@@ -43,25 +49,36 @@ class DynamicTimeWarping(Alignment):
         What the others are warped onto: the demonstration with the least summed distance to
         the others, their iterative average (DBA), or the demonstration of that index.
     features : sequence of str, optional
-        Groups of features to compare, see :class:`AlignmentFeatures`: ``"joints"``,
-        ``"directions"`` of motion, with a robot also each link, ``"left_hand"``, and each
-        link seen from each frame, ``"left_hand in bottle"``. The default is all but the last.
+        Groups of features to compare, see :class:`AlignmentFeatures`: ``"speed"``,
+        ``"joints"``, ``"directions"`` of motion, with a robot also each link, ``"left_hand"``,
+        and each link seen from each frame, ``"left_hand in bottle"``. The default is the
+        speed, the joints and each link.
     weights : mapping of str to float, optional
-        Weight of groups; by default 3 for the directions, and ``n ** -0.5`` for each of
-        the n others. Units do not matter: each group is divided by its standard deviation.
+        Weight of groups; by default 5 for the speed, 4.5 for the directions, and ``n ** -0.5``
+        for each of the n others. Units do not matter: each group is divided by its standard
+        deviation.
     robot : Kinematics, optional
         Gives the link positions; see :class:`Robot` and :class:`Poses`.
     window : float, optional
         Largest difference between a warp and linear time normalisation, as a fraction of
         the duration. With ``open_end``, between a warp and equal clocks, as a fraction of
         the reference's duration.
-    penalty : float, default=1.0
+    penalty : float, default=1.5
         Resistance against stretching and compressing: its square is added to the squared
-        feature distance of each step that advances in one sequence alone. It stands in for
-        a slope constraint and matters where little moves.
+        feature distance of each step that advances in one sequence alone. It matters where
+        little moves.
+    max_slope : int, default=2
+        How many times faster or slower than linear time normalisation a demonstration may
+        run anywhere; 1 is linear time. With ``open_end``, than on equal clocks.
     open_end : bool, default=False
         Whether a demonstration may go on after the end of the reference: its best prefix is
         matched with the whole reference. The reference should then be one that ends early.
+    fallback : bool, default=True
+        Whether demonstrations are left on linear time, with a warning, if warping them does
+        not pay: if the mean squared difference from the reference (for a barycentre, from
+        the demonstration that it started from) of features that are *not* used (of
+        directions, by default) falls by less than 5 %. Nothing is checked if no feature is
+        left over, with ``open_end``, and of warps within 2 % of linear time.
     smoothing : float, default=0.2
         Half the length of the kernel that smooths a warp [s].
     n_iter : int, default=10
@@ -81,6 +98,8 @@ class DynamicTimeWarping(Alignment):
         Common time grid [s]. For a barycentre it is the average clock, from 0 on.
     distortions_ : ndarray of shape (n_demonstrations,)
         Root mean square distance of features along each path, in standard deviations.
+    fallback_ : dict of int to str
+        Which demonstrations of ``fit`` were left on linear time, and why.
     feature_names_ : tuple of str
         The groups of features in use; those that never change are left out.
     paths_, joint_names_ : list of Tensor of shape (T,), tuple of str or None
@@ -105,7 +124,9 @@ class DynamicTimeWarping(Alignment):
         "robot": "no_validation",
         "window": [Interval(Real, 0, None, closed="neither"), None],
         "penalty": [Interval(Real, 0, None, closed="left")],
+        "max_slope": [Interval(Integral, 1, None, closed="left")],
         "open_end": ["boolean"],
+        "fallback": ["boolean"],
         "smoothing": [Interval(Real, 0, None, closed="left")],
         "n_iter": [Interval(Integral, 1, None, closed="left")],
         "n_steps": [Interval(Integral, 2, None, closed="left"), None],
@@ -120,8 +141,10 @@ class DynamicTimeWarping(Alignment):
         weights: Mapping[str, float] | None = None,
         robot: Any = None,
         window: float | None = None,
-        penalty: float = 1.0,
+        penalty: float = 1.5,
+        max_slope: int = 2,
         open_end: bool = False,
+        fallback: bool = True,
         smoothing: float = 0.2,
         n_iter: int = 10,
         n_steps: int | None = None,
@@ -133,7 +156,9 @@ class DynamicTimeWarping(Alignment):
         self.robot = robot
         self.window = window
         self.penalty = penalty
+        self.max_slope = max_slope
         self.open_end = open_end
+        self.fallback = fallback
         self.smoothing = smoothing
         self.n_iter = n_iter
         self.n_steps = n_steps
@@ -145,11 +170,15 @@ class DynamicTimeWarping(Alignment):
         Raises
         ------
         DataError
-            If ``reference`` is out of range, nothing moves, or ``window`` is too narrow.
+            If ``reference`` is out of range, nothing moves, ``window`` is too narrow, or,
+            with ``open_end``, a demonstration ends too early.
         UnknownNameError
             If a feature does not exist.
-        DependencyError
-            Without dtaidistance.
+
+        Warns
+        -----
+        PlausibilityWarning
+            Once, if demonstrations are left on linear time.
         """
         demonstrations = self._start(X)
         self._features = AlignmentFeatures.fit(
@@ -175,6 +204,13 @@ class DynamicTimeWarping(Alignment):
             )
         pairs = list(zip(demonstrations, sequences, strict=True))
         warps = [self._warp(*pair) for pair in pairs]
+        self._witness = self._held_out(demonstrations, warps)
+        reasons = [self._doubt(d, w) for d, w in zip(demonstrations, warps, strict=True)]
+        self.fallback_ = {i: reason for i, reason in enumerate(reasons) if reason}
+        for i in self.fallback_:
+            warps[i] = self._linear(demonstrations[i])
+        if self.fallback_:
+            _warn("; ".join(f"demonstration {i}: {why}" for i, why in self.fallback_.items()))
         self.paths_ = [self._on_grid(d, w) for d, w in zip(demonstrations, warps, strict=True)]
         self.distortions_ = np.array(
             [
@@ -186,7 +222,7 @@ class DynamicTimeWarping(Alignment):
 
     def _index(self, sequences: Sequence[Array]) -> int:
         if isinstance(self.reference, str):
-            return medoid(sequences, self.window)
+            return medoid(sequences, self.window, self.max_slope)
         n = len(sequences)
         if not -n <= self.reference < n:
             raise DataError(
@@ -211,7 +247,12 @@ class DynamicTimeWarping(Alignment):
         window = None
         if self.window is not None:
             window = max(1, round(self.window * (len(self._clock) - 1)))
-        return {"window": window, "penalty": self.penalty, "open_end": self.open_end}
+        return {
+            "window": window,
+            "penalty": self.penalty,
+            "open_end": self.open_end,
+            "max_slope": self.max_slope,
+        }
 
     def _source_clock(self, demonstration: Demonstration) -> Array:
         """Where a demonstration is sampled: as many steps as the reference, or as long ones."""
@@ -226,6 +267,12 @@ class DynamicTimeWarping(Alignment):
         clock, n = self._source_clock(demonstration), len(self._clock)
         source = resample(sequence, seconds(demonstration), clock)
         path, cost = warping_path(self._target, source, **self._options())
+        if n > self.max_slope * len(clock):
+            raise DataError(
+                f"a demonstration of {demonstration.duration:.6g} s is too short for a "
+                f"reference of {self._clock[-1] - self._clock[0]:.6g} s: within "
+                f"max_slope={self.max_slope} it does not reach its end"
+            )
         if not np.isfinite(cost):
             smallest = np.ceil((n - len(clock)) / (n - 1) * 1e4) / 1e4
             raise DataError(
@@ -238,10 +285,61 @@ class DynamicTimeWarping(Alignment):
         instants: Array = np.interp(warp, np.arange(len(clock)), clock)
         return instants
 
+    def _held_out(
+        self, demonstrations: Sequence[Demonstration], warps: Sequence[Array]
+    ) -> tuple[AlignmentFeatures, Array] | None:
+        """Features that warps do not depend on, and those of the reference on the clock."""
+        if not self.fallback or self.open_end:
+            return None
+        others = AlignmentFeatures.others(demonstrations, self._features)
+        if others is None:
+            return None
+        one = demonstrations[self.reference_index_]
+        return others, resample(others(one), seconds(one), warps[self.reference_index_])
+
+    def _doubt(self, demonstration: Demonstration, warp: Array) -> str:
+        """Why a demonstration should rather run linearly; empty if it should not."""
+        linear = self._linear(demonstration)
+        tolerance = NEARLY_LINEAR * demonstration.duration
+        if self._witness is None or np.abs(warp - linear).max() <= tolerance:
+            return ""
+        features, target = self._witness
+        own, time = features(demonstration), seconds(demonstration)
+        before, after = (
+            # over both clocks: what is squeezed into an instant counts with its duration
+            np.average(
+                ((resample(own, time, w) - target) ** 2).sum(axis=1),
+                weights=1 + np.gradient(w) / np.gradient(w).mean(),
+            )
+            for w in (linear, warp)
+        )
+        if after <= (1 - LEAST_GAIN) * before:
+            return ""
+        return (
+            f"its difference from the reference in {', '.join(features.names)} is "
+            f"{after / before:.0%} of that on linear time"
+        )
+
+    def _linear(self, demonstration: Demonstration) -> Array:
+        time = seconds(demonstration)
+        return np.linspace(time[0], time[-1], len(self._clock))
+
     def _on_grid(self, demonstration: Demonstration, warp: Array) -> Tensor:
         return steps_at(demonstration, np.interp(self.time_.numpy(), self._clock, warp))
 
     def _path(self, demonstration: Demonstration) -> Tensor:
-        return self._on_grid(
-            demonstration, self._warp(demonstration, self._features(demonstration))
-        )
+        warp = self._warp(demonstration, self._features(demonstration))
+        if reason := self._doubt(demonstration, warp):
+            warp = self._linear(demonstration)
+            _warn(f"of transform: {reason}")
+        return self._on_grid(demonstration, warp)
+
+
+def _warn(found: str) -> None:
+    warnings.warn(
+        "left on linear time, for warping does not bring nearer what it did not use. "
+        f"{found}. Is it one skill, from its beginning to its end? Choose other features, or "
+        "set fallback=False",
+        PlausibilityWarning,
+        stacklevel=3,
+    )

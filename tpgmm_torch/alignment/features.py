@@ -22,9 +22,9 @@ __all__ = ["AlignmentFeatures", "quaternion_columns"]
 VELOCITY_SMOOTHING = 0.1
 #: Below this fraction of a demonstration's root mean square speed the direction fades out.
 STANDSTILL = 0.3
-#: Weight of the directions, where those of the postures together have 1: postures differ
-#: between demonstrations at equal phase, by start and goal, and would shift a rhythm.
-DIRECTIONS_WEIGHT = 3.0
+#: Weights where those of the postures together have 1: postures differ between demonstrations
+#: at equal phase, by start and goal, and would shift a rhythm.
+SPEED_WEIGHT, DIRECTIONS_WEIGHT = 5.0, 4.5
 #: Columns that vary by less than this, relative to their size, count as constant.
 CONSTANT = 1e-9
 
@@ -60,11 +60,12 @@ def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[in
 class AlignmentFeatures:
     """Groups of features, each scaled to unit variance over the demonstrations of ``fit``.
 
-    The groups are ``"joints"``, ``"directions"`` (in which the joints move: their velocity
-    over its norm, which does not depend on the speed and fades out at standstill), and with a
-    robot its link positions by link, ``"left_hand"``, and the same seen from each frame,
-    ``"left_hand in bottle"``. Quaternions among the joints count as rotation matrices, which
-    do not depend on their sign.
+    The groups are ``"joints"``, ``"speed"`` (of each link, without a robot of all joints
+    together, over its root mean square along the demonstration), ``"directions"`` (in which the
+    joints move: their velocity over its norm, which does not depend on the speed and fades out
+    at standstill), and with a robot its link positions by link, ``"left_hand"``, and the same
+    seen from each frame, ``"left_hand in bottle"``. Quaternions among the joints count as
+    rotation matrices, which do not depend on their sign.
 
     Parameters
     ----------
@@ -101,9 +102,11 @@ class AlignmentFeatures:
         demonstrations, robot : sequence of Demonstration, Kinematics or None
             What to compare.
         names, weights : sequence of str, mapping of str to float, optional
-            As ``features`` and ``weights`` of :class:`DynamicTimeWarping`. Features seen from a
-            frame are no default: away from the object that the motion is about, they differ
-            between demonstrations at equal phase.
+            As ``features`` and ``weights`` of :class:`DynamicTimeWarping`. Directions are no
+            default: two demonstrations that reach for objects on either side move against each
+            other, and the matching would rather skip the way. Neither are features seen from
+            a frame: away from the object that the motion is about, they differ between
+            demonstrations at equal phase.
 
         Raises
         ------
@@ -112,18 +115,17 @@ class AlignmentFeatures:
         DataError
             If a weight is negative, or no feature changes.
         """
-        links = getattr(robot, "links", ())
         raw = [_groups(one, robot) for one in demonstrations]
         if names is None:
-            seen = {
-                f"{link} in {frame}" for link in links for frame in demonstrations[0].frames
-            }
-            names = [name for name in raw[0] if name not in seen]
+            names = ("speed", "joints", *getattr(robot, "links", ()))
         _check_names(names, raw[0], "feature")
         weights = dict(weights or {})
         _check_names(weights, names, "weight")
-        usual = max(1, len(set(names) - {"directions"})) ** -0.5
-        defaults = dict.fromkeys(names, usual) | {"directions": DIRECTIONS_WEIGHT}
+        usual = max(1, len(set(names) - {"speed", "directions"})) ** -0.5
+        defaults = dict.fromkeys(names, usual) | {
+            "speed": SPEED_WEIGHT,
+            "directions": DIRECTIONS_WEIGHT,
+        }
         columns: dict[str, NDArray[np.bool_]] = {}
         scales: dict[str, float] = {}
         for name in dict.fromkeys(names):
@@ -144,6 +146,19 @@ class AlignmentFeatures:
                 "there is nothing to align by"
             )
         return cls(tuple(columns), robot, columns, scales)
+
+    @classmethod
+    def others(cls, demonstrations: Sequence[Demonstration], used: Self) -> Self | None:
+        """What the features in use leave out: postures, speed, directions; None if nothing.
+
+        Whether a matching by some features is right shows in others.
+        """
+        names = ("speed", "joints", "directions", *getattr(used.robot, "links", ()))
+        rest = [name for name in names if name not in used.names]
+        try:
+            return cls.fit(demonstrations, used.robot, rest) if rest else None
+        except DataError:  # nothing of it changes
+            return None
 
     def __call__(self, demonstration: Demonstration) -> Array:
         """The features of a demonstration, shape (T, D)."""
@@ -171,29 +186,46 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
     others = [column for column in range(demonstration.n_joints) if column not in inside]
     turns = [quaternions.to_matrix(joints[:, block]).flatten(1) for block in quaternion]
     values = as_array(torch.cat((joints[:, others], *turns), dim=1))
-    groups = {"joints": values, "directions": _directions(values, demonstration)}
-    if robot is None:
+    velocity = _velocity(values, demonstration)
+    groups = {"joints": values, "directions": _directions(velocity)}
+    if robot is None or not robot.links:
+        groups["speed"] = _speed(velocity)
         return groups
     names = getattr(robot, "joint_names", None)
     ordered = demonstration if names is None else demonstration.reordered(names)
     state = robot.state(ordered.joints.detach())
+    speeds = []
     for link in robot.links:
         position = state.position(link)
         groups[link] = as_array(position)
+        speeds.append(_speed(_velocity(groups[link], demonstration)))
         for name, frame in demonstration.frames.items():
             groups[f"{link} in {name}"] = as_array(
                 frame.to(position).inverse_transform(position)
             )
+    groups["speed"] = np.concatenate(speeds, axis=1)
     return groups
 
 
-def _directions(values: Array, demonstration: Demonstration) -> Array:
+def _velocity(values: Array, demonstration: Demonstration) -> Array:
+    """Smoothed rates of change, zero for what does not change, shape (T, d)."""
     time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
     smooth = moving_average(resample(values, time, even), round(VELOCITY_SMOOTHING / step))
     rates = resample(np.gradient(smooth, step, axis=0), even, time)
-    squared = (rates**2).sum(axis=1, keepdims=True)
+    return np.where(values.std(axis=0) > CONSTANT * np.abs(values).max(axis=0), rates, 0.0)
+
+
+def _speed(velocity: Array) -> Array:
+    """Over its root mean square, which may be zero, shape (T, 1)."""
+    speed = np.linalg.norm(velocity, axis=1, keepdims=True)
+    usual = np.sqrt((speed**2).mean())
+    return speed / usual if usual > 0 else speed
+
+
+def _directions(velocity: Array) -> Array:
+    squared = (velocity**2).sum(axis=1, keepdims=True)
     norm = np.sqrt(squared + STANDSTILL**2 * squared.mean())
     # a demonstration that stands still has no direction
-    return np.divide(rates, norm, out=np.zeros_like(rates), where=norm > 0)
+    return np.divide(velocity, norm, out=np.zeros_like(velocity), where=norm > 0)

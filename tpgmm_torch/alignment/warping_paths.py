@@ -1,7 +1,7 @@
 """Dynamic time warping of feature sequences: which instant of one is which of the other.
 
 Plain arrays on uniform grids; :mod:`tpgmm_torch.alignment` applies the result to
-demonstrations. The accumulated costs come from dtaidistance.
+demonstrations.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.exceptions import DependencyError
 
 __all__ = ["barycenter", "medoid", "moving_average", "resample", "warping_map", "warping_path"]
 
@@ -23,21 +23,9 @@ Floats = NDArray[np.floating[Any]]
 #: A warp never runs slower than this, relative to its mean: events have one instant each.
 SLOWEST = 1e-3
 #: The medoid is chosen on sequences of at most this many steps.
-MEDOID_STEPS = 400
+MEDOID_STEPS = 200
 #: The barycentre has converged when a round lowers the summed cost by less, relatively.
 BARYCENTER_TOLERANCE = 1e-3
-
-
-def _dtaidistance() -> Any:
-    try:
-        from dtaidistance import dtw_cc, dtw_ndim
-    except ImportError as error:
-        raise DependencyError(
-            "dynamic time warping needs dtaidistance with its C library: "
-            "pip install 'tpgmm-torch[data]'"
-        ) from error
-    del dtw_cc
-    return dtw_ndim
 
 
 def resample(values: Array, time: Floats, grid: Floats) -> Array:
@@ -71,8 +59,13 @@ def warping_path(
     window: int | None = None,
     penalty: float = 0.0,
     open_end: bool = False,
+    max_slope: int = 2,
 ) -> tuple[NDArray[np.intp], float]:
-    """The cheapest monotone matching of two sequences.
+    """The cheapest monotone matching of two sequences, within bounds of its slope.
+
+    The path is made of segments that advance by one in one sequence and by one to
+    ``max_slope`` in the other, so no part of it is steeper than ``max_slope`` or flatter than
+    its inverse (Sakoe and Chiba's slope constraint) [1]_.
 
     Parameters
     ----------
@@ -84,49 +77,81 @@ def warping_path(
         Its square is added for each step that advances in one sequence alone.
     open_end : bool, default=False
         Match the whole reference with the best prefix of the source.
+    max_slope : int, default=2
+        At least one, which leaves the diagonal alone.
 
     Returns
     -------
     path : ndarray of shape (L, 2)
         Matched (reference, source) indices from (0, 0) on.
     cost : float
-        Summed squared distances and penalties, infinite if the window reaches no end.
+        Summed squared distances and penalties, infinite if no path reaches an end.
+
+    References
+    ----------
+    .. [1] H. Sakoe, S. Chiba: Dynamic programming algorithm optimization for spoken word
+       recognition. IEEE Transactions on Acoustics, Speech, and Signal Processing 26 (1978).
     """
-    n, m = len(reference), len(source)
-    # dtaidistance widens the window by the difference in length: with equal lengths it is
-    # exact. The costs of prefixes do not depend on what is appended here.
-    band = None if window is None else window + 1
-    length = max(n, m)
-    if band is not None and length == 2 * band:
-        length += 1  # dtaidistance 2.5 misplaces costs at exactly this size
-    padded = [
-        np.ascontiguousarray(np.pad(s, ((0, length - len(s)), (0, 0)), mode="edge"))
-        for s in (reference, source)
-    ]
-    _, costs = _dtaidistance().warping_paths_fast(
-        *padded, window=band, penalty=penalty, psi_neg=False, keep_int_repr=True
-    )
-    end = 1 + int(np.argmin(costs[n, 1 : m + 1])) if open_end else m
-    cost = float(costs[n, end])
+    costs, totals = _accumulated(reference, source, window, penalty**2, max_slope)
+    i, j = totals.shape[0] - 1, totals.shape[1] - 1
+    if open_end:
+        j = max_slope + int(np.argmin(totals[i, max_slope:]))
+    cost = float(totals[i, j])
     if not np.isfinite(cost):
         return np.empty((0, 2), dtype=np.intp), cost
-    return _backtrack(costs, n, end, penalty**2), cost
+    return _backtrack(costs, totals, i, j, penalty**2, max_slope), cost
 
 
-def _backtrack(costs: Array, i: int, j: int, penalty: float) -> NDArray[np.intp]:
-    """Follow the accumulated costs, which have a border of infinity, back to (1, 1)."""
-    path = [(i, j)]
-    while i > 1 or j > 1:
-        diagonal = costs.item(i - 1, j - 1)
-        up, left = costs.item(i - 1, j) + penalty, costs.item(i, j - 1) + penalty
-        if diagonal <= up and diagonal <= left:
-            i, j = i - 1, j - 1
-        elif up <= left:
-            i -= 1
-        else:
-            j -= 1
-        path.append((i, j))
-    return np.array(path[::-1], dtype=np.intp) - 1
+def _accumulated(
+    reference: Array, source: Array, window: int | None, penalty: float, border: int
+) -> tuple[Array, Array]:
+    """Local costs and those of the cheapest paths to each pair, from ``border`` indices on.
+
+    A path begins at the last pair of the border, whose others cannot be reached.
+    """
+    n, m = len(reference), len(source)
+    costs = np.zeros((n + border, m + border))
+    costs[border:, border:] = cdist(reference, source, "sqeuclidean")
+    if window is not None:
+        far = np.abs(np.arange(n)[:, None] - np.arange(m)) > window
+        costs[border:, border:][far] = np.inf
+    totals = np.full_like(costs, np.inf)
+    totals[border - 1, border - 1] = 0.0
+    for i in range(border, n + border):
+        row, before = costs[i], totals[i - 1]
+        best = before[border - 1 : -1] + row[border:]
+        # of segments that advance by k in the source, then in the reference
+        along, across = row[border:], row[border:]
+        for k in range(2, border + 1):
+            start = border - k
+            along = along + row[start + 1 : start + 1 + m] + penalty
+            np.minimum(best, before[start : start + m] + along, out=best)
+            across = across + costs[i - k + 1, border:] + penalty
+            np.minimum(best, totals[i - k, border - 1 : -1] + across, out=best)
+        totals[i, border:] = best
+    return costs, totals
+
+
+def _backtrack(
+    costs: Array, totals: Array, i: int, j: int, penalty: float, border: int
+) -> NDArray[np.intp]:
+    """Follow the accumulated costs back to the border; in doubt, diagonally."""
+    path = []
+    while i >= border:
+        best, step = totals[i - 1, j - 1] + costs[i, j], (1, 1)
+        along = across = costs[i, j]
+        for k in range(2, border + 1):
+            along = along + costs[i, j - k + 1] + penalty
+            across = across + costs[i - k + 1, j] + penalty
+            for total, other in (
+                (totals[i - 1, j - k] + along, (1, k)),
+                (totals[i - k, j - 1] + across, (k, 1)),
+            ):
+                if total < best:
+                    best, step = total, other
+        path += [(i - min(k, step[0] - 1), j - min(k, step[1] - 1)) for k in range(max(step))]
+        i, j = i - step[0], j - step[1]
+    return np.array(path[::-1], dtype=np.intp) - border
 
 
 def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
@@ -148,7 +173,7 @@ def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
     return (1 - SLOWEST) * moving_average(means, width) + SLOWEST * line
 
 
-def medoid(sequences: Sequence[Array], window: float | None = None) -> int:
+def medoid(sequences: Sequence[Array], window: float | None = None, max_slope: int = 2) -> int:
     """Index of the sequence with the least summed warping distance to the others.
 
     Parameters
@@ -157,19 +182,19 @@ def medoid(sequences: Sequence[Array], window: float | None = None) -> int:
         At least one.
     window : float, optional
         As a fraction of the duration.
+    max_slope : int, default=2
+        As in :func:`warping_path`.
     """
     if len(sequences) < 3:
         return 0
     steps = min(MEDOID_STEPS, max(map(len, sequences)))
     phase = np.linspace(0, 1, steps)
-    short = [
-        np.ascontiguousarray(resample(s, np.linspace(0, 1, len(s)), phase)) for s in sequences
-    ]
-    band = None if window is None else 1 + max(1, round(window * (steps - 1)))
-    distance = _dtaidistance().distance_fast
+    short = [resample(s, np.linspace(0, 1, len(s)), phase) for s in sequences]
+    band = None if window is None else max(1, round(window * (steps - 1)))
     total = np.zeros(len(short))
     for i, j in itertools.combinations(range(len(short)), 2):
-        total[[i, j]] += distance(short[i], short[j], window=band)
+        _, costs = _accumulated(short[i], short[j], band, 0.0, max_slope)
+        total[[i, j]] += np.sqrt(costs[-1, -1])
     return int(np.argmin(total))
 
 

@@ -22,7 +22,7 @@ ORDER = ("demo", "fit", "reproduce", "plot", "view", "dataset")
 #: Plugins of this distribution are quick to import: ``--help`` shows what theirs are for.
 DISTRIBUTION = "tpgmm-torch"
 #: Packages that come with the extra ``cli``.
-OPTIONAL = ("dtaidistance", "matplotlib", "pandas", "pyarrow")
+OPTIONAL = ("matplotlib", "pandas", "pyarrow")
 
 
 class Commands(TyperGroup):

@@ -142,7 +142,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     if base == "tpgmm-places":
         demonstrations = [_at_first(demonstration) for demonstration in demonstrations]
     if not benchmark.synchronous:
-        warping = DynamicTimeWarping(features=["directions"])
+        warping = DynamicTimeWarping(robot=benchmark.robot)
         demonstrations = warping.fit_transform(demonstrations)
     model = TaskParameterizedGMM(
         settings.n_components or benchmark.n_components,

@@ -1,7 +1,9 @@
 """Laws of dynamic time warping, on demonstrations whose true phase is known."""
 
 import pickle
-import sys
+import warnings
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,13 +24,13 @@ from tests.support.motions import (
     random_clock,
     turning,
 )
+from tests.support.worlds import upper_body
+from tpgmm_datasets.bottle.skill import CHEST, BottleShaking
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.alignment.warping_paths import moving_average
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.exceptions import (
-    DataError,
-    DependencyError,
-    UnknownNameError,
-)
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.robots.tracked_poses import Poses
 
 
@@ -178,11 +180,12 @@ def test_the_sign_of_recorded_quaternions_does_not_matter():
 def test_units_do_not_decide_but_weights_do():
     rng = np.random.default_rng(3)
     family = DEMONSTRATIONS[:3]
-    milli = [Demonstration(d.time, d.joints * 1000, d.frames) for d in family]
+    # a power of two: where nothing moves, rounding decides
+    milli = [Demonstration(d.time, d.joints * 1024, d.frames) for d in family]
     paths = [DynamicTimeWarping(0, n_steps=200).fit(x).paths_[1] for x in (family, milli)]
     torch.testing.assert_close(*paths, rtol=0, atol=1e-9)
     noise = [Demonstration(d.time, rng.normal(size=(len(d), 5)), d.frames) for d in family]
-    with_weight = DynamicTimeWarping(weights={"directions": 0}).fit(noise)
+    with_weight = DynamicTimeWarping(weights={"speed": 0}, fallback=False).fit(noise)
     assert with_weight.feature_names_ == ("joints",)
 
 
@@ -271,17 +274,14 @@ def test_it_is_a_transformer_of_scikit_learn():
         ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
         ({"reference": "mean"}, ValueError, "reference"),
         ({"window": 0}, ValueError, "window"),
+        ({"max_slope": 0}, ValueError, "max_slope"),
+        ({"max_slope": 1.5}, ValueError, "max_slope"),
+        ({"fallback": "linear"}, ValueError, "fallback"),
     ],
 )
 def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
     with pytest.raises(error, match=message):
         DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2])
-
-
-def test_without_dtaidistance_the_error_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "dtaidistance", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[data\]"):
-        DynamicTimeWarping().fit(DEMONSTRATIONS[:2])
 
 
 @pytest.mark.parametrize("options", [{}, {"open_end": True}, {"reference": "barycenter"}])
@@ -323,7 +323,8 @@ def test_smoothing_covers_its_seconds_on_both_sides():
     halting = np.minimum(even, 2) + np.maximum(even - 3, 0)  # waits from 2 s to 3 s
     waiting = Demonstration(even, halting[:, None])
     steady = Demonstration(np.linspace(0, 3, 301), np.linspace(0, 3, 301)[:, None])
-    options = {"features": ["joints"], "penalty": 0.0}
+    # a wait, that the other does not have, is steeper than any usual bound
+    options = {"features": ["joints"], "penalty": 0.0, "max_slope": 60, "fallback": False}
     sharp, smooth = (
         DynamicTimeWarping(0, smoothing=s, **options).fit([waiting, steady]).paths_[1].numpy()
         / 100
@@ -347,3 +348,107 @@ def test_the_window_is_the_nearest_number_of_steps_of_the_reference(window, step
     assert (
         warping.fit([own, near]).distortions_[1] < 0.1 < warping.fit([own, far]).distortions_[1]
     )
+
+
+@cache
+def reaching_to_either_side():
+    """Two demonstrations to bottles on either side, timed alike, that directions confuse."""
+    skill = BottleShaking(rate=25, steady_rhythm=True)
+    rng = np.random.default_rng(0)
+    n = 110  # drawn together, of which these are the first two
+    bottles, starts = skill.bottle_poses(n, rng)[:2], skill.start_postures(n, rng)[:2]
+    ends = skill._phase_ends(n, rng)[:2]
+    amplitudes = skill.amplitude * torch.from_numpy(rng.uniform(0.95, 1.05, n))[:2]
+    chests = Frame((CHEST + rng.uniform(-0.005, 0.005, (n, 3)))[:2])
+    pair = skill._demonstrations(bottles, chests, starts, ends, amplitudes)
+    lifts = dict(zip(skill.phases, ends.T.tolist(), strict=True))["hold"]
+    return [
+        replace(one, events={"grasp": one.events["grasp"], "lift": lift})
+        for one, lift in zip(pair, lifts, strict=True)
+    ]
+
+
+def apart(aligned, event):
+    return abs(aligned[0].events[event] - aligned[1].events[event])
+
+
+def test_seconds_are_no_longer_made_of_hundredths():
+    pair = reaching_to_either_side()
+    assert apart(pair, "grasp") < 0.05 and apart(pair, "lift") < 0.15
+    steep = DynamicTimeWarping(features=["directions"], max_slope=200, fallback=False)
+    assert apart(steep.fit_transform(pair), "grasp") > 4
+
+
+@pytest.mark.parametrize("robot", [None, upper_body()], ids=["joints", "robot"])
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_grasp_and_a_lift_stay_together_that_directions_confuse(robot, order):
+    pair = reaching_to_either_side()[::order]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)  # linear time is right too
+        aligned = DynamicTimeWarping(robot=robot).fit_transform(pair)
+    assert apart(aligned, "grasp") < 0.3 and apart(aligned, "lift") < 0.3
+
+
+@pytest.mark.parametrize("max_slope", [1, 2, 4])
+def test_no_second_of_a_warp_is_steeper_or_flatter_than_allowed(max_slope):
+    fitted = DynamicTimeWarping(0, features=["joints"], max_slope=max_slope, fallback=False)
+    for path in fitted.fit(DEMONSTRATIONS[:4]).paths_:
+        steps = round(1.0 / float(fitted.time_[1]))
+        share = path / path[-1]
+        slopes = (share[steps:] - share[:-steps]) * (len(path) - 1) / steps
+        # a segment that is cut by the ends of the second belongs to it in part
+        assert slopes.max() < max_slope * 1.05 and slopes.min() > 0.95 / max_slope
+
+
+def unlike(seed, duration=10.0):
+    """A motion of its own, on its own clock."""
+    time = np.linspace(0, duration, 250)
+    noise = np.random.default_rng(seed).standard_normal((250, 3))
+    return Demonstration(time, moving_average(noise, 40).cumsum(axis=0))
+
+
+def linear_path(transformer, one):
+    return torch.linspace(0, len(one) - 1, len(transformer.time_), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("reference", [0, "barycenter"])
+def test_what_warping_does_not_bring_nearer_stays_linear_with_a_warning(reference):
+    family = list(DEMONSTRATIONS[:3])
+    turned = family[1].joints.flip(0)  # the same motion backwards
+    family[1] = Demonstration(family[1].time, turned, family[1].frames, family[1].joint_names)
+    transformer = DynamicTimeWarping(reference)
+    with pytest.warns(PlausibilityWarning, match=r"demonstration 1: .*directions") as caught:
+        aligned = transformer.fit_transform(family)
+    assert len(caught) == 1
+    assert list(transformer.fallback_) == [1]
+    torch.testing.assert_close(transformer.paths_[1], linear_path(transformer, family[1]))
+    assert len({len(one) for one in aligned}) == 1
+    with pytest.warns(PlausibilityWarning, match="linear time"):
+        [again] = transformer.transform(family[1:2])
+    torch.testing.assert_close(again.joints, aligned[1].joints)
+
+
+def test_the_fallback_can_be_turned_off():
+    family = [unlike(0), unlike(1)]
+    with pytest.warns(PlausibilityWarning, match="left on linear time"):
+        linear = DynamicTimeWarping(0).fit(family)
+    warped = DynamicTimeWarping(0, fallback=False).fit(family)
+    assert list(linear.fallback_) == [1] and warped.fallback_ == {}
+    assert (warped.paths_[1] - linear.paths_[1]).abs().max() > 0.02 * 250
+
+
+def test_demonstrations_on_one_clock_need_no_warping_and_no_warning():
+    time = np.linspace(0, 8, 400)
+    family = [Demonstration(time, motion(time, np.full(5, c), np.ones(5))) for c in (0.0, 0.1)]
+    fitted = DynamicTimeWarping(0).fit(family)
+    assert fitted.fallback_ == {}
+    assert (fitted.paths_[1] - linear_path(fitted, family[1])).abs().max() < 0.02 * 400
+
+
+def test_an_end_that_no_allowed_slope_reaches_is_refused():
+    even = np.linspace(0, 10, 501)
+    long = Demonstration(even, np.sin(even)[:, None])
+    short = Demonstration(even[:201], np.sin(even[:201])[:, None])
+    with pytest.raises(DataError, match="4 s is too short for a reference of 10 s: within max"):
+        DynamicTimeWarping(0, open_end=True).fit([long, short])
+    DynamicTimeWarping(0, open_end=True, max_slope=3).fit([long, short])

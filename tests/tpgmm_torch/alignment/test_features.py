@@ -9,6 +9,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.alignment.features import AlignmentFeatures, quaternion_columns
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import (
     DataError,
     ShapeError,
@@ -19,7 +20,7 @@ from tpgmm_torch.robots.tracked_poses import Poses
 
 def test_features_are_named_and_constant_ones_left_out():
     transformer = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
-    assert transformer.feature_names_ == ("joints", "directions", "elbow", "hand")
+    assert transformer.feature_names_ == ("speed", "joints", "elbow", "hand")
     chosen = ["hand in bottle", "joints"]
     transformer = DynamicTimeWarping(0, features=chosen, robot=Arm()).fit(DEMONSTRATIONS[:2])
     assert transformer.feature_names_ == tuple(chosen)
@@ -63,10 +64,12 @@ def test_a_group_has_the_square_of_its_weight_as_variance(name):
     assert variance([features(one) for one in family]) == pytest.approx(2.5**2)
 
 
-def test_usual_weights_are_three_for_the_directions_and_one_for_all_others():
+def test_speed_and_directions_weigh_more_than_all_others_together():
     family = DEMONSTRATIONS[:3]
-    features = AlignmentFeatures.fit(family, Arm())
-    assert features.names == ("joints", "directions", "elbow", "hand")
+    assert AlignmentFeatures.fit(family).names == ("speed", "joints")
+    names = ["speed", "joints", "directions", "elbow", "hand"]
+    features = AlignmentFeatures.fit(family, Arm(), names)
+    assert features.names == tuple(names)
     assert list(features.scales) == list(features.columns) == list(features.names)
     by_group = {
         name: features.scales[name]
@@ -74,10 +77,10 @@ def test_usual_weights_are_three_for_the_directions_and_one_for_all_others():
         for name in features.names
     }
     other = 3**-0.5
-    expected = {"joints": other, "directions": 3.0, "elbow": other, "hand": other}
+    expected = {"speed": 5.0, "joints": other, "directions": 4.5, "elbow": other, "hand": other}
     assert by_group == pytest.approx(expected)
     alone = AlignmentFeatures.fit(family, None, ["directions"])
-    assert variance([alone(one) for one in family]) == pytest.approx(9.0)
+    assert variance([alone(one) for one in family]) == pytest.approx(4.5**2)
 
 
 def test_features_are_what_they_are_called():
@@ -166,7 +169,49 @@ def test_what_is_no_feature_or_weight_is_refused(names, weights, error, message)
 
 def test_a_weight_of_nothing_leaves_a_group_out():
     features = AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, None, {"joints": 0})
-    assert features.names == ("directions",)
+    assert features.names == ("speed",)
+
+
+@pytest.mark.parametrize(
+    "names, left",
+    [
+        (None, ("directions",)),
+        (["directions"], ("speed", "joints", "elbow", "hand")),
+        (["hand in bottle"], ("speed", "joints", "directions", "elbow", "hand")),
+    ],
+)
+def test_the_others_are_what_is_not_used(names, left):
+    family = DEMONSTRATIONS[:2]
+    features = AlignmentFeatures.fit(family, Arm(), names)
+    assert AlignmentFeatures.others(family, features).names == left
+    everything = AlignmentFeatures.fit(family, None, ["joints", "speed", "directions"])
+    assert AlignmentFeatures.others(family, everything) is None
+    # of what never changes in any other way than the features do, nothing is left
+    still = [
+        Demonstration(d.time, torch.zeros_like(d.joints), {"bottle": Frame(d.joints[:, :3])})
+        for d in family
+    ]
+    seen = AlignmentFeatures.fit(still, Arm(), ["hand in bottle"])
+    assert AlignmentFeatures.others(still, seen) is None
+
+
+def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():
+    time = np.linspace(0, 4, 401)
+    way = np.interp(time, [0, 1, 2, 4], [0, 1, 1, 0])  # 1 rad/s, a rest, 0.5 rad/s
+    usual = np.sqrt((1 + 0 + 0.25 + 0.25) / 4)
+    for scale in (1.0, 100.0):
+        moving = Demonstration(time, scale * np.outer(way, [0.6, 0.8]))
+        [speed] = unscaled([moving], "speed")
+        assert speed.shape == (401, 1)
+        speed = speed[:, 0] / np.sqrt((speed**2).mean())
+        np.testing.assert_allclose(
+            speed[[50, 150, 300]], np.array([1, 0, 0.5]) / usual, atol=0.02
+        )
+    # the elbow of the arm stands still, and no rounding is blown up
+    joints = np.zeros((401, 5))
+    joints[:, 4] = way
+    names = AlignmentFeatures.fit([Demonstration(time, joints)], Arm(), ["speed", "elbow"])
+    assert names.columns["speed"].tolist() == [False, True]
 
 
 def test_each_quaternion_has_four_columns_wherever_it_stands():

@@ -1,5 +1,7 @@
 """The warping of sequences, against dynamic programming written out."""
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,29 +18,45 @@ from tpgmm_torch.alignment.warping_paths import (
 )
 
 
-def written_out(a, b, window, penalty, open_end):
-    costs = np.full((len(a) + 1, len(b) + 1), np.inf)
-    costs[0, 0] = 0
-    for i, x in enumerate(a, 1):
-        for j, y in enumerate(b, 1):
-            if window is None or abs(i - j) <= window:
-                before = (costs[i - 1, j] + penalty**2, costs[i, j - 1] + penalty**2)
-                costs[i, j] = ((x - y) ** 2).sum() + min(costs[i - 1, j - 1], *before)
-    return costs[-1, 1:].min() if open_end else costs[-1, -1]
+def written_out(a, b, window, penalty, open_end, max_slope=2):
+    """The cost of the cheapest path, by a recursion over its segments."""
+    n, m = len(a), len(b)
+    segments = {(1, k) for k in range(1, max_slope + 1)} | {
+        (k, 1) for k in range(1, max_slope + 1)
+    }
+
+    def local(i, j):
+        if i < 0 or j < 0 or (window is not None and abs(i - j) > window):
+            return np.inf
+        return ((a[i] - b[j]) ** 2).sum()
+
+    costs = {(-1, -1): 0.0}
+    for i in range(n):
+        for j in range(m):
+            costs[i, j] = min(
+                costs.get((i - p, j - q), np.inf)
+                + sum(local(i - min(k, p - 1), j - min(k, q - 1)) for k in range(max(p, q)))
+                + (max(p, q) - 1) * penalty**2
+                for p, q in segments
+            )
+    return min(costs[n - 1, j] for j in (range(m) if open_end else [m - 1]))
 
 
 @given(
     seed=st.integers(0, 2**32 - 1),
-    lengths=st.tuples(st.integers(1, 20), st.integers(1, 20)),
-    window=st.none() | st.integers(0, 12),
+    lengths=st.tuples(st.integers(1, 12), st.integers(1, 12)),
+    window=st.none() | st.integers(0, 8),
     penalty=st.sampled_from([0.0, 0.5, 2.0]),
     open_end=st.booleans(),
+    max_slope=st.integers(1, 4),
 )
-def test_the_path_is_optimal_and_inside_the_window(seed, lengths, window, penalty, open_end):
+def test_the_path_is_optimal_inside_the_window_and_the_slopes(
+    seed, lengths, window, penalty, open_end, max_slope
+):
     rng = np.random.default_rng(seed)
     a, b = (rng.standard_normal((n, 2)).cumsum(axis=0) for n in lengths)
-    path, cost = warping_path(a, b, window, penalty, open_end)
-    assert cost == pytest.approx(written_out(a, b, window, penalty, open_end))
+    path, cost = warping_path(a, b, window, penalty, open_end, max_slope)
+    assert cost == pytest.approx(written_out(a, b, window, penalty, open_end, max_slope))
     if np.isinf(cost):
         assert len(path) == 0
         return
@@ -49,16 +67,37 @@ def test_the_path_is_optimal_and_inside_the_window(seed, lengths, window, penalt
     assert path[0].tolist() == [0, 0] and path[-1, 0] == len(a) - 1
     assert open_end or path[-1, 1] == len(b) - 1
     assert window is None or np.abs(path[:, 0] - path[:, 1]).max() <= window
+    # what stands still in one sequence does so for less than max_slope steps
+    for stands in (steps[:, 0] == 0, steps[:, 1] == 0):
+        runs = np.diff(np.flatnonzero(np.concatenate(([True], ~stands, [True]))))
+        assert runs.max() - 1 < max_slope
 
 
-@pytest.mark.parametrize("window", [4, 9])
-def test_the_window_is_right_where_dtaidistance_misplaces_costs(window):
-    rng = np.random.default_rng(window)
-    length = 2 * (window + 1)
-    a, b = rng.standard_normal((2, length, 2)).cumsum(axis=1)
-    for n in range(1, length):
-        _, cost = warping_path(a[:n], b, window, open_end=True)
-        assert cost == pytest.approx(written_out(a[:n], b, window, 0.0, True))
+@given(seed=st.integers(0, 2**32 - 1), max_slope=st.integers(1, 5))
+def test_no_part_of_a_path_is_steeper_or_flatter_than_allowed(seed, max_slope):
+    a, b = np.random.default_rng(seed).standard_normal((2, 60, 1)).cumsum(axis=1)
+    path, _ = warping_path(a, b, max_slope=max_slope)
+    for early, late in itertools.combinations(path[::7], 2):
+        i, j = late - early
+        assert i <= max_slope * (j + 2) and j <= max_slope * (i + 2)
+
+
+def test_a_path_without_a_bound_in_effect_is_that_of_dynamic_time_warping():
+    rng = np.random.default_rng(1)
+    a, b = (rng.standard_normal((n, 2)).cumsum(axis=0) for n in (15, 11))
+    costs = np.full((16, 12), np.inf)
+    costs[0, 0] = 0
+    for i, x in enumerate(a, 1):
+        for j, y in enumerate(b, 1):
+            before = (costs[i - 1, j] + 0.25, costs[i, j - 1] + 0.25, costs[i - 1, j - 1])
+            costs[i, j] = ((x - y) ** 2).sum() + min(before)
+    assert warping_path(a, b, penalty=0.5, max_slope=15)[1] == pytest.approx(costs[-1, -1])
+
+
+def test_a_slope_of_one_is_the_diagonal():
+    a, b = np.random.default_rng(2).standard_normal((2, 9, 1))
+    path, _ = warping_path(a, b, max_slope=1)
+    assert path.tolist() == [[i, i] for i in range(9)]
 
 
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 60), width=st.integers(0, 80))

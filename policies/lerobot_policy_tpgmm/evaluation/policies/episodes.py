@@ -89,9 +89,9 @@ class Episodes:
     def on_common_clock(self, *others: Episodes) -> tuple[Episodes, ...]:
         """These and other episodes, warped in time onto the most typical of these.
 
-        The warping is TP-GMM's own: on how the joint references move.
+        The warping is TP-GMM's own: on how fast the joint references move, and where.
         """
-        warping = DynamicTimeWarping(features=["directions"])
+        warping = DynamicTimeWarping()
         aligned = [warping.fit_transform(self._demonstrations())]
         aligned += [warping.transform(other._demonstrations()) for other in others]
         n, *_ = self.widths
