@@ -158,6 +158,7 @@ def test_g1_grasps_an_unseen_bottle_an_order_better_than_both_baselines(example)
 
 
 @needs_recordings
+@pytest.mark.filterwarnings("ignore:.*are unlike the others and were not learned from")
 def test_g1_approaches_better_if_the_start_of_the_hand_is_a_frame(example):
     recording = example.load_g1(DATA / "g1_bottle")
     models = {name: recording.models[name] for name in ("TP-GMM", "TP-GMM, start")}
