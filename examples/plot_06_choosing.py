@@ -92,11 +92,11 @@ bic = [
 # %%
 # Neither the room nor the tray explains the whole motion: only a model that looks at both
 # comes within 25 mm. More Gaussians help up to about K = 12; beyond they cost time and gain
-# next to nothing. BIC says the same without any reproduction.
+# next to nothing. BIC, without any reproduction, finds eight and twelve equally good.
 #
 # If all that matters is that the hand takes what is on the tray, eight are enough, and they
-# are within 4 mm where the whole path is off by 23; the tray alone does as well, though it
-# is off by 92 along the path. With four the path already looks fair, and the hand misses by 21.
+# are within 4 mm where the whole path is off by 20; the tray alone does as well, though it
+# is off by 92 along the path. With four the path already looks fair, and the hand misses by 23.
 
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
 errors, misses = {name: [] for name in sets}, {name: [] for name in sets}

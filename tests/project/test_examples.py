@@ -50,7 +50,8 @@ CLAIMS = {
             and v["errors"]["room and tray"][3] < 25
             and min(v["errors"]["room"] + v["errors"]["tray"]) > 75
             and v["errors"]["room and tray"][4] > 0.9 * v["errors"]["room and tray"][3]
-            and bool((np.diff(v["bic"])[:3] < 0).all())
+            and bool((np.diff(v["bic"])[:2] < 0).all())
+            and abs(v["bic"][3] / v["bic"][2] - 1) < 0.01
             and max(v["misses"]["room and tray"][2:] + v["misses"]["tray"][2:]) < 4
             and v["misses"]["room and tray"][1] > 15
             and v["errors"]["tray"][4] > 90

@@ -60,6 +60,10 @@ PATIENCE = 0.05
 RETURNING = 0.9
 #: So far behind the time a robot may be, beyond its lag [s]; twice, and time stands still.
 GRACE = 0.2
+#: A robot that moves by less has not moved [rad or m].
+STILL = 0.01
+#: Below that share of its speed, time stands.
+STANDS = 0.05
 #: The most that time hurries, in units of its speed.
 HURRY = 2.0
 
@@ -404,7 +408,8 @@ class LocalizingClock(WaitingClock):
 
     Time waits for a robot that is behind, hurries after one that is ahead, and moves to where
     a robot is that was brought to another place: :attr:`Progress.relocalized` says so. Where
-    no place explains what is observed, time waits.
+    no place explains what is observed, time waits. A robot that was stopped in a pause of the
+    skill is missed late: when it moves again, time goes back to when it came to rest.
 
     Parameters
     ----------
@@ -459,6 +464,10 @@ class LocalizingClock(WaitingClock):
             place=waiting.now,
             sure=waiting.error,
             moved=no,
+            rest=waiting.expected,
+            rested=waiting.now,
+            stalled=no,
+            returned=waiting.now - math.inf,
         )
         return progress.located(frames) if self.initial == "anywhere" else progress
 
@@ -494,6 +503,14 @@ class LocalizingProgress(WaitingProgress):
         For how long that has been another place than the present one [s].
     moved : bool array of shape (...)
         See :attr:`Progress.relocalized`.
+    rest : array of shape (..., n_joints)
+        The posture that a robot has not left since.
+    rested : array of shape (...)
+        The time when it came there [s].
+    stalled : bool array of shape (...)
+        Robots that were waited for meanwhile.
+    returned : array of shape (...)
+        Where time has gone back to last, which it does once [s].
     """
 
     localizer: Localizer
@@ -508,6 +525,10 @@ class LocalizingProgress(WaitingProgress):
     place: Array
     sure: Array
     moved: Flags
+    rest: Array
+    rested: Array
+    stalled: Flags
+    returned: Array
 
     @property
     def relocalized(self) -> Tensor:
@@ -528,21 +549,63 @@ class LocalizingProgress(WaitingProgress):
         since = self.since + (_array(dt) if isinstance(dt, Tensor) else dt)
         due = since > (1 - 1e-6) * self.localizer.step
         new["since"] = np.where(due, 0.0, since)
+        left = np.abs(measured - self.rest).max(-1) > STILL
+        no = np.zeros_like(self.moved)
+        stood = {
+            "rest": np.where(left[..., None], measured, self.rest),
+            "rested": np.where(left, now, self.rested),
+        }
         if not (astray | self.localized).any():
-            return replace(self, **new, before=now, reached=now, stood=measured)
+            return replace(
+                self,
+                **new,
+                **stood,
+                before=now,
+                reached=now,
+                stood=measured,
+                stalled=no,
+                moved=no,
+            )
+        back = left & self.stalled & (now > self.rested + GRACE)
+        back &= np.abs(self.rested - self.returned) > JUMP
+        if back.any():
+            return self._gone_back(replace(self, **new, **stood), back)
         went = replace(
             self,
             **new,
+            **stood,
+            stalled=(self.stalled | (new["rate"] < STANDS)) & astray & ~left,
             before=np.where(due | ~astray, now, self.before),
             reached=np.where(astray, self.reached, now),
             stood=np.where(astray[..., None], self.stood, measured),
             strayed=np.where(due, new["error"], self.strayed),
             localized=self.localized & astray,
             sure=np.where(astray, self.sure, 0.0),
-            moved=np.zeros_like(self.moved),
+            moved=no,
         )
         rows = due & astray
         return self._corrected(went, rows, since, observation) if rows.any() else went
+
+    def _gone_back(self, went: Self, back: Flags) -> Self:
+        """Robots that were stopped and are let go do again what they have not done."""
+        then = np.where(back, self.rested, went.now)
+        joints = np.where(back[..., None], went.measured, went.expected)
+        return replace(
+            went,
+            now=then,
+            before=then,
+            reached=np.where(back, then, went.reached),
+            place=np.where(back, then, went.place),
+            rested=np.where(back, then, went.rested),
+            returned=np.where(back, then, went.returned),
+            stood=np.where(back[..., None], went.measured, went.stood),
+            expected=joints,
+            rate=np.where(back, 0.0, went.rate),
+            sure=np.where(back, 0.0, went.sure),
+            localized=went.localized & ~back,
+            stalled=went.stalled & ~back,
+            moved=back,
+        )
 
     def _rate(self, following: Array) -> Array:
         """Behind the time, it waits for the robot; ahead of it, it hurries after the robot."""

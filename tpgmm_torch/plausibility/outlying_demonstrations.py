@@ -18,7 +18,7 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plausibility.findings import Finding, listed
-from tpgmm_torch.plausibility.outliers import CONSISTENT, FAR
+from tpgmm_torch.plausibility.outliers import CONSISTENT
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.training_rows import typical_time
@@ -31,8 +31,9 @@ FEWEST = 5
 NEAR = 0.02
 #: and an angle [rad].
 NEAR_ANGLE = 0.05
-#: It has to be unlike them for so long [s].
-LONG = 0.2
+#: So many robust standard deviations from the median are unlike the others (at most 5 of those
+#: who are not, on real recordings), where they last for so long [s].
+UNLIKE, LONG = 7.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ def outlying_demonstrations(
     """Demonstrations far from the median of all, at instants at which the others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
-    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than six
-    times 1.4826 times the median distance from the median, for 0.2 s in all. Where the others
+    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than seven
+    times 1.4826 times the median distance from the median, for a second in all. Where the others
     agree to less than 2 % of the range of an operator's coordinates, or 0.05 rad, that counts
     as their distance.
 
@@ -101,7 +102,7 @@ def outlying_demonstrations(
         distance = torch.linalg.vector_norm(local - local.median(0).values, dim=-1)  # (M, T)
         usual = distance.median(0).values.clamp(min=near)
         ratios, instants = (distance / (CONSISTENT * usual)).topk(count, dim=1)
-        for episode in (ratios[:, -1] > FAR).nonzero()[:, 0].tolist():
+        for episode in (ratios[:, -1] > UNLIKE).nonzero()[:, 0].tolist():
             ratio, instant = float(ratios[episode, -1]), int(instants[episode, -1])
             if episode not in found or ratio > found[episode].ratio:
                 found[episode] = Outlying(episode, operator, float(time[instant]), ratio)
