@@ -80,7 +80,8 @@ def view(
     """Look at a motion in three dimensions.
 
     Writes one HTML file that needs nothing else: the robot from its URDF, frames, demonstrated
-    and reproduced paths, ellipsoids of two standard deviations along the path, a time line.
+    and reproduced paths, ellipsoids of two standard deviations along the path, a time line,
+    curves of stiffness and of each operator's share.
     """
     import torch
 

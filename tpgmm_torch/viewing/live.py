@@ -16,11 +16,14 @@ import numpy as np
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.viewing.curves import Panel, motion_panels
 from tpgmm_torch.viewing.recording import viser_server
 from tpgmm_torch.viewing.scene import MotionScene
 
 __all__ = ["LiveView"]
 
+#: Of each panel of curves [pixels].
+PLOT_HEIGHT = 160
 SPEEDS = ("0.25", "0.5", "1", "2", "4")
 
 
@@ -28,7 +31,8 @@ class LiveView:
     """Serve motions to a browser; a context manager.
 
     The page has a time line, a choice of situations, and a handle on every object that stands
-    still: where it is let go, the skill is reproduced again.
+    still: where it is let go, the skill is reproduced again. Beside it are the stiffness that
+    is asked for and each operator's share over time.
 
     Parameters
     ----------
@@ -54,6 +58,8 @@ class LiveView:
     scene : MotionScene
     situation : Situation
         What is shown, and where the objects are in it by now.
+    plots : list of viser.GuiUplotHandle
+        Stiffness and shares, :func:`~tpgmm_torch.viewing.curves.motion_panels`.
     clock : float
         The instant that is shown, from the start of the motion [s].
 
@@ -75,8 +81,9 @@ class LiveView:
         host: str = "127.0.0.1",
         port: int = 8080,
     ) -> None:
-        self._situations, self._fps = list(situations), fps
+        self._model, self._situations, self._fps = model, list(situations), fps
         self.clock = 0.0
+        self.plots: list[Any] = []
         self._lock = threading.RLock()
         with ExitStack() as stack:
             server = stack.enter_context(viser_server(host, port))
@@ -121,6 +128,7 @@ class LiveView:
         with self._lock:
             self.situation = situation
             self.trajectory = self.scene.show(situation)
+            self._plot(motion_panels(self._model, self.trajectory))
             self._slider.max = max(float(np.ptp(self.scene.time)), 0.01)
             self._move_to(self.clock)
 
@@ -132,6 +140,15 @@ class LiveView:
             at = int(np.searchsorted(instants, self.clock))
             self.scene.move_to(min(at, len(instants) - 1))
             self._slider.value = round(self.clock, 2)
+
+    def _plot(self, panels: Sequence[Panel]) -> None:
+        """Draw the curves, in place of those before."""
+        drawn = [_plot_options(panel) for panel in panels]
+        if not self.plots:
+            gui = self.scene.server.gui
+            self.plots = [gui.add_uplot(height=PLOT_HEIGHT, **options) for options in drawn]
+        for plot, options in zip(self.plots, drawn, strict=True):
+            plot.scales, plot.data = options["scales"], options["data"]
 
     def _add_controls(self, gui: Any, first: int) -> None:
         self._play = gui.add_checkbox("play", True)
@@ -148,3 +165,15 @@ class LiveView:
         if event.client is not None:  # moved by hand, not by the clock
             self._play.value = False
             self._move_to(event.target.value)
+
+
+def _plot_options(panel: Panel) -> dict[str, Any]:
+    """A panel as viser's plots have it."""
+    lines = [{"label": c.label, "stroke": c.color, "width": 1.5} for c in panel.curves]
+    return {
+        "title": panel.title,
+        "data": (panel.time, *(curve.values for curve in panel.curves)),
+        "series": ({"label": "time [s]"}, *lines),
+        "padding": (12, 24, 0, 0),
+        "scales": {"x": {"time": False}, "y": {"range": (0.0, panel.top)}},
+    }

@@ -16,12 +16,28 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.viewing.curves import as_html, motion_panels
 from tpgmm_torch.viewing.scene import COLORS, STANDARD_DEVIATIONS, MotionScene
 
 __all__ = ["viser_server", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
+#: The page is light in any browser. On a narrow one the curves go above the legend.
+STYLE = """
+#legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
+display:flex;flex-wrap:wrap-reverse;justify-content:space-between;align-items:end;gap:.5em;
+font:14px sans-serif;color:#333}
+#legend>*{background:rgba(255,255,255,.9);padding:.5em;box-sizing:border-box;max-width:100%}
+#curves{width:24em;font-size:12px;overflow-wrap:anywhere}
+#curves summary{pointer-events:auto;cursor:pointer}
+#curves .row{display:flex;justify-content:space-between;gap:1em}
+#curves .row :last-child{white-space:nowrap}
+#curves svg{display:block;width:100%;height:3.5em;overflow:visible;
+border-bottom:1px solid currentColor}
+#curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
+#curves line{stroke:currentColor;stroke-width:1}
+"""
 
 
 def write_motion(
@@ -35,6 +51,8 @@ def write_motion(
     title: str = "tpgmm",
 ) -> Trajectory:
     """Write a reproduction as an HTML file with a time line, which needs nothing else.
+
+    Beside the scene are the stiffness that is asked for and each operator's share over time.
 
     Parameters
     ----------
@@ -65,8 +83,10 @@ def write_motion(
             scene.move_to(picture)
             recording.insert_sleep(float(pause))
         page = recording.as_html()
+    curves = as_html(motion_panels(model, trajectory))
+    legend = _legend(title, bool(demonstrations), curves)
     with replacing(path) as new:
-        new.write_text(_entitled(page, title, bool(demonstrations)), encoding="utf-8")
+        new.write_text(_entitled(page, title, legend), encoding="utf-8")
     return trajectory
 
 
@@ -99,8 +119,15 @@ def _quiet() -> Any:
     return redirect_stdout(io.StringIO())
 
 
-def _entitled(page: str, title: str, with_demonstrations: bool) -> str:
-    """The page with a title, and a legend in a corner."""
+def _entitled(page: str, title: str, beside: str) -> str:
+    """The page with a title, and what stands beside the scene."""
+    before, body, after = page.rpartition("</body>")
+    page = before + beside + body + after
+    return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
+
+
+def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
+    """What the colours mean, and the curves, along the lower edge."""
     entries = {
         "reproduction": "reproduction",
         "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
@@ -111,12 +138,7 @@ def _entitled(page: str, title: str, with_demonstrations: bool) -> str:
         f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
         for kind, text in entries.items()
     )
-    legend = (
-        '<div id="legend" style="position:fixed;left:1em;bottom:4em;z-index:10;'
-        "pointer-events:none;font:14px sans-serif;color:#333;"
-        'background:rgba(255,255,255,.8);padding:.5em">'
-        f"<b>{html.escape(title)}</b>{lines}</div>"
+    return (
+        f'<style>{STYLE}</style><div id="legend">'
+        f"<div><b>{html.escape(title)}</b>{lines}</div>{curves}</div>"
     )
-    before, body, after = page.rpartition("</body>")
-    page = before + legend + body + after
-    return page.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)

@@ -97,7 +97,7 @@ class MotionScene:
 
     def show(self, situation: Situation) -> Trajectory:
         """Reproduce the skill in a situation and draw it, in place of the one before."""
-        [trajectory] = self._model.predict([situation], candidates=False)
+        [trajectory] = self._model.predict([situation])
         steps = _steps(trajectory.time.cpu(), self._fps)
         state = self._body.state(trajectory.joints.cpu()[steps])
         covariance = trajectory.covariance.cpu().to(state.joints)[steps]

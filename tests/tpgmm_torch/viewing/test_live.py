@@ -23,6 +23,9 @@ def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
         view.move_frame("cup", cup)
         [expected] = model.predict([replace(situation, frames={"cup": cup})])
         torch.testing.assert_close(view.trajectory.joints, expected.joints)
+        [plot] = view.plots
+        for line, candidate in zip(plot.data[1:], expected.candidates, strict=True):
+            np.testing.assert_allclose(line, 100 * candidate.share.mean(-1))
         view.show(1)
         [expected] = model.predict([other])
         torch.testing.assert_close(view.trajectory.joints, expected.joints)

@@ -48,6 +48,12 @@ def test_the_page_opens_from_disk_draws_the_robot_and_plays(motion):
         clock = "Number(document.querySelector('input').value)"
         before = page.evaluate(clock)
         page.wait_for(f"{clock} != {before}")
+        # folded where there is little room; the marker goes with the time line
+        assert page.evaluate("document.getElementById('curves').open") is False
+        marker = (
+            "parseFloat(document.querySelector('.now').getAttribute('transform')?.slice(10))"
+        )
+        page.wait_for(f"{clock} > 0 && Math.abs({marker} - {clock}) < 0.5")
         assert page.evaluate("document.querySelectorAll('canvas').length") >= 1
         for word in ("reproduction", "demonstrations"):
             assert page.evaluate(f"document.body.innerText.includes({word!r})")

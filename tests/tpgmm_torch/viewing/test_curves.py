@@ -1,0 +1,77 @@
+"""Curves beside the scene: the numbers in the page are those of the model."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from tests.support import skills
+from tpgmm_torch import Impedance, Robot, Situation
+from tpgmm_torch.viewing.curves import motion_panels
+
+#: The joints of :func:`skills.waves`, of which the first slides.
+SLIDING_ARM = (
+    "<robot name='r'><link name='base'/>"
+    + "".join(
+        f"<link name='{name}'/><joint name='{name}' type='{kind}'><parent link='{parent}'/>"
+        f"<child link='{name}'/><axis xyz='0 0 1'/>"
+        "<limit lower='-9' upper='9' velocity='9' effort='9'/></joint>"
+        for name, parent, kind in (
+            ("a", "base", "prismatic"),
+            ("b", "a", "revolute"),
+            ("c", "b", "revolute"),
+        )
+    )
+    + "</robot>"
+)
+
+
+def polylines(page: str) -> list[np.ndarray]:
+    """Times and values of each drawn curve, (T, 2)."""
+    drawn = re.findall(r'<polyline [^>]*points="([^"]+)"', page)
+    return [np.array([point.split(",") for point in one.split()], float) for one in drawn]
+
+
+def test_the_page_draws_the_stiffness_that_is_asked_for_and_the_operators_shares(bottle):
+    recording, trajectory, _ = bottle
+    stiffness, *shares = polylines(recording.page)
+    for drawn in (stiffness, *shares):
+        np.testing.assert_allclose(drawn[:, 0], trajectory.time - trajectory.time[0], atol=1e-4)
+    matrix = Impedance(skills.small_bottle().kinematics_).joints.matrix(trajectory.covariance)
+    expected = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)
+    np.testing.assert_allclose(stiffness[:, 1], expected, rtol=1e-5)
+    assert expected.max() > 2 * expected.min()
+    for drawn, candidate in zip(shares, trajectory.candidates, strict=True):
+        np.testing.assert_allclose(drawn[:, 1], 100 * candidate.share.mean(-1), rtol=1e-5)
+    np.testing.assert_allclose(sum(shares)[:, 1], 100, rtol=1e-4)
+    for text in ("[N m/rad]", "position:l_hand@bottle + ", "> canonical<"):
+        assert recording.page.count(text) == 1
+
+
+def test_drawings_show_all_of_each_curve(bottle):
+    recording, _, _ = bottle
+    lines = polylines(recording.page)
+    boxes = re.findall(r'<svg viewBox="0 0 (\S+) (\S+)" preserveAspectRatio', recording.page)
+    (end, most), (same, hundred) = [tuple(map(float, box)) for box in boxes]
+    assert end == same == lines[0][-1, 0]
+    np.testing.assert_allclose((most, hundred), (lines[0][:, 1].max(), 100), rtol=1e-5)
+
+
+def test_tracked_poses_have_shares_but_no_stiffness():
+    model = skills.hands()
+    [trajectory] = model.predict([skills.new_handling()[0]])
+    [panel] = motion_panels(model, trajectory)
+    assert [curve.label.count("left") for curve in panel.curves] == [2, 2]
+
+
+def test_joints_that_slide_do_not_count_among_newton_metres_per_radian():
+    robot = Robot.from_urdf(SLIDING_ARM, links=["c"])
+    demonstrations = skills.waves()
+    model = skills.canonical(n_components=2, robot=robot).fit(demonstrations)
+    [trajectory] = model.predict([Situation.of(demonstrations[0])])
+    variances = torch.tensor([1e-8, 0.01, 0.01], dtype=torch.float64)
+    trajectory = replace(trajectory, covariance=variances.diag().expand(len(trajectory), 3, 3))
+    [stiffness, _] = motion_panels(model, trajectory)
+    [expected] = Impedance(robot).joints.matrix(variances[1:2].diag()).flatten()
+    np.testing.assert_allclose(stiffness.curves[0].values, expected)

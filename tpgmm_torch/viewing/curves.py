@@ -1,0 +1,164 @@
+"""Curves beside the scene: how stiff the joints are asked to be, and which operator decides."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+
+import numpy as np
+
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.trajectories import Trajectory
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.impedance.stiffness import Impedance
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["Curve", "Panel", "as_html", "motion_panels"]
+
+#: Of stiffness: the ellipsoids' colour, as both show the covariance.
+STIFFNESS = "#1f77b4"
+#: Of the operators; none is the reproduced path's or the ellipsoids'.
+OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
+
+# The time line's position is in the page's first input; without one there is no marker. On a
+# narrow page the curves would hide the robot: there they begin folded.
+FOLLOW = """
+(() => {
+  document.getElementById('curves').open = innerWidth >= 700;
+  const marks = document.querySelectorAll('#curves .now');
+  const follow = () => {
+    const clock = parseFloat(document.querySelector('input')?.value);
+    for (const mark of marks) {
+      mark.setAttribute('visibility', Number.isFinite(clock) ? 'visible' : 'hidden');
+      if (Number.isFinite(clock)) mark.setAttribute('transform', `translate(${clock})`);
+    }
+    requestAnimationFrame(follow);
+  };
+  follow();
+})();
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One quantity over time.
+
+    Parameters
+    ----------
+    label : str
+        Empty if the panel's title says it all.
+    color : str
+        As CSS has it.
+    values : ndarray of shape (T,)
+        Not negative.
+    """
+
+    label: str
+    color: str
+    values: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves over one time axis.
+
+    Parameters
+    ----------
+    title : str
+        What they show, with its unit.
+    time : ndarray of shape (T,)
+        Since the start of the motion [s].
+    curves : sequence of Curve
+        In one unit.
+    top : float
+        Where the vertical axis ends, which begins at 0.
+    """
+
+    title: str
+    time: Array
+    curves: Sequence[Curve]
+    top: float
+
+
+def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Panel]:
+    """Stiffness and the operators' shares, over time.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Fitted.
+    trajectory : Trajectory
+        What it reproduced, with candidates.
+
+    Returns
+    -------
+    list of Panel
+        The stiffness that ``Impedance(robot)`` gives the joints that turn, their mean; left
+        out where none does, as of tracked poses. The :attr:`Candidate.share` of each operator,
+        the mean of all joints.
+    """
+    time = as_array(trajectory.time - trajectory.time[0])
+    panels = []
+    if turning := _turning(model.kinematics_):
+        matrix = Impedance(model.kinematics_).joints.matrix(trajectory.covariance)
+        stiffness = as_array(matrix.diagonal(dim1=-2, dim2=-1)[:, turning].mean(-1))
+        title = "stiffness, mean of the joints [N m/rad]"
+        top = float(stiffness.max())
+        panels.append(Panel(title, time, [Curve("", STIFFNESS, stiffness)], top))
+    decided = zip(model.operators_, trajectory.candidates, strict=True)
+    shares = [
+        Curve(format_operator(operator), color, as_array(100 * candidate.share.mean(-1)))
+        for (operator, candidate), color in zip(decided, cycle(OPERATORS), strict=False)
+    ]
+    panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
+    return panels
+
+
+def _turning(kinematics: Kinematics) -> list[int]:
+    """Coordinates whose stiffness is in N m/rad."""
+    others = {*kinematics.lengths}
+    for start in kinematics.quaternion_starts:
+        others.update(range(start, start + 4))
+    return [joint for joint in range(kinematics.n_joints) if joint not in others]
+
+
+def as_html(panels: Sequence[Panel]) -> str:
+    """The panels as a part of a page, to be folded away; a marker follows the time line.
+
+    Drawings have seconds and the curves' own units for coordinates, upwards.
+    """
+    end = panels[0].time[-1]
+    drawn = "".join(map(_figure, panels))
+    return (
+        '<details id="curves" open><summary>curves over time</summary>'
+        f'{drawn}<div class="row"><span>0 s</span><span>{end:.1f} s</span></div></details>'
+        f"<script>{FOLLOW}</script>"
+    )
+
+
+def _figure(panel: Panel) -> str:
+    end, top = max(float(panel.time[-1]), 1e-3), panel.top
+    lines = "".join(
+        f'<polyline stroke="{curve.color}" points="{_points(panel.time, curve.values)}"/>'
+        for curve in panel.curves
+    )
+    names = "".join(
+        f'<div><span style="color:{curve.color}">&#9632;</span> '
+        f"{html.escape(curve.label)}</div>"
+        for curve in panel.curves
+        if curve.label
+    )
+    return (
+        f'<div class="row"><span>{html.escape(panel.title)}</span><span>{top:.0f}</span></div>'
+        f'<svg viewBox="0 0 {end:.6g} {top:.6g}" preserveAspectRatio="none">'
+        f'<g transform="translate(0 {top:.6g}) scale(1 -1)">{lines}'
+        f'<line class="now" y2="{top:.6g}" visibility="hidden"/></g></svg>{names}'
+    )
+
+
+def _points(time: Array, values: Array) -> str:
+    rows = np.column_stack((time, values))
+    return " ".join(f"{at:.6g},{value:.6g}" for at, value in rows)
