@@ -13,6 +13,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from tpgmm_torch.control.command import Command
+from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -32,7 +34,8 @@ class LiveView:
 
     The page has a time line, a choice of situations, and a handle on every object that stands
     still: where it is let go, the skill is reproduced again. Beside it are the stiffness that
-    is asked for and each operator's share over time.
+    is asked for and each operator's share over time. With "controller", a :class:`Controller`
+    leads the robot instead: objects can be moved meanwhile, and the robot be held.
 
     Parameters
     ----------
@@ -58,6 +61,8 @@ class LiveView:
     scene : MotionScene
     situation : Situation
         What is shown, and where the objects are in it by now.
+    command : Command or None
+        What the controller sent last, if one leads.
     plots : list of viser.GuiUplotHandle
         Stiffness and shares, :func:`~tpgmm_torch.viewing.curves.motion_panels`.
     clock : float
@@ -84,6 +89,9 @@ class LiveView:
         self._model, self._situations, self._fps = model, list(situations), fps
         self.clock = 0.0
         self.plots: list[Any] = []
+        self.command: Command | None = None
+        self._controller: Controller | None = None
+        self._posture = self._situations[first].joints
         self._lock = threading.RLock()
         with ExitStack() as stack:
             server = stack.enter_context(viser_server(host, port))
@@ -105,7 +113,10 @@ class LiveView:
 
     def show(self, index: int) -> None:
         """Show the situation of that ``index``."""
-        self._reproduce(self._situations[index])
+        with self._lock:
+            self._reproduce(self._situations[index])
+            if self._controller is not None:
+                self.start_controller()
 
     def move_frame(self, name: str, frame: Frame) -> None:
         """Put an object elsewhere in the situation that is shown, and reproduce again."""
@@ -121,8 +132,48 @@ class LiveView:
             time.sleep(1 / self._fps)
             now = time.monotonic()
             if self._play.value:
-                self._move_to(self.clock + (now - last) * float(self._speed.value))
+                self.step((now - last) * float(self._speed.value))
             last = now
+
+    def step(self, seconds: float) -> None:
+        """Go on by so many ``seconds``, along the time line or with the controller."""
+        with self._lock:
+            if self._controller is None:
+                self._move_to(self.clock + seconds)
+                return
+            self.command = self._controller.step(seconds, self._posture, self._frames_now())
+            if not self._hold.value:
+                self._posture = self.command.reference
+            reason = self.command.reason()
+            self._status.value = self.command.status + (f": {reason}" if reason else "")
+            self.clock = float(self.command.time - self.trajectory.time[0])
+            self.scene.move_robot(self._posture, self._picture())
+            self._slider.value = round(self.clock, 2)
+
+    def start_controller(self) -> None:
+        """Let a controller lead the robot, from the skill's start."""
+        with self._lock:
+            self.clock, self._posture = 0.0, self.situation.joints
+            self._controller = self._model.controller(self._posture, self._frames_now())
+            self._run.value = True
+
+    def stop_controller(self) -> None:
+        """Go back to the reproduction and its time line."""
+        with self._lock:
+            self._controller = self.command = None
+            self._run.value, self._status.value = False, ""
+            self._move_to(self.clock)
+
+    def _frames_now(self) -> dict[str, Frame]:
+        """Poses of the model's objects at the instant that is shown."""
+        time = self.trajectory.time
+        at = min(int((time - time[0] < self.clock).sum()), len(time) - 1)
+        frames = self.situation.frames_at(time)
+        return {
+            name: frames[name][at] if frames[name].batch_shape else frames[name]
+            for name in self._model.frame_names_
+            if name in frames
+        }
 
     def _reproduce(self, situation: Situation) -> None:
         with self._lock:
@@ -130,16 +181,20 @@ class LiveView:
             self.trajectory = self.scene.show(situation)
             self._plot(motion_panels(self._model, self.trajectory))
             self._slider.max = max(float(np.ptp(self.scene.time)), 0.01)
-            self._move_to(self.clock)
+            if self._controller is None:
+                self._move_to(self.clock)
 
     def _move_to(self, clock: float) -> None:
         """Show an instant, in seconds since the start; after the end that is the start."""
         with self._lock:
-            instants = self.scene.time - self.scene.time[0]
-            self.clock = clock if clock <= instants[-1] else 0.0
-            at = int(np.searchsorted(instants, self.clock))
-            self.scene.move_to(min(at, len(instants) - 1))
+            self.clock = clock if clock <= np.ptp(self.scene.time) else 0.0
+            self.scene.move_to(self._picture())
             self._slider.value = round(self.clock, 2)
+
+    def _picture(self) -> int:
+        """Which picture of the scene is of the instant that is shown."""
+        instants = self.scene.time - self.scene.time[0]
+        return min(int(np.searchsorted(instants, self.clock)), len(instants) - 1)
 
     def _plot(self, panels: Sequence[Panel]) -> None:
         """Draw the curves, in place of those before."""
@@ -155,7 +210,12 @@ class LiveView:
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
 
+        self._run = gui.add_checkbox("controller", False)
+        self._hold = gui.add_checkbox("hold the robot", False)
+        self._status = gui.add_text("status", "", disabled=True)
+
         self._slider.on_update(self._slid)
+        self._run.on_update(self._switched)
         if len(self._situations) > 1:
             numbers = [str(index) for index in range(len(self._situations))]
             chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])
@@ -164,7 +224,12 @@ class LiveView:
     def _slid(self, event: Any) -> None:
         if event.client is not None:  # moved by hand, not by the clock
             self._play.value = False
-            self._move_to(event.target.value)
+            self.clock = event.target.value
+            self.stop_controller()
+
+    def _switched(self, event: Any) -> None:
+        if event.client is not None:
+            (self.start_controller if event.target.value else self.stop_controller)()
 
 
 def _plot_options(panel: Panel) -> dict[str, Any]:

@@ -119,8 +119,20 @@ class MotionScene:
 
     def move_to(self, picture: int) -> None:
         """Put everything that moves where it is at ``time[picture]``."""
-        for handle, pose in zip(self._links, self._link_poses[picture], strict=True):
+        self._place_links(self._link_poses[picture])
+        self._move_frames(picture)
+
+    def move_robot(self, joints: Tensor, picture: int) -> None:
+        """Put the robot at ``joints`` (n_joints,) instead, and objects as at a picture."""
+        state = self._body.state(joints.cpu())
+        self._place_links(_poses(state.positions, state.orientations))
+        self._move_frames(picture)
+
+    def _place_links(self, poses: Array) -> None:
+        for handle, pose in zip(self._links, poses, strict=True):
             _place(handle, pose)
+
+    def _move_frames(self, picture: int) -> None:
         for name, poses in self._frame_poses.items():
             if len(poses) > 1:
                 _place(self.frames[name], poses[picture])

@@ -36,6 +36,36 @@ def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
     assert capsys.readouterr().out == ""
 
 
+def test_live_a_controller_leads_the_robot_to_an_object_that_is_moved_meanwhile():
+    demonstration = skills.few_bottles()[1]
+    situation = Situation(demonstration.joints[0], demonstration.frames)
+    model = skills.small_bottle()
+    with LiveView(model, [situation], port=0) as view:
+        untouched = model.controller(situation.joints, situation.frames)
+        view.start_controller()
+        for _ in range(20):
+            view.step(0.05)
+            expected = untouched.step(0.05, untouched.reference, situation.frames)
+        torch.testing.assert_close(view.command.reference, expected.reference)
+        assert view.command.status == "running"
+        assert view.clock == float(view.command.time) > 0.5
+        bottle = situation.frames["bottle"]
+        view.move_frame("bottle", Frame(bottle.position + 0.05, bottle.orientation))
+        for _ in range(30):
+            view.step(0.05)
+            expected = untouched.step(0.05, untouched.reference, situation.frames)
+        assert float((view.command.reference - expected.reference).abs().max()) > 0.02
+        at, view._hold.value = view.clock, True
+        for _ in range(40):
+            view.step(0.05)
+        assert view.clock - at < 1.5  # the skill waits for the robot
+        at = view.clock
+        view.stop_controller()
+        assert view.command is None
+        view.step(0.05)
+        assert view.clock > at
+
+
 def seen_at(page, camera, point) -> np.ndarray:
     """The pixel at which a point of the scene is seen, (2,)."""
     left, top, width, height = page.evaluate(
