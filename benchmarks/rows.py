@@ -65,8 +65,10 @@ class Row:
 
     @property
     def ratio(self) -> float | None:
-        """How many times our figure theirs is."""
-        return None if self.theirs is None else self.theirs / self.ours
+        """How many times our figure theirs is; None where one of them is not known."""
+        if self.theirs is None or self.ours <= 0:  # a difference of times within their noise
+            return None
+        return self.theirs / self.ours
 
     @property
     def reached(self) -> bool | None:

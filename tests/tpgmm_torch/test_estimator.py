@@ -1187,7 +1187,7 @@ def starting():
     """A model in which where the hand started matters, and a demonstration of it."""
     shown = [started(one) for one in few_bottles()]
     operators = [pose("l_hand", "bottle"), pose("l_hand", "start"), Canonical()]
-    model = TaskParameterizedGMM(4, operators, upper_body(), random_state=0, max_iter=5)
+    model = TaskParameterizedGMM(4, operators, upper_body(), random_state=0)
     return model.fit(shown), shown[1]
 
 

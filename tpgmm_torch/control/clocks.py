@@ -44,6 +44,8 @@ RESTART = 0.2
 INITIAL = ("beginning", "anywhere")
 #: So many places may explain the start posture.
 CANDIDATES = 5
+#: A skill that might begin there may as well begin at its beginning [s].
+SOON = 0.5
 #: Standard deviation of the time of robots that follow [s].
 WIDTH = 0.1
 #: Observations per second that are worth one by themselves: those between see the same.
@@ -62,6 +64,8 @@ RETURNING = 0.9
 GRACE = 0.2
 #: A robot that moves by less has not moved [rad or m].
 STILL = 0.01
+#: A robot is missed late if time goes on for longer after it has come to rest [s].
+PAUSE = 1.0
 #: Below that share of its speed, time stands.
 STANDS = 0.05
 #: The most that time hurries, in units of its speed.
@@ -417,7 +421,8 @@ class LocalizingClock(WaitingClock):
         See :class:`WaitingClock`.
     initial : {"beginning", "anywhere"}, default="beginning"
         Where in the skill robots are believed to be at its start. With ``"anywhere"`` that is
-        the place which explains the start posture best; the beginning if none does.
+        the place which explains the start posture best; the beginning if none does, or if it
+        explains it too and is not far from there.
 
     Raises
     ------
@@ -566,7 +571,7 @@ class LocalizingProgress(WaitingProgress):
                 stalled=no,
                 moved=no,
             )
-        back = left & self.stalled & (now > self.rested + GRACE)
+        back = left & self.stalled & (now > self.rested + PAUSE)
         back &= np.abs(self.rested - self.returned) > JUMP
         if back.any():
             return self._gone_back(replace(self, **new, **stood), back)
@@ -709,7 +714,8 @@ class LocalizingProgress(WaitingProgress):
         measured = self.measured[rows]
         look = self._look(rows, frames)
         likelihood = look.log_likelihood()
-        now, known = self.now[rows], np.zeros(rows.sum(), bool)
+        begin = now = self.now[rows]
+        at_begin, known = self._explains(begin, measured, look), np.zeros(rows.sum(), bool)
         for _ in range(CANDIDATES):
             place = instants[likelihood.argmax(1)]
             fits = ~known & self._explains(place, measured, look)
@@ -718,7 +724,8 @@ class LocalizingProgress(WaitingProgress):
                 break
             near = np.abs(instants - place[:, None]) <= MODE
             likelihood = np.where(near, -np.inf, likelihood)
-        now = now.reshape(self.now.shape)
+        # little is left out only with a reason
+        now = np.where(at_begin & (now - begin < SOON), begin, now).reshape(self.now.shape)
         return replace(self, now=now, before=now, reached=now, place=now)
 
 

@@ -69,9 +69,9 @@ def outlying_demonstrations(
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
     as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than seven
-    times 1.4826 times the median distance from the median, for a second in all. Where the others
-    agree to less than 2 % of the range of an operator's coordinates, or 0.05 rad, that counts
-    as their distance.
+    times 1.4826 times the median distance from the median, for a second in all. Where the
+    others agree to less than 2 % of the range of an operator's coordinates, or 0.05 rad, that
+    counts as their distance.
 
     Parameters
     ----------

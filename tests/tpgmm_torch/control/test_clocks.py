@@ -278,8 +278,12 @@ def test_robots_are_held_for_ten_seconds(shaking):
     run = localizing(shaking, 24, dt=0.05)
     run.run(END + 15, between(since, since + 10))
     times = torch.stack(run.times)
-    assert not torch.stack(run.relocalized).any()
-    assert times.diff(dim=0).min() >= 0
+    # time only goes back, and once, to the beginning of a pause in which a robot was stopped
+    again = torch.stack(run.relocalized)
+    gone = times.diff(dim=0)
+    assert again.sum(0).max() <= 1
+    assert gone[~again].min() >= 0
+    assert 0 < again.sum() < 12 and gone[again].max() < -1
     tick = torch.stack((since + 5, since + 9.9)) / run.dt
     later, last = times.gather(0, tick.long())
     assert torch.equal(later, last)

@@ -103,7 +103,8 @@ def test_it_is_the_controller(package, expected):
             (one.covariance, other.estimate.covariance),
             (torch.tensor(one.time, dtype=torch.float64), other.time),
         ):
-            torch.testing.assert_close(actual, wanted, rtol=0, atol=1e-9)
+            # wanted postures are rounded to 2^-32 in the controller: in speed that is more
+            torch.testing.assert_close(actual, wanted, rtol=0, atol=3e-7)
         assert one.status.code == int(other.codes)
     assert commands[-1].status is Status.FINISHED
 
