@@ -556,7 +556,7 @@ class LocalizingProgress(WaitingProgress):
         new["since"] = np.where(due, 0.0, since)
         left = np.abs(measured - self.rest).max(-1) > STILL
         no = np.zeros_like(self.moved)
-        stood = {
+        stood: dict[str, Any] = {
             "rest": np.where(left[..., None], measured, self.rest),
             "rested": np.where(left, now, self.rested),
         }
