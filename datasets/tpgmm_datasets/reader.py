@@ -301,7 +301,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         if it never changes.
     events : mapping of str to str, Detector or callable, optional
         How events are found, all values of the joint feature given: what
-        :func:`~tpgmm_torch.events.text.parse_event` takes, as ``"closing:*gripper*"``, or a
+        :func:`~tpgmm_torch.events.parse_event` takes, as ``"closing:*gripper*"``, or a
         function from the demonstration to a time [s]. Columns ``event.*`` are found by
         themselves, and so are ``close`` and ``open`` (of the gripper on the link's side, known
         by its name) and ``stop`` where a frame is at them. What is found without confidence is
