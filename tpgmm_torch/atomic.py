@@ -157,12 +157,13 @@ def consistent[T](path: str | Path, read: Callable[[], T]) -> T:
             return result
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def _identity(path: Path) -> tuple[int, ...] | None:
     try:
         found = path.stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino
+    # the number of a folder that is gone is soon given to another: its times are not
+    return found.st_dev, found.st_ino, found.st_mtime_ns, found.st_ctime_ns
 
 
 def read_whole(path: str | Path) -> bytes:
