@@ -42,6 +42,8 @@ Flags = NDArray[np.bool_]
 RESTART = 0.2
 #: What robots may be believed at the start of a skill.
 INITIAL = ("beginning", "anywhere")
+#: Places whose log-likelihoods differ by less explain a posture alike.
+ALIKE = 5.0
 #: So many places may explain the start posture.
 CANDIDATES = 5
 #: A skill that might begin there may as well begin at its beginning [s].
@@ -421,8 +423,8 @@ class LocalizingClock(WaitingClock):
         See :class:`WaitingClock`.
     initial : {"beginning", "anywhere"}, default="beginning"
         Where in the skill robots are believed to be at its start. With ``"anywhere"`` that is
-        the place which explains the start posture best; the beginning if none does, or if it
-        explains it too and is not far from there.
+        the earliest of the places which explain the start posture best; the beginning if none
+        does, or if it explains it too and is not far from there.
 
     Raises
     ------
@@ -714,19 +716,20 @@ class LocalizingProgress(WaitingProgress):
         measured = self.measured[rows]
         look = self._look(rows, frames)
         likelihood = look.log_likelihood()
+        best = likelihood.max(1)
         begin = now = self.now[rows]
         at_begin, known = self._explains(begin, measured, look), np.zeros(rows.sum(), bool)
         for _ in range(CANDIDATES):
             place = instants[likelihood.argmax(1)]
-            fits = ~known & self._explains(place, measured, look)
+            # of several, as in a repeating motion, the earliest: the others leave something out
+            fits = self._explains(place, measured, look)
+            fits &= ~known | ((place < now) & (likelihood.max(1) > best - ALIKE))
             now, known = np.where(fits, place, now), known | fits
-            if known.all():
-                break
             near = np.abs(instants - place[:, None]) <= MODE
             likelihood = np.where(near, -np.inf, likelihood)
         # little is left out only with a reason
         now = np.where(at_begin & (now - begin < SOON), begin, now).reshape(self.now.shape)
-        return replace(self, now=now, before=now, reached=now, place=now)
+        return replace(self, now=now, before=now, reached=now, place=now, rested=now)
 
 
 def _array(tensor: Tensor) -> Array:
