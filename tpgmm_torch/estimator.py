@@ -378,9 +378,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
             kinematics = self._kinematics_for(known, operators)
-            weights, shown = self._examined(known, operators, kinematics)
+            weights, shown, found = self._examined(known, operators, kinematics)
             known = [each for each, weight in zip(known, weights, strict=True) if weight > 0]
-            holds = holds_for(self.holds, known, operators, kinematics)
+            holds = (
+                holds_for(self.holds, known, operators, kinematics) if found is None else found
+            )
             gathered = rows_in_memory(
                 known,
                 operators,
@@ -1114,21 +1116,24 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         demonstrations: Sequence[Demonstration],
         operators: Sequence[Operator],
         kinematics: Kinematics,
-    ) -> tuple[Tensor, Shown]:
-        """Act on what is implausible; weights (M,) of demonstrations, and what these showed."""
+    ) -> tuple[Tensor, Shown, tuple[Hold, ...] | None]:
+        """Act on what is implausible; weights (M,) of demonstrations, and what these showed.
+
+        And what is held in them, if that was looked for and none is left out.
+        """
         episodes = summarize(demonstrations, kinematics)
         family = self.covariance_type, self.covariance_shrinkage
         report = learning_report(episodes, operators, kinematics, *family)
-        weights = torch.ones(len(demonstrations), dtype=torch.float64)
+        weights, holds = torch.ones(len(demonstrations), dtype=torch.float64), None
         if self.robust and (not report.errors() or self.plausibility == "ignore"):
             holds = holds_for(self.holds, demonstrations, operators, kinematics)
             outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
             if outlying:
                 report = report.and_also(left_out(outlying, len(demonstrations)))
-                weights[[one.episode for one in outlying]] = 0.0
+                weights[[one.episode for one in outlying]], holds = 0.0, None
         report.act(self.plausibility, stacklevel=3)
         kept = [each for each, weight in zip(episodes, weights, strict=True) if weight > 0]
-        return weights, Shown.of(kept, kinematics)
+        return weights, Shown.of(kept, kinematics), holds
 
     def _examine(
         self,

@@ -573,10 +573,9 @@ class LocalizingProgress(WaitingProgress):
                 stalled=no,
                 moved=no,
             )
+        # one that was stopped and is let go does again what it has not done
         back = left & self.stalled & (now > self.rested + PAUSE)
         back &= np.abs(self.rested - self.returned) > JUMP
-        if back.any():
-            return self._gone_back(replace(self, **new, **stood), back)
         went = replace(
             self,
             **new,
@@ -590,28 +589,32 @@ class LocalizingProgress(WaitingProgress):
             sure=np.where(astray, self.sure, 0.0),
             moved=no,
         )
-        rows = due & astray
-        return self._corrected(went, rows, since, observation) if rows.any() else went
-
-    def _gone_back(self, went: Self, back: Flags) -> Self:
-        """Robots that were stopped and are let go do again what they have not done."""
-        then = np.where(back, self.rested, went.now)
-        joints = np.where(back[..., None], went.measured, went.expected)
+        rows = due & astray & ~back
+        if rows.any():
+            went = self._corrected(went, rows, since, observation)
+        if not back.any():
+            return went
         return replace(
-            went,
-            now=then,
-            before=then,
-            reached=np.where(back, then, went.reached),
-            place=np.where(back, then, went.place),
-            rested=np.where(back, then, went.rested),
-            returned=np.where(back, then, went.returned),
-            stood=np.where(back[..., None], went.measured, went.stood),
-            expected=joints,
-            rate=np.where(back, 0.0, went.rate),
-            sure=np.where(back, 0.0, went.sure),
+            went._relocated(back, self.rested),
+            rested=np.where(back, self.rested, went.rested),
+            returned=np.where(back, self.rested, went.returned),
             localized=went.localized & ~back,
-            stalled=went.stalled & ~back,
-            moved=back,
+        )
+
+    def _relocated(self, robots: Flags, time: Array) -> Self:
+        """The time of some robots moved elsewhere, from where they stand on."""
+        joints = robots[..., None]
+        return replace(
+            self,
+            now=np.where(robots, time, self.now),
+            before=np.where(robots, time, self.before),
+            reached=np.where(robots, time, self.reached),
+            place=np.where(robots, time, self.place),
+            stood=np.where(joints, self.measured, self.stood),
+            expected=np.where(joints, self.measured, self.expected),
+            rate=np.where(robots, 0.0, self.rate),
+            sure=np.where(robots, 0.0, self.sure),
+            moved=self.moved | robots,
         )
 
     def _rate(self, following: Array) -> Array:
@@ -663,23 +666,17 @@ class LocalizingProgress(WaitingProgress):
         elsewhere &= ~(known & (error < RETURNING * self.strayed[rows]))
         sure = np.where(elsewhere, self.sure[rows] + passed, 0.0)
         moves = elsewhere & (self.sure[rows] > 0) & (sure > PATIENCE)
-        return replace(
+        went = replace(
             went,
             weights=_put(went.weights, rows, belief),
             localized=went.localized | rows,
             lost=_put(went.lost, rows, ~explained),
             place=_put(went.place, rows, place),
-            sure=_put(went.sure, rows, np.where(moves, 0.0, sure)),
-            moved=_put(went.moved, rows, moves),
-            now=_put(went.now, rows, np.where(moves, place, now)),
-            before=_put(went.before, rows, np.where(moves, place, now)),
-            reached=_put(went.reached, rows, np.where(moves, place, went.reached[rows])),
-            stood=_put(went.stood, rows, np.where(moves[:, None], measured, went.stood[rows])),
-            expected=_put(
-                went.expected, rows, np.where(moves[:, None], measured, went.expected[rows])
-            ),
-            rate=_put(went.rate, rows, np.where(moves, 0.0, went.rate[rows])),
+            sure=_put(went.sure, rows, sure),
         )
+        if not moves.any():
+            return went
+        return went._relocated(_put(np.zeros_like(rows), rows, moves), went.place)
 
     def _look(
         self,

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.control.clocks import Clock, EvenClock, Observation
+from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Observation
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
@@ -248,7 +248,7 @@ class Controller:
             estimate = _choose(ended, last.estimate, estimate)
         goal = None
         if measured is not None and self._trust is not None and last is not None:
-            waits = (time - before.time < 0.05 * passed).expand(self._led.shape)
+            waits = (time - before.time < STANDS * passed).expand(self._led.shape)
             waits = waits if ended is None else waits & ~ended
             goal = self._leading(estimate.joints, wanted, measured, waits)
         return self._send(estimate, wanted, dt, halted, ended, goal)

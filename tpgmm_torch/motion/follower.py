@@ -149,24 +149,27 @@ class Follower:
         Follower or None
             None if a joint of a robot cannot follow.
         """
-        moment, raw, limits = self.moment, as_array(wanted), self.bounds.arrays
+        moment, raw = self.moment, as_array(wanted)
         exact = moment.taken(raw, dt)
         # bytes are sooner looked at than an array of bool
         certain = (
             moment.behind is None and b"\0" not in moment.measured(exact, self.bounds).tobytes()
         )
-        if not certain:
-            within = (raw >= limits.lower) & (raw <= limits.upper)  # else: back to them
-            if not (within & moment.allows(exact, self.bounds)).all():
-                return None
+        if not certain and not self._serves(raw, exact).all():
+            return None
         return type(self)(self.bounds, wanted, exact)
 
     def fits(self, wanted: Tensor, dt: float) -> Tensor:
         """Which robots :meth:`take` would serve: bool of shape (...)."""
-        raw, limits = as_array(wanted), self.bounds.arrays
-        within = (raw >= limits.lower) & (raw <= limits.upper)
-        fits = (within & self.moment.allows(self.moment.taken(raw, dt), self.bounds)).all(-1)
+        raw = as_array(wanted)
+        fits = self._serves(raw, self.moment.taken(raw, dt)).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
+
+    def _serves(self, wanted: Array, exact: Moment) -> Mask:
+        """Which joints may be taken there: outside their limits they go back to them."""
+        limits = self.bounds.arrays
+        within = (wanted >= limits.lower) & (wanted <= limits.upper)
+        return within & self.moment.allows(exact, self.bounds)
 
     def advance(self, wanted: Tensor, dt: float) -> Self:
         """The next reference: what is wanted where it can be followed, else towards it.

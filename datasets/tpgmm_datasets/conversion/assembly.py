@@ -217,7 +217,9 @@ class Assembly:
                 if not found.certain:
                     self.doubtful.append((rows.episode.index, name, found.confidence))
                     continue
-            at = found.time if isinstance(source, Detector) else float(source(demonstration))
+                at = found.time
+            else:
+                at = float(source(demonstration))
             if not 0 <= at <= demonstration.duration:
                 raise DatasetError(
                     f"event {name!r} was found at {at:.6g} s, outside the episode of "
