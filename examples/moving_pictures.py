@@ -1,8 +1,9 @@
 """Moving pictures of a skill that runs while things go wrong, as WebP files.
 
 The simulated robot shakes a bottle in episodes of the environment ``bottle_shaking`` in which
-it is stopped, is pushed back, or in which somebody moves the bottle. Beside it, over time: the
-controller's progress in the skill, and how stiff the model wants the arms to be.
+it is stopped, is pushed back, or in which somebody moves the bottle; and it carries one that
+slides in its hands to a tray, in ``carry_and_put``. Beside it, over time: the controller's
+progress in the skill, and how stiff the model wants the arms to be.
 
     python examples/moving_pictures.py docs/images
 
@@ -10,7 +11,7 @@ It needs the plugin with its extra ``environments``, and EGL or OSMesa to draw w
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,25 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
+from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
+from lerobot_policy_tpgmm.environments.bottle.handling import BottleEnv
 from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
-from tpgmm_datasets.bottle.experiment import bottle_operators
-from tpgmm_datasets.bottle.skill import BottleShaking
+from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark, CarryBenchmark
 from tpgmm_torch import Frame, Impedance, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.command import Command, Status
 
-#: File, condition of the environment, what happens.
+#: File, task, condition of the environment, what happens.
 EPISODES = {
-    "stopped": ("stopped-3@6+live", "stopped for 3 s"),
-    "pushed": ("pushed-back-2@8+live", "pushed back by 2 s"),
-    "moved": ("moved-slowly+live", "the bottle is moved on the way"),
+    "stopped": ("shake", "stopped-3@6+live", "stopped for 3 s"),
+    "pushed": ("shake", "pushed-back-2@8+live", "pushed back by 2 s"),
+    "moved": ("shake", "moved-slowly+live", "the bottle is moved on the way"),
+    "carried": ("carry", "nominal", "the bottle slides in the hands"),
+}
+#: The environment of each task, and its generator and operators.
+TASKS: dict[str, tuple[type[BottleEnv], type[BottleBenchmark] | type[CarryBenchmark]]] = {
+    "shake": (BottleShakingEnv, BottleBenchmark),
+    "carry": (CarryAndPutEnv, CarryBenchmark),
 }
 SEED = 10003
 #: Pictures per second of the episode, and how fast they are shown.
@@ -42,25 +50,30 @@ PICTURES, SPEED = 5, 2.0
 HEIGHT, WIDTH, CURVES = 180, 200, 220
 
 
-def learned() -> TaskParameterizedGMM:
-    """The skill from ten generated demonstrations."""
-    skill = BottleShaking(steady_rhythm=True)
-    demonstrations = skill.demonstrations(10, seed=0)
-    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
-    return TaskParameterizedGMM(30, bottle_operators(), skill.robot).fit(aligned)
+def learned(task: str) -> TaskParameterizedGMM:
+    """A skill from ten generated demonstrations."""
+    bench = TASKS[task][1](rate=25)
+    demonstrations = bench.skill.demonstrations(10, seed=0)
+    aligned = DynamicTimeWarping(robot=bench.robot).fit_transform(demonstrations)
+    operators = bench.operators(orientation=True)
+    return TaskParameterizedGMM(bench.n_components, operators, bench.robot).fit(aligned)
 
 
-def told(observation: dict[str, Any]) -> tuple[NDArray[np.float64], dict[str, Frame]]:
+def told(
+    observation: dict[str, Any], names: Sequence[str] = ("bottle",)
+) -> tuple[NDArray[np.float64], dict[str, Frame]]:
     """Posture and objects of an observation."""
-    pose = observation["environment_state"]
-    return observation["agent_pos"], {"bottle": Frame(pose[:3], pose[3:])}
+    poses = observation["environment_state"].reshape(-1, 7)
+    frames = {name: Frame(pose[:3], pose[3:]) for name, pose in zip(names, poses, strict=True)}
+    return observation["agent_pos"], frames
 
 
 def run(
-    model: TaskParameterizedGMM, condition: str, length: int | None = None
+    model: TaskParameterizedGMM, task: str, condition: str, length: int | None = None
 ) -> Iterator[tuple[float, Command, NDArray[np.uint8]]]:
     """Time, command and picture, ``PICTURES`` times a second of an episode of some ticks."""
-    env = BottleShakingEnv(
+    made, bench = TASKS[task]
+    env = made(
         condition=condition,
         episode_length=length,
         render_mode="rgb_array",
@@ -68,16 +81,16 @@ def run(
         render_height=HEIGHT,
     )
     observation, _ = env.reset(seed=SEED)
-    joints, frames = told(observation)
-    controller = model.controller(joints, frames, impedance=Impedance(model.kinematics_))
+    impedance = Impedance(model.kinematics_)
+    controller = model.controller(*told(observation, bench.objects), impedance=impedance)
     over, step = False, 0
     while not over:
-        command = controller.step(1 / env.fps, *told(observation))
+        command = controller.step(1 / env.fps, *told(observation, bench.objects))
         if step % (env.fps // PICTURES) == 0:
             yield step / env.fps, command, env.render()
         observation, _, ended, cut, info = env.step(controller.reference.numpy())
         over, step = ended or cut, step + 1
-    print(f"{condition}: {'success' if info['is_success'] else 'failure'}")
+    print(f"{task}, {condition}: {'success' if info['is_success'] else 'failure'}")
 
 
 class Curves:
@@ -114,12 +127,13 @@ class Curves:
 def write(
     path: Path,
     model: TaskParameterizedGMM,
+    task: str,
     condition: str,
     title: str,
     length: int | None = None,
 ) -> None:
     """One episode as a file."""
-    moments = list(run(model, condition, length))
+    moments = list(run(model, task, condition, length))
     curves = Curves(title, moments[-1][0], float(model.time_[-1]))
     pictures = [
         Image.fromarray(np.hstack((picture, curves(time, command))))
@@ -140,7 +154,8 @@ if __name__ == "__main__":
     parser.add_argument("--only", choices=EPISODES, help="one of them")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    skill = learned()
-    for name, (condition, title) in EPISODES.items():
+    skills = {}
+    for name, (task, *shown) in EPISODES.items():
         if options.only in (None, name):
-            write(options.folder / f"{name}.webp", skill, condition, title)
+            skills[task] = skills.get(task) or learned(task)
+            write(options.folder / f"{name}.webp", skills[task], task, *shown)

@@ -153,11 +153,13 @@ def test_moving_pictures_show_that_time_waits(tmp_path):
     from tests.support.skills import small_bottle
 
     example = runpy.run_path(str(FOLDER / "moving_pictures.py"))
-    moments = list(example["run"](small_bottle(), "stopped-1@2", 400))
+    moments = list(example["run"](small_bottle(), "shake", "stopped-1@2", 400))
     progress = {round(time, 2): float(command.time) for time, command, _ in moments}
     assert progress[1.8] == pytest.approx(1.8, abs=0.02)
     assert progress[3.8] < 3.5
-    example["write"](tmp_path / "one.webp", small_bottle(), "stopped-1@2", "stopped", 100)
+    example["write"](
+        tmp_path / "one.webp", small_bottle(), "shake", "stopped-1@2", "stopped", 100
+    )
     with Image.open(tmp_path / "one.webp") as moving:
         assert moving.n_frames == 5
         assert moving.size == (420, 180)
