@@ -1,16 +1,20 @@
-"""LeRobot's asynchronous inference over loopback: its server, and what its client sends."""
+"""LeRobot's asynchronous inference over loopback: its server and its client."""
 
+import json
 import pickle
+import threading
 import time
 from concurrent import futures
 
 import grpc
+import pytest
 import torch
 from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
 from lerobot.transport import services_pb2, services_pb2_grpc
 from lerobot.transport.utils import send_bytes_in_chunks
 
+from tests.support.lerobot_commands import PLUGINS
 from tests.support.policies import STATE, batch, changed, fitted, pose
 from tests.support.skills import bottle_demonstrations
 
@@ -18,15 +22,16 @@ POSE = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
 NAMES = [f"{name}.pos" for name in fitted().kinematics.joint_names]
 
 
-def test_chunks_come_over_the_wire_and_go_on(tmp_path, monkeypatch):
+@pytest.fixture
+def address(tmp_path, monkeypatch):
+    """Where a server listens; a policy of 20 Hz is in the folder ``policy``."""
     monkeypatch.chdir(tmp_path)  # where it is imported it writes a log
     from lerobot.async_inference.policy_server import PolicyServer
 
     from lerobot_policy_tpgmm import async_server
 
-    names = NAMES + POSE
     policy = changed(
-        fitted(), control_fps=20.0, chunk_size=20, state_names=names, action_names=NAMES
+        fitted(), control_fps=20.0, chunk_size=20, state_names=NAMES + POSE, action_names=NAMES
     )
     policy.save_pretrained(tmp_path / "policy")
     assert async_server.serve
@@ -35,35 +40,81 @@ def test_chunks_come_over_the_wire_and_go_on(tmp_path, monkeypatch):
     services_pb2_grpc.add_AsyncInferenceServicer_to_server(PolicyServer(config), server)
     port = server.add_insecure_port("127.0.0.1:0")
     server.start()
-    try:
-        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
-            stub = services_pb2_grpc.AsyncInferenceStub(channel)
-            stub.Ready(services_pb2.Empty())
-            features = {STATE: {"dtype": "float32", "shape": (len(names),), "names": names}}
-            specs = RemotePolicyConfig("tpgmm", str(tmp_path / "policy"), features, 20, "cpu")
-            stub.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(specs)))
-            state, sent = batch()[STATE][0], []
-            for turn in range(4):
-                values = [
-                    *state.tolist(),
-                    *pose(bottle_demonstrations()[5].frames["bottle"]).tolist(),
-                ]
-                seen = dict(zip(names, values, strict=True)) | {"task": "shake"}
-                observation = TimedObservation(time.time(), 8 * turn, seen, must_go=True)
-                stub.SendObservations(
-                    send_bytes_in_chunks(
-                        pickle.dumps(observation), services_pb2.Observation, silent=True
-                    )
+    yield f"127.0.0.1:{port}"
+    server.stop(None)
+
+
+def observed(state):
+    """Of joints and of the bottle, by name."""
+    bottle = pose(bottle_demonstrations()[5].frames["bottle"])
+    return dict(zip(NAMES + POSE, [*state.tolist(), *bottle.tolist()], strict=True))
+
+
+def test_chunks_come_over_the_wire_and_go_on(address, tmp_path):
+    names = NAMES + POSE
+    with grpc.insecure_channel(address) as channel:
+        stub = services_pb2_grpc.AsyncInferenceStub(channel)
+        stub.Ready(services_pb2.Empty())
+        features = {STATE: {"dtype": "float32", "shape": (len(names),), "names": names}}
+        specs = RemotePolicyConfig("tpgmm", str(tmp_path / "policy"), features, 20, "cpu")
+        stub.SendPolicyInstructions(services_pb2.PolicySetup(data=pickle.dumps(specs)))
+        state, sent = batch()[STATE][0], []
+        for turn in range(4):
+            seen = observed(state) | {"task": "shake"}
+            observation = TimedObservation(time.time(), 8 * turn, seen, must_go=True)
+            stub.SendObservations(
+                send_bytes_in_chunks(
+                    pickle.dumps(observation), services_pb2.Observation, silent=True
                 )
-                chunk = pickle.loads(stub.GetActions(services_pb2.Empty()).data)
-                assert [action.get_timestep() for action in chunk][:2] == [
-                    8 * turn,
-                    8 * turn + 1,
-                ]
-                sent += [action.get_action() for action in chunk[:8]]
-                state = sent[-1]
-    finally:
-        server.stop(None)
+            )
+            chunk = pickle.loads(stub.GetActions(services_pb2.Empty()).data)
+            assert [action.get_timestep() for action in chunk][:2] == [8 * turn, 8 * turn + 1]
+            sent += [action.get_action() for action in chunk[:8]]
+            state = sent[-1]
     actions = torch.stack(sent)
     torch.testing.assert_close(actions[0], batch()[STATE][0], rtol=0, atol=1e-5)
     assert 0.01 < float(actions.diff(dim=0).abs().max()) < 0.3  # no jump between chunks
+
+
+# its loggers replace one another, and leave their files open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_the_client_drives_a_robot(address, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(PLUGINS))
+    from lerobot.async_inference.configs import RobotClientConfig
+    from lerobot.async_inference.robot_client import RobotClient
+    from lerobot_robot_bimanual import BimanualConfig
+
+    start, log = tmp_path / "start.json", tmp_path / "log.json"
+    start.write_text(json.dumps(observed(batch()[STATE][0])))
+    client = RobotClient(
+        RobotClientConfig(
+            policy_type="tpgmm",
+            pretrained_name_or_path=str(tmp_path / "policy"),
+            robot=BimanualConfig(start=start, log=log),
+            actions_per_chunk=20,
+            server_address=address,
+            task="shake",
+            fps=20,
+        )
+    )
+    assert client.start()
+    threads = [
+        threading.Thread(target=client.receive_actions, daemon=True),
+        threading.Thread(target=client.control_loop, args=("shake",), daemon=True),
+    ]
+    for thread in threads:
+        thread.start()
+    began = time.monotonic()
+    while len(client.robot._actions) < 45 and time.monotonic() - began < 100:
+        time.sleep(0.05)
+    client.shutdown_event.set()
+    for thread in threads:
+        thread.join(30)
+    client.stop()
+    sent = torch.tensor(
+        [[action[name] for name in NAMES] for action in json.loads(log.read_text())]
+    )
+    assert len(sent) >= 45  # of chunks of 20
+    torch.testing.assert_close(sent[0], batch()[STATE][0], rtol=0, atol=1e-5)
+    assert float((sent[-1] - sent[0]).abs().max()) > 0.1
+    assert float(sent.diff(dim=0).abs().max()) < 0.3
