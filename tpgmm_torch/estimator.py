@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from numbers import Integral, Real
 from pathlib import Path
@@ -450,7 +451,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         situations_report(situations, self.shown_, self.time_, self.kinematics_).act(
             self.plausibility
         )
-        return rollout(
+        trajectories = rollout(
             self.regression(),
             situations,
             self.time_,
@@ -459,6 +460,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             candidates,
             self.holds_,
         )
+        if self.shown_ is None or self.shown_.novelty is None:
+            return trajectories
+        novelty = self.shown_.novelty
+        return [
+            replace(one, novelty=float(novelty.ratio(situation.joints, _first(situation))))
+            for one, situation in zip(trajectories, situations, strict=True)
+        ]
 
     def step(
         self,
@@ -685,6 +693,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             feedback=feedback,
             impedance=impedance or Impedance(self.kinematics_),
             holds=self.holds_,
+            novelty=None if self.shown_ is None else self.shown_.novelty,
         )
 
     def sample(
@@ -728,6 +737,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 mean.covariance,
                 (),
                 mean.joint_names,
+                mean.novelty,
             )
             for z in draws
         ]
@@ -1230,6 +1240,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         tags = super().__sklearn_tags__()
         tags.input_tags.two_d_array = False  # X is a list of demonstrations
         return tags
+
+
+def _first(situation: Situation) -> dict[str, Frame]:
+    """The frames of a situation where the skill begins."""
+    return {
+        n: frame[0] if frame.batch_shape else frame for n, frame in situation.frames.items()
+    }
 
 
 def _moved(tensors: Mapping[str, Tensor], device: str, path: str | Path) -> dict[str, Tensor]:

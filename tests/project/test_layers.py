@@ -28,7 +28,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("data", "em"),
         ("robots", "alignment", "large_data"),
         ("operators", "mixture", "impedance"),
-        ("training", "persistence", "metrics", "motion", "sensing"),
+        ("training", "persistence", "metrics", "motion", "sensing", "novelty"),
         ("regression", "plausibility"),
         ("events",),
         ("control",),

@@ -107,6 +107,7 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
         f"speed <= {largest_velocity(trajectory):.3g} rad/s  "
         f"acceleration <= {largest_acceleration(trajectory):.3g} rad/s^2  "
         f"{', '.join(problems) or 'within limits'}"
+        f"{'' if trajectory.novelty is None else f'  novelty {trajectory.novelty:.2g}'}"
     )
 
 

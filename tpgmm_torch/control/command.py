@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -61,6 +61,8 @@ class Command:
         Why a robot does not simply run, by its index in the batch, ``()`` for a single robot.
     impedance : Impedance, optional
         What stiffness and damping are made with.
+    compute_novelty : callable, optional
+        What gives :attr:`novelty`.
     """
 
     reference: Tensor
@@ -70,6 +72,7 @@ class Command:
     codes: Tensor
     reasons: Mapping[tuple[int, ...], str] = _NO_REASONS
     impedance: Impedance | None = None
+    compute_novelty: Callable[[], Tensor] | None = None
 
     @property
     def status(self) -> Any:
@@ -109,6 +112,16 @@ class Command:
         if status not in _CODES:
             raise UnknownNameError("status", str(status), "a command", _STATUSES)
         return torch.eq(self.codes, _CODES[Status(status)])
+
+    @cached_property
+    def novelty(self) -> Tensor | None:
+        """How new its situation is to the model, of each robot (...).
+
+        1 is as far from the demonstrations as the one of these that is furthest from the
+        others: the start posture, and where objects are now or, if held, were last free. None
+        where the model does not know its demonstrations.
+        """
+        return None if self.compute_novelty is None else self.compute_novelty()
 
     @property
     def covariance(self) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Self
 
@@ -24,6 +25,8 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.novelty import Novelty
+from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -78,6 +81,8 @@ class Controller:
         What q_{t-1} is: the last reference, or the measured posture.
     impedance : Impedance, optional
         What stiffness and damping are made with.
+    novelty : Novelty, optional
+        What tells how new the situation is.
 
     Attributes
     ----------
@@ -113,6 +118,7 @@ class Controller:
         at_rest: bool = True,
         feedback: str = "reference",
         impedance: Impedance | None = None,
+        novelty: Novelty | None = None,
     ) -> None:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
@@ -128,6 +134,10 @@ class Controller:
         if trust is not None:
             self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
         self._progress = clock.start(regression, begin, end, self.reference, self._frames)
+        self._novelty, self._at_first = novelty, self._frames
+        # who begins in the middle of the skill stands where nobody starts
+        midway = self._progress.time > begin + START * (end - begin)
+        self._start = torch.where(midway.unsqueeze(-1), torch.nan, self.reference)
         self._follower: Follower | None = None
         self._bounds, self._position_bounds = bounds, None
         if bounds is not None:
@@ -523,8 +533,24 @@ class Controller:
             codes.to(torch.int8),
             reasons,
             self._impedance,
+            self._situation_novelty(),
         )
         return self.command
+
+    def _situation_novelty(self) -> Callable[[], Tensor] | None:
+        """What tells how new it is where robots began and objects are, or were last free."""
+        if self._novelty is None:
+            return None
+        frames = dict(self.holding.frames)
+        for name in self._novelty.moving:
+            if name in self._at_first:
+                frames[name] = self._at_first[name]
+        return functools.partial(_ratio, self._novelty, self._start, frames)
+
+
+def _ratio(novelty: Novelty, start: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+    """Novelty of each robot (...) of a batch of start postures."""
+    return torch.as_tensor(novelty.ratio(start, frames)).to(start).expand(start.shape[:-1])
 
 
 def _choose(where: Tensor, one: Estimate, other: Estimate) -> Estimate:

@@ -45,6 +45,11 @@ class Trajectory:
         One per operator of the model, in its order, each with leading shape (T,).
     joint_names : tuple of str
         Names of the columns of ``joints``.
+    novelty : float, optional
+        How new the situation is to the model: 1 is as far from the demonstrations as the one
+        of these that is furthest from the others
+        (:class:`~tpgmm_torch.novelty.Novelty`). None where the model does not know its
+        demonstrations.
     """
 
     time: Tensor
@@ -52,6 +57,7 @@ class Trajectory:
     covariance: Tensor
     candidates: tuple[Candidate, ...]
     joint_names: tuple[str, ...]
+    novelty: float | None = None
 
     def __len__(self) -> int:
         """Number of time steps T."""

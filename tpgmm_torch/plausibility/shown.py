@@ -12,10 +12,12 @@ from scipy.special import fdtri
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.poses import angles_to, mean_orientation, other_order
 from tpgmm_torch.plausibility.summaries import (
     EpisodeSummary,
+    PoseSummary,
     poses_among,
     quaternion_columns,
 )
@@ -36,6 +38,8 @@ FEWEST = 6
 AXES = "xyz"
 #: A frame that is a link's pose at the start is so up to rounding, that of float32 too.
 ROUNDING = 1e-5
+#: What moves by less stands still [m], [rad].
+STILL, STILL_ANGLE = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,8 @@ class Shown:
     compared : sequence of bool
         Which joints are compared: not those that are parts of a quaternion.
     frames : mapping of str to ShownFrame
+    novelty : Novelty, optional
+        Tells how new a situation is; None in what versions before this one kept.
     """
 
     n_demonstrations: int
@@ -89,6 +95,7 @@ class Shown:
     start_high: Sequence[float]
     compared: Sequence[bool]
     frames: Mapping[str, ShownFrame]
+    novelty: Novelty | None = None
 
     @classmethod
     def of(cls, episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Self:
@@ -106,14 +113,17 @@ class Shown:
             link: (as_array(state.position(link)), as_array(state.orientation(link)))
             for link in kinematics.links
         }
-        frames = {}
-        for name in episodes[0].frames:
-            poses = [e.frames[name] for e in episodes]
+        frames, first_poses, moving = {}, {}, []
+        ways = {name: [e.frames[name] for e in episodes] for name in episodes[0].frames}
+        for name, poses in ways.items():
             every = np.concatenate([pose.positions for pose in poses])
             first = np.stack([pose.positions[0] for pose in poses])
             turns = np.stack([pose.orientations[0] for pose in poses])
             mean = mean_orientation(turns)
             covariance = np.cov(first.T) if len(first) > 1 else np.zeros((3, 3))
+            first_poses[name] = first, turns, mean
+            if any(_moves(pose) for pose in poses):
+                moving.append(name)
             still = all(len(pose.positions) == 1 for pose in poses)
             same = [link for link, pose in links.items() if _same(pose, (first, turns))]
             frames[name] = ShownFrame(
@@ -134,6 +144,7 @@ class Shown:
             starts.max(axis=0).tolist(),
             compared.tolist(),
             frames,
+            Novelty.of(starts, compared, first_poses, moving),
         )
 
     def config(self) -> dict[str, Any]:
@@ -153,6 +164,8 @@ class Shown:
             fields = dict(config)
             fields["joint_names"] = tuple(fields["joint_names"])
             fields["frames"] = {n: ShownFrame(**f) for n, f in fields["frames"].items()}
+            if fields.get("novelty") is not None:
+                fields["novelty"] = Novelty.from_config(fields["novelty"])
             shown = cls(**fields)
             n = len(shown.joint_names)
             shapes = [np.shape(shown.start_low), np.shape(shown.start_high)]
@@ -378,6 +391,13 @@ class Shown:
 
 def _array(values: Any) -> Array:
     return as_array(values) if hasattr(values, "detach") else np.asarray(values, np.float64)
+
+
+def _moves(pose: PoseSummary) -> bool:
+    """Whether a frame moves by more than a tracker's noise."""
+    away = np.linalg.norm(pose.positions - pose.positions[0], axis=-1)
+    turned = angles_to(pose.orientations, pose.orientations[0])
+    return bool((away > STILL).any() or (turned > STILL_ANGLE).any())
 
 
 def _same(pose: tuple[Array, Array], other: tuple[Array, Array]) -> bool:

@@ -16,7 +16,7 @@ from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.plausibility.summaries import poses_among
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["situations_report", "tick_report"]
+__all__ = ["START", "situations_report", "tick_report"]
 
 #: Within this share of a skill's duration from its begin, a posture is a start.
 START = 0.02

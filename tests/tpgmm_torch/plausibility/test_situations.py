@@ -80,3 +80,44 @@ def test_a_saved_model_remembers_and_strictness_is_kept(tmp_path):
     odd = Situation(one.joints, {"bottle": Frame([0.3, 0.0, 2.0])})
     with pytest.raises(PlausibilityError, match="bottle: z = 2 m, shown"):
         again.predict([odd])
+
+
+def test_a_trajectory_says_how_new_its_situation_was(tmp_path):
+    model, [one] = bottle_model(3, tol=1e6, plausibility="ignore").fit(few_bottles()), given()
+    away = Frame(one.frames["bottle"].position + 0.3, one.frames["bottle"].orientation)
+    situations = [one, Situation(one.joints, {"bottle": away})]
+    novelty = [t.novelty for t in model.predict(situations, candidates=False)]
+    measured = [float(model.shown_.novelty.ratio(s.joints, s.frames)) for s in situations]
+    assert novelty == measured and novelty[0] <= 1 < novelty[1]
+    assert model.sample(situations[1])[0].novelty == novelty[1]
+    model.save(tmp_path / "model")
+    again = TaskParameterizedGMM.load(tmp_path / "model")
+    assert [t.novelty for t in again.predict(situations, candidates=False)] == novelty
+
+
+def test_a_command_says_how_new_the_situation_is_now():
+    model, [one] = bottle_model(3, tol=1e6, plausibility="ignore").fit(few_bottles()), given()
+    bottle = one.frames["bottle"]
+    away = Frame(bottle.position + 0.3, bottle.orientation)
+    controller = model.controller(one.joints.expand(2, -1), one.frames, trust=None)
+    [before, _] = controller.step(0.02).novelty.tolist()
+    both = Frame.stack([bottle, away])
+    after = controller.step(0.02, frames={"bottle": both}).novelty
+    assert after[0] == before == pytest.approx(model.predict([one])[0].novelty)
+    assert after[1] > 1
+    # a posture from which nobody starts counts only where the skill begins
+    bent = one.joints + 0.5
+    begun = model.controller(bent, one.frames, clock="localizing:initial=anywhere")
+    middle = model.predict([one])[0].joints[len(model.time_) // 2]
+    resumed = model.controller(middle, one.frames, clock="localizing:initial=anywhere")
+    assert float(begun.step(0.02).novelty) > 1 >= float(resumed.step(0.02).novelty)
+
+
+def test_a_model_that_does_not_know_its_demonstrations_says_nothing():
+    model, [one] = small_bottle(), given()
+    bare = TaskParameterizedGMM.from_parameters(
+        model.weights_, model.means_, model.covariances_, model.time_,
+        operators=model.operators_, robot=model.kinematics_,
+    )  # fmt: skip
+    assert bare.predict([one])[0].novelty is None
+    assert bare.controller(one.joints, one.frames).step(0.02).novelty is None
