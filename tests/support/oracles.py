@@ -5,6 +5,7 @@ share with the code under test is the state of the robot, whose poses and Jacobi
 of their own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,11 @@ def skew(a: Array) -> Array:
 def canonical(at: At) -> Row:
     n = len(at.joints)
     return Row(np.eye(n), np.eye(n), -at.joints)
+
+
+def canonical_of(at: At, columns: Sequence[int]) -> Row:
+    rows = np.eye(len(at.joints))[list(columns)]
+    return Row(rows, np.eye(len(columns)), -at.joints[list(columns)])
 
 
 def absolute_position(at: At, link: str) -> Row:

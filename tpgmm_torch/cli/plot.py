@@ -107,7 +107,8 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
             n for member in operator.operators for n in coordinate_names(member, kinematics)
         ]
     if isinstance(operator, Canonical):
-        return list(kinematics.joint_names)
+        names = kinematics.joint_names
+        return [names[column] for column in operator.columns(names)]
     if isinstance(operator, AbsolutePosition | RelativePosition):
         return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
     if isinstance(operator, AbsoluteOrientation | RelativeOrientation):

@@ -3,7 +3,8 @@
 ``position:l_hand@bottle + orientation:l_hand@bottle`` is a stack of two relative operators,
 ``position:l_hand`` an absolute one, ``pose:l_hand@bottle`` short for position and orientation,
 ``position:r_hand@held:bottle`` refers to the bottle as it is carried, ``position:bottle@tray``
-is where a carried bottle is on a tray, and ``canonical`` the joints themselves.
+is where a carried bottle is on a tray, ``canonical`` the joints themselves, and
+``canonical:left_*,waist`` some of them.
 ``parameters@shelf`` takes task parameters A, b of the situation, on the joints,
 ``parameters:l_hand@shelf`` on a link's position. ``~`` and a number behind a term is its
 tolerance, ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad].
@@ -39,11 +40,14 @@ TERM = re.compile(
 PARAMETERS = re.compile(
     r"parameters(:(?P<link>[^\s:@+]+))?@(?P<frame>[^\s:@+\[\]]+)(\[(?P<size>[1-9]\d*)\])?"
 )
+#: Some of the joints.
+JOINTS = re.compile(r"canonical:(?P<joints>[^\s:@+~,]+(,[^\s:@+~,]+)*)")
 TOLERANCE = re.compile(r"(?P<term>[^~]+)~(?P<tolerance>\d+\.?\d*(e-?\d+)?)")
 GRAMMAR = (
-    "'canonical', or 'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each "
-    "with '@FRAME' behind it if seen from a frame or another link, '@held:FRAME' if from an "
-    "object as the robot carries it (LINK may be an object too), or 'parameters@NAME' or "
+    "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
+    "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
+    "behind it if seen from a frame or another link, '@held:FRAME' if from an object as the "
+    "robot carries it (LINK may be an object too), or 'parameters@NAME' or "
     "'parameters:LINK@NAME' (with '[D]' behind it if A has D columns), all but 'pose' perhaps "
     "with a tolerance, '~NUMBER', behind it; '+' stacks them, as in "
     "'position:l_hand@bottle + orientation:l_hand@bottle'"
@@ -56,7 +60,8 @@ def parse_operator(text: str) -> Operator:
     Parameters
     ----------
     text : str
-        One term, or several joined by ``+``. A term is ``canonical``, or ``position``,
+        One term, or several joined by ``+``. A term is ``canonical``, perhaps with a colon
+        and names or patterns of joints, joined by commas; or ``position``,
         ``orientation`` or ``pose`` (both), a colon and a link or an object that is carried;
         ``@`` and the name of a frame or of another link make it relative, ``@held:`` to an
         object as it is carried. ``parameters@NAME``, ``parameters:LINK@NAME`` are
@@ -72,7 +77,7 @@ def parse_operator(text: str) -> Operator:
     >>> parse_operator("position:l_hand@bottle")
     RelativePosition(link='l_hand', frame='bottle', held=False, tolerance=0.0)
     >>> parse_operator("pose:l_hand + canonical~0.02").operators[2]
-    Canonical(tolerance=0.02)
+    Canonical(tolerance=0.02, joints=None)
     """
     operators = [operator for term in text.split("+") for operator in _term(term.strip(), text)]
     return operators[0] if len(operators) == 1 else Stack(*operators)
@@ -89,6 +94,8 @@ def _term(term: str, text: str) -> list[Operator]:
         return [replace(operators[0], tolerance=float(given["tolerance"]))]  # type: ignore[type-var]
     if term == "canonical":
         return [Canonical()]
+    if some := JOINTS.fullmatch(term):
+        return [Canonical(joints=tuple(some["joints"].split(",")))]
     if general := PARAMETERS.fullmatch(term):
         size = None if general["size"] is None else int(general["size"])
         return [TaskParameters(general["frame"], general["link"], size)]
@@ -128,7 +135,8 @@ def format_operator(operator: Operator) -> str:
     if isinstance(operator, Stack):
         return " + ".join(map(format_operator, operator.operators))
     if type(operator) is Canonical:
-        return "canonical" + _tolerance(operator)
+        some = "" if operator.joints is None else f":{','.join(operator.joints)}"
+        return f"canonical{some}" + _tolerance(operator)
     if type(operator) is TaskParameters:
         link = "" if operator.link is None else f":{operator.link}"
         size = "" if operator.size is None else f"[{operator.size}]"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.operators import Operator, Stack
+from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.outliers import CONSISTENT
@@ -130,7 +130,9 @@ def _coordinates(
             spread = local.flatten(0, 1).amax(0) - local.flatten(0, 1).amin(0)
             if not bool((spread > 0).any()):
                 continue
-            if leaf.determines_joints:  # of which each has a unit of its own
+            if leaf.determines_joints or isinstance(
+                leaf, Canonical
+            ):  # of which each has a unit of its own
                 local = local[..., spread > 0] / spread[spread > 0]
                 yield leaf, local, NEAR * local.shape[-1] ** 0.5
             else:

@@ -48,7 +48,7 @@ class KalmanUpdate:
     ----------
     kinematics : Kinematics
     operators : sequence of Operator
-        At least one of them is :class:`Canonical`.
+        At least one of them is :class:`Canonical` with all joints.
     conditionals : sequence of Conditionals
         One per operator.
 
@@ -70,9 +70,9 @@ class KalmanUpdate:
             name = "the covariance of a projected component"
             gaussians.cholesky(one.covariance.double(), name)
         pairs = list(zip(operators, conditionals, strict=True))
-        tasks = [operator for operator, _ in pairs if type(operator) is not Canonical]
-        local = [one for operator, one in pairs if type(operator) is not Canonical]
-        priors = [one for operator, one in pairs if type(operator) is Canonical]
+        tasks = [operator for operator, _ in pairs if not _whole(operator)]
+        local = [one for operator, one in pairs if not _whole(operator)]
+        priors = [one for operator, one in pairs if _whole(operator)]
         self.task = Stack(*tasks) if tasks else None
         self.conditionals = Conditionals.stacked([*local, Conditionals.product(priors)])
         starts = self.task.quaternion_starts(kinematics) if self.task is not None else ()
@@ -92,9 +92,9 @@ class KalmanUpdate:
             Where the joint vector holds quaternions, what the joints' operator says depends on
             the present state.
         """
-        if kinematics.quaternion_starts or not any(type(o) is Canonical for o in operators):
+        if kinematics.quaternion_starts or not any(map(_whole, operators)):
             return False
-        tasks = [operator for operator in operators if type(operator) is not Canonical]
+        tasks = [operator for operator in operators if not _whole(operator)]
         leaves = Stack(*tasks).leaves if tasks else ()
         return all(type(leaf) in TASKS for leaf in leaves)
 
@@ -164,3 +164,8 @@ class KalmanUpdate:
         if not batch:
             return steps, covariances
         return steps.movedim(0, -2), covariances.movedim(0, -3)
+
+
+def _whole(operator: Operator) -> bool:
+    """Whether an operator is all of the joints."""
+    return type(operator) is Canonical and operator.determines_joints

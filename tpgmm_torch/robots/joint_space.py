@@ -33,8 +33,11 @@ class JointSpace(Kinematics):
         """The state with no link in it; see :meth:`Kinematics.state`."""
         joints = self.joint_tensor(joints)
         shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
-        parts = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
-        return RobotState(joints, (), *parts)
+        positions, orientations, jacobians = (
+            joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes
+        )
+        names = self.joint_names
+        return RobotState(joints, (), positions, orientations, jacobians, joint_names=names)
 
     def config(self) -> dict[str, Any]:
         """What :meth:`from_config` needs, ready for JSON."""

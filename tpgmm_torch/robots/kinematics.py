@@ -67,6 +67,8 @@ class RobotState:
     carriers : Tensor of int, of shape (..., V), optional
         For each of the last V links, which are objects (:meth:`with_link`), the index of the
         robot's link that carries it, -1 where it is free.
+    joint_names : tuple of str, default=()
+        Of the joints, for operators that look some of them up by name.
     """
 
     joints: Tensor
@@ -75,6 +77,7 @@ class RobotState:
     orientations: Tensor
     jacobians: Tensor
     carriers: Tensor | None = None
+    joint_names: tuple[str, ...] = ()
 
     @property
     def robot_links(self) -> tuple[str, ...]:

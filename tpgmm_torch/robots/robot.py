@@ -159,7 +159,11 @@ class Robot(Kinematics):
             parts = tuple(part.squeeze(0) for part in parts)
         elif len(batch) > 1:
             parts = tuple(part.unflatten(0, batch) for part in parts)
-        return RobotState(joints, self.links, *parts)
+        positions, orientations, jacobians = parts
+        names = self.joint_names
+        return RobotState(
+            joints, self.links, positions, orientations, jacobians, joint_names=names
+        )
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None

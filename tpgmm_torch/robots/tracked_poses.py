@@ -119,7 +119,14 @@ class Poses(Kinematics):
             unit = quaternions.identity(joints.dtype, joints.device)
             orientations, angular = unit.expand(*poses.shape[:-1], 4), torch.zeros_like(linear)
         jacobians = torch.cat((linear, angular), dim=-2)
-        return PosesState(joints, self.links, poses[..., :3], orientations, jacobians)
+        return PosesState(
+            joints,
+            self.links,
+            poses[..., :3],
+            orientations,
+            jacobians,
+            joint_names=self.joint_names,
+        )
 
     def retract(self, joints: Tensor) -> Tensor:
         """Bring the quaternions in (..., n_joints) back to unit norm."""

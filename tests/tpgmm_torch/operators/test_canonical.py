@@ -20,12 +20,14 @@ from tests.support.worlds import OnPoses, OnRobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import (
     Canonical,
+    Poses,
     RelativeOrientation,
     RelativePosition,
+    Situation,
     Stack,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots.joint_space import JointSpace
 
 
@@ -42,6 +44,19 @@ class TestCanonicalOnRobot(OnRobot, CanonicalLaws):
 
 class TestCanonicalOnPoses(OnPoses, CanonicalLaws, OrientationLaws):
     pass
+
+
+class SomeJointsLaws(OperatorLaws):
+    def row(self, at):
+        return oracles.canonical_of(at, self.operator.columns(self.kinematics.joint_names))
+
+
+class TestSomeJointsOnRobot(OnRobot, SomeJointsLaws):
+    operator = Canonical(joints=("l_*", "waist_yaw"))
+
+
+class TestSomeJointsOnPoses(OnPoses, SomeJointsLaws, OrientationLaws):
+    operator = Canonical(joints=("r_hand.*",))
 
 
 def test_the_size_of_the_canonical_operator_is_that_of_a_robot():
@@ -122,3 +137,49 @@ def test_every_operator_has_a_tolerance_in_its_unit():
 def test_what_is_no_tolerance_is_refused(tolerance):
     with pytest.raises(DataError, match=r"a tolerance is a number of at least 0, Canonical"):
         TaskParameterizedGMM(2, [Canonical(tolerance)]).fit(waves())
+
+
+def test_some_joints_are_learned_and_the_others_go_their_way():
+    """They follow what was shown; the prior holds the rest where it starts."""
+    shown = waves()
+    names = JointSpace("abc")
+    some = TaskParameterizedGMM(1, [Canonical(joints=("b",))], names, blend=0)
+    every = TaskParameterizedGMM(1, [Canonical()], names, blend=0)
+    start = Situation.of(shown[0])
+    [one], [all_of_them] = some.fit(shown).predict(start), every.fit(shown).predict(start)
+    torch.testing.assert_close(one.joints[:, 1], all_of_them.joints[:, 1], rtol=0, atol=2e-3)
+    still = one.joints[:, [0, 2]] - one.joints[:1, [0, 2]]
+    assert float(still.abs().max()) < 1e-6 < float(one.joints[:, 1].std())
+
+
+def test_joints_in_two_operators_are_all_joints_where_these_are_independent():
+    shown, start = waves(), Situation.of(waves()[0])
+    pair = [Canonical(joints=["a"]), Canonical(joints=["[bc]"])]
+    whole, parts = (
+        TaskParameterizedGMM(1, operators, covariance_type="diag").fit(shown).predict(start)[0]
+        for operators in ([Canonical()], pair)
+    )
+    torch.testing.assert_close(parts.joints, whole.joints, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("joints", ["left_*", [], [3]])
+def test_what_names_no_joints_is_refused(joints):
+    with pytest.raises(DataError, match="joints is a sequence of at least one name or pattern"):
+        Canonical(joints=joints)
+
+
+def test_joints_that_the_robot_does_not_have_are_refused():
+    shown = waves()
+    with pytest.raises(UnknownNameError, match=r"joint 'left_\*' is not in the robot; it has"):
+        TaskParameterizedGMM(2, [Canonical(joints=["left_*"])]).fit(shown)
+
+
+def test_a_quaternion_is_not_cut():
+    with pytest.raises(DataError, match=r"\['hand.qw', .* of a quaternion: name all four"):
+        Canonical(joints=["hand.qw"]).check(Poses(["hand"]), ())
+
+
+def test_a_robot_that_does_not_name_its_joints_is_told_so():
+    state = JointSpace(["a", "b"]).state([0.0, 1.0])
+    with pytest.raises(DataError, match="has to pass joint_names to RobotState"):
+        Canonical(joints=["a"]).coordinates(replace(state, joint_names=()), {})

@@ -33,6 +33,8 @@ OPERATORS = [
     TaskParameters("shelf", size=3),
     Stack(TaskParameters("shelf", "l_hand", 2), Canonical()),
     Canonical(tolerance=0.02),
+    Canonical(joints=("left_*", "waist_yaw")),
+    Canonical(0.1, ("left_*",)),
     RelativePosition("l_hand", "bottle", tolerance=1e-5),
     Stack(AbsoluteOrientation("l_hand", tolerance=0.1), TaskParameters("shelf", tolerance=2.0)),
 ]
@@ -66,6 +68,8 @@ def test_a_pose_is_position_and_orientation():
         "parameters",
         "parameters@a[0]",
         "canonical~",
+        "canonical:",
+        "canonical:a,",
         "canonical~-1",
         "canonical~0.1~0.2",
     ],
