@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.tracked_poses import Poses
     from tpgmm_torch.sensing.pose_filter import OneEuro
     from tpgmm_torch.sensing.trust import Trust
+    from tpgmm_torch.structure.operator_selection import OperatorSelection
     from tpgmm_torch.training.hold_detection import find_holds
 
     __version__: str
@@ -73,6 +74,7 @@ __all__ = [
     "MotionBounds",
     "OneEuro",
     "Operator",
+    "OperatorSelection",
     "Poses",
     "RelativeOrientation",
     "RelativePosition",
@@ -125,6 +127,7 @@ _HOMES = {
     "robots.robot": ("Robot",),
     "sensing.pose_filter": ("OneEuro",),
     "sensing.trust": ("Trust",),
+    "structure.operator_selection": ("OperatorSelection",),
     "data.trajectories": ("Candidate", "Trajectory"),
     "training.hold_detection": ("find_holds",),
 }

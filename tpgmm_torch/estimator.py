@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
+from sklearn.base import BaseEstimator, clone
 from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
@@ -61,6 +61,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import (
@@ -97,8 +98,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     ----------
     n_components : int, default=10
         K, the number of Gaussians.
-    operators : sequence of Operator, optional
+    operators : sequence of Operator, "auto" or OperatorSelection, optional
         Candidate projection operators, one subspace each; the default is ``[Canonical()]``.
+        "auto" finds those that matter, :class:`OperatorSelection`, in at least three
+        demonstrations; one of your own has candidates and thresholds of your own.
     robot : Kinematics, optional
         A :class:`Robot`, :class:`Poses` for recorded poses without a robot, or your own;
         not needed by ``Canonical()`` alone.
@@ -182,6 +185,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     covariances_ : list of Tensor of shape (K, 1 + D_j, 1 + D_j)
         Local covariances Sigma_i^(j).
     operators_ : tuple of Operator
+    operator_selection_ : OperatorSelection or None
+        Which were found, and why; None where they were given, and for a model that was loaded.
     kinematics_ : Kinematics
     holds_ : tuple of Hold
         In the time of the skill.
@@ -229,7 +234,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "n_components": [Interval(Integral, 1, None, closed="left")],
-        "operators": ["array-like", tuple, None],
+        "operators": [StrOptions({"auto"}), OperatorSelection, "array-like", tuple, None],
         "robot": [Kinematics, None],
         "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
         "reg_covar": [Interval(Real, 0, None, closed="left")],
@@ -258,6 +263,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     shown_: Shown | None
     demonstration_weights_: Tensor | None
+    operator_selection_: OperatorSelection | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
 
@@ -269,7 +275,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def __init__(
         self,
         n_components: int = 10,
-        operators: Sequence[Operator] | None = None,
+        operators: Sequence[Operator] | str | OperatorSelection | None = None,
         robot: Kinematics | None = None,
         *,
         covariance_type: str = "full",
@@ -323,6 +329,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.device = device
         self.verbose = verbose
 
+    @property
+    def selects(self) -> bool:
+        """Whether :meth:`fit` finds the operators."""
+        return isinstance(self.operators, str | OperatorSelection)
+
     def check_parameters(self) -> None:
         """Check types and ranges of the parameters, as :meth:`fit` does before it begins.
 
@@ -374,10 +385,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             If another of the processes died.
         """
         self._validate_params()
-        operators = check_operators(self.operators)
         demonstrations, batches = split_batches(X)
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
+            selection = self._selection(known)
+            chosen = self.operators if selection is None else selection.operators_
+            operators = check_operators(chosen)
             kinematics = self._kinematics_for(known, operators)
             weights, shown, found = self._examined(known, operators, kinematics)
             known = [each for each, weight in zip(known, weights, strict=True) if weight > 0]
@@ -393,8 +406,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             )
             self._learn(gathered, operators, kinematics, checkpoint, holds)
             self.shown_, self.demonstration_weights_ = shown, weights
+            self.operator_selection_ = selection
             peaks = demonstrated_peaks(known, kinematics.joint_names)
             return self._set_peaks(*peaks)
+        if self.selects:
+            raise DataError(
+                'operators="auto" compares all demonstrations with each other, which those in '
+                "batches or in several processes are not: fit an OperatorSelection to some of "
+                "them, and give its operators_"
+            )
+        operators = check_operators(self.operators)
         walk = checked_batches([demonstrations] if batches is None else batches)
         head = next(walk, None)
         check_shares(head, processes)
@@ -898,7 +919,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_iter_ = getattr(mixture, "n_iter_", 0)
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
-        self.shown_ = self.demonstration_weights_ = None
+        self.shown_ = self.demonstration_weights_ = self.operator_selection_ = None
         self._untried = True
         return self
 
@@ -1120,6 +1141,19 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             processes=learning.processes,
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
+
+    def _selection(self, demonstrations: Sequence[Demonstration]) -> OperatorSelection | None:
+        """Find the operators that matter, where none are given."""
+        if not self.selects:
+            return None
+        selection = OperatorSelection()
+        if isinstance(self.operators, OperatorSelection):
+            selection = clone(self.operators)
+        shared = {name: getattr(self, name) for name in ("holds", "robust", "dtype", "device")}
+        selection.set_params(**shared)
+        if selection.robot is None:
+            selection.set_params(robot=self.robot)
+        return selection.fit(demonstrations)
 
     def _examined(
         self,

@@ -131,6 +131,8 @@ def fit_folds(
     shown = [[demonstrations[index] for index in fold] for fold in chosen]
     models = [clone(estimator) for _ in chosen]
     estimator.check_parameters()
+    if estimator.selects:  # each fold finds its own
+        return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     operators = check_operators(estimator.operators)
     kinematics = kinematics_for(
         demonstrations, operators, estimator.robot, estimator.dtype, estimator.device

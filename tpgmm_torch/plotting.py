@@ -14,13 +14,22 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.training.local_data import local_data
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["figure", "plot_candidates", "plot_components", "plot_local", "shade"]
+__all__ = [
+    "figure",
+    "plot_candidates",
+    "plot_components",
+    "plot_local",
+    "plot_relevance",
+    "shade",
+]
 
 DEMONSTRATION, REPRODUCTION = "0.15", "tab:red"
 COMPONENT = "tab:green"
@@ -176,3 +185,30 @@ def plot_candidates(
         axes.plot(time, mean, color=color, linewidth=1.6, label=label)
     axes.plot(time, as_array(trajectory.joints[:, column]), "k", linewidth=1.2, label="TP-GMM")
     axes.set_ylabel(f"{joint} [rad]")
+
+
+def plot_relevance(axes: Axes, selection: OperatorSelection) -> None:
+    """When which candidate matters: gains over time, those kept above, in bold.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+        Where to draw.
+    selection : OperatorSelection
+        Fitted.
+    """
+    order = np.lexsort((-selection.relevance_.mean(0), ~selection.support_))
+    gains = selection.relevance_[:, order].T.clip(min=0)
+    begin, end = selection.time_[0], selection.time_[-1]
+    extent = (float(begin), float(end), len(order) - 0.5, -0.5)
+    image = axes.imshow(
+        gains, aspect="auto", extent=extent, cmap="Greens", interpolation="nearest"
+    )
+    axes.set_yticks(
+        range(len(order)), [format_operator(selection.candidates_[j]) for j in order]
+    )
+    for label, kept in zip(axes.get_yticklabels(), selection.support_[order], strict=True):
+        label.set(fontsize="x-small", fontweight="bold" if kept else "normal")
+    axes.axhline(selection.support_.sum() - 0.5, color=REPRODUCTION, linewidth=1.0)
+    axes.set_xlabel("time [s]")
+    axes.figure.colorbar(image, ax=axes, label="gain [nats]")

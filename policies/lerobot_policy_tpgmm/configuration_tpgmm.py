@@ -333,9 +333,21 @@ class TPGMMConfig(StatePolicyConfig):
         return Robot.from_urdf(urdf, links, joints=joints, coordinates=self.coordinates)
 
     def decoded_operators(self) -> list[Operator] | None:
-        """The operators that ``operators`` describes; None if it says nothing."""
+        """The operators that ``operators`` describes; None if it says nothing.
+
+        Raises
+        ------
+        DataError
+            If a text describes none.
+        """
         if self.operators is None:
             return None
+        if "auto" in self.operators:
+            raise DataError(
+                "a policy has its operators before it sees demonstrations: find them with "
+                "'tpgmm fit --operator auto', which can write a policy, --format lerobot; or "
+                "name those that it reports in operators"
+            )
         return [
             parse_operator(item) if isinstance(item, str) else decode(item)
             for item in self.operators

@@ -163,6 +163,7 @@ def test_a_truncated_file_is_refused(directory, keep):
         ("dtype", "float32", r"expected float32"),
         ("operators", ["canonical"], "mixture.factors.1 is .*, expected nothing"),
         ("operators", ["shake"], "'shake' is not a term"),
+        ("operators", ["auto"], "tpgmm fit --operator auto"),
         ("operators", ["position:foot"], "link 'foot' is not in"),
         ("robot", {"type": "Robot", "config": {}}, "cannot be rebuilt"),
         ("robot", {"type": "Spot", "config": {}}, "'Spot', which is not known here"),

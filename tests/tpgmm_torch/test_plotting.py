@@ -11,9 +11,17 @@ from matplotlib.patches import Ellipse
 
 from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
 from tests.support.worlds import OnPoses
-from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM
+from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.plotting import figure, plot_candidates, plot_components, plot_local, shade
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.plotting import (
+    figure,
+    plot_candidates,
+    plot_components,
+    plot_local,
+    plot_relevance,
+    shade,
+)
 
 
 def joints_model() -> TaskParameterizedGMM:
@@ -126,3 +134,18 @@ def test_a_figure_is_written(tmp_path):
         plot_candidates(axes, trajectory, joint)
     drawing.savefig(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_candidates_that_matter_stand_above_the_others():
+    selection = OperatorSelection(robot=HANDS).fit(handlings())
+    [axes] = figure(1, "").axes
+    plot_relevance(axes, selection)
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    kept = {format_operator(selection.candidates_[j]) for j in selection.get_support(True)}
+    assert set(labels[: len(kept)]) == kept and len(labels) == len(selection.candidates_)
+    [image] = axes.images
+    column = [format_operator(one) for one in selection.candidates_].index(labels[0])
+    np.testing.assert_allclose(
+        image.get_array()[0], selection.relevance_[:, column].clip(min=0)
+    )
+    assert [line.get_ydata()[0] for line in axes.lines] == [len(kept) - 0.5]

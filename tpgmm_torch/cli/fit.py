@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -75,7 +75,8 @@ def fit(
             "What is learned together, repeatable: 'canonical' (the joints), "
             "'position:LINK@FRAME', 'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), "
             "without @FRAME in the base frame; FRAME may be another link, or held:FRAME an "
-            "object as it is carried, which LINK may be too; '+' stacks. "
+            "object as it is carried, which LINK may be too; 'canonical:left_*' some joints; "
+            "'+' stacks. 'auto' finds what matters and says why. "
             "Default: the poses of all links in all frames, stacked, and canonical."
         ),
     ] = None,
@@ -174,7 +175,9 @@ def fit(
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = model_format(output_format)
-    operators = [parse_operator(text) for text in operator or ()]
+    operators: Any = "auto"
+    if operator != ["auto"]:
+        operators = [parse_operator(text) for text in operator or ()]
     given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
     recordings = options.recordings(
@@ -214,6 +217,8 @@ def fit(
     else:
         write(model, out, recordings.signals())
     _report(model, durations, steps, data.aligned)
+    if model.operator_selection_ is not None:
+        typer.echo(f"\n{model.operator_selection_.report()}\n")
     if kept:
         typer.echo(f"resumed          {checkpoint}, after {kept} iterations")
     if processes.count > 1:

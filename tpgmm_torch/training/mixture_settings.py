@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 __all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
 
 
-def check_operators(operators: Sequence[Operator] | None) -> tuple[Operator, ...]:
+def check_operators(operators: Any) -> tuple[Operator, ...]:
     """The operators; ``(Canonical(),)`` where none are given.
 
     Raises

@@ -126,3 +126,11 @@ def test_fit_has_the_estimators_defaults():
     assert len(shared) > 8
     for name in shared - {"random_state"}:
         assert options[name].default == estimator[name].default, name
+
+
+def test_fit_finds_operators_and_says_why(dataset, tmp_path):
+    options = ("--rate", 5, "--n-components", 2, "--operator", "auto", *CALMLY)
+    printed = output("fit", dataset, *UPPER_BODY, *options, "--out", tmp_path / "model")
+    assert "left out is off by" in printed and "decides there" in printed
+    model = TaskParameterizedGMM.load(tmp_path / "model")
+    assert "bottle" in model.frame_names_

@@ -1,0 +1,257 @@
+"""Which operators matter: found where it is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
+
+from tests.support.planted import HAND, PlantedTask, told
+from tests.support.skills import handlings, hands_model, waves
+from tpgmm_torch import (
+    AbsolutePosition,
+    Affine,
+    Canonical,
+    Frame,
+    OperatorSelection,
+    Poses,
+    RelativePosition,
+    Stack,
+    TaskParameterizedGMM,
+)
+from tpgmm_torch.alignment import LinearTimeNormalization
+from tpgmm_torch.exceptions import DataError, NotFittedError, UnknownNameError
+from tpgmm_torch.model_selection import fit_folds
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.structure.operator_selection import candidate_operators
+
+
+def relative(selection):
+    """Texts of what was kept and refers to a frame."""
+    texts = {format_operator(selection.candidates_[j]) for j in selection.get_support(True)}
+    return {text for text in texts if "@" in text}
+
+
+@pytest.mark.parametrize("n_relevant", [1, 2])
+def test_what_was_planted_is_found_among_eight_frames_and_nothing_else(n_relevant):
+    hits = wrong = missed = 0
+    for seed in range(4):
+        task = PlantedTask(seed, n_relevant)
+        found = relative(OperatorSelection(robot=HAND).fit(task.demonstrations(5)))
+        hits, wrong = hits + len(found & told(task)), wrong + len(found - told(task))
+        missed += len(told(task) - found)
+    assert 2 * hits / (2 * hits + wrong + missed) >= 0.95
+
+
+@pytest.fixture(scope="module")
+def task():
+    return PlantedTask(0, 2)
+
+
+@pytest.fixture(scope="module")
+def selection(task):
+    return OperatorSelection(robot=HAND).fit(task.demonstrations(5))
+
+
+def test_it_says_when_an_operator_matters(selection, task):
+    """The first frame while the hand rests at it, the second later."""
+    texts = [format_operator(one) for one in selection.candidates_]
+    assert selection.relevance_.shape == (len(selection.time_), len(texts))
+    first, second = (texts.index(f"position:hand@{name}") for name in task.relevant)
+    peaks = selection.time_[selection.relevance_.argmax(0)]
+    assert 3.0 < peaks[first] < 6.5 < peaks[second] < 11.5
+    dropped = selection.relevance_[:, ~selection.support_].mean(0)
+    assert dropped.max() < selection.threshold < selection.relevance_.mean(0)[first]
+
+
+def test_it_says_why(selection, task):
+    judged = {format_operator(one.operator): one for one in selection.judgements_}
+    kept = judged[f"position:hand@{task.relevant[0]}"]
+    assert kept.kept and kept.unit == "mm" and kept.error < 15 < 100 < kept.error_of_others
+    other = next(name for name in "abcdefgh" if name not in task.relevant)
+    dropped = judged[f"orientation:hand@{other}"]
+    assert not dropped.kept and dropped.unit == "deg"
+    assert dropped.error > dropped.error_of_others
+    lines = selection.report().splitlines()
+    assert len(lines) == 1 + len(selection.candidates_)
+    assert sum(line.startswith("kept") for line in lines) == selection.support_.sum()
+
+
+def test_what_refers_to_one_frame_is_stacked_and_joints_come_last(selection, task):
+    *tasks, joints = selection.operators_
+    assert joints == Canonical()
+    assert [one.references()[0] for one in tasks] == list(task.relevant)
+    assert all(isinstance(one, Stack) and len(one.operators) == 2 for one in tasks)
+
+
+def test_turning_and_moving_the_world_changes_nothing(selection, task):
+    """Gains do not depend on the base frame, but for what stands in it."""
+    world = Frame([0.4, -0.3, 0.7], np.array([0.6, -0.2, 0.5, 0.59]) / np.sqrt(0.9981))
+    moved = []
+    for one in task.demonstrations(5):
+        state = HAND.state(one.joints)
+        frames = {name: world.compose(frame) for name, frame in one.frames.items()}
+        joints = Poses.joints({"hand": world.compose(state.pose("hand"))})
+        moved.append(replace(one, joints=joints, frames=frames))
+    again = OperatorSelection(robot=HAND).fit(moved)
+    np.testing.assert_array_equal(again.support_, selection.support_)
+
+
+def test_the_sign_of_a_quaternion_means_nothing(selection, task):
+    shown = task.demonstrations(5)
+    frames = {name: Frame(f.position, -f.orientation) for name, f in shown[1].frames.items()}
+    joints = shown[2].joints.clone()
+    joints[:, 3:] *= -1
+    shown[1], shown[2] = replace(shown[1], frames=frames), replace(shown[2], joints=joints)
+    again = OperatorSelection(robot=HAND).fit(shown)
+    np.testing.assert_allclose(again.relevance_, selection.relevance_, atol=1e-8)
+
+
+def test_of_two_frames_that_are_one_only_one_is_kept():
+    """A tray on a table that moves with it says nothing more."""
+    task = PlantedTask(3, 1)
+    [name], shown = task.relevant, task.demonstrations(5)
+    on_it = Frame([0.1, 0.0, 0.05])
+    shown = [
+        replace(one, frames={name: one.frames[name], "tray": one.frames[name].compose(on_it)})
+        for one in shown
+    ]
+    found = OperatorSelection(robot=HAND).fit(shown)
+    kinds = sorted(text.partition(":")[0] for text in relative(found))
+    assert kinds == ["orientation", "position"]
+    spare = [one for one in found.judgements_ if not one.kept and one.operator.references()]
+    assert all(one.alone > found.threshold > one.gain for one in spare)
+
+
+def test_one_hand_seen_from_the_other_is_found():
+    found = OperatorSelection(robot=hands_model().robot).fit(handlings(5))
+    assert "position:right@left" in relative(found) or "position:left@cup" in relative(found)
+    assert not found.support_[
+        [format_operator(one) for one in found.candidates_].index("position:left")
+    ]
+
+
+def test_joints_that_matter_are_found_in_groups():
+    """One joint repeats its motion, the other wanders."""
+    rng, time = np.random.default_rng(0), torch.linspace(0, 2, 60, dtype=torch.float64)
+    shown = []
+    for one in waves(5, 60):
+        steps = torch.from_numpy(rng.normal(size=60)).cumsum(0) * 0.2
+        shown.append(
+            replace(
+                one,
+                time=time,
+                joints=torch.stack((one.joints[:, 0], steps), 1),
+                joint_names=("steady", "idle"),
+            )
+        )
+    groups = [Canonical(joints=["steady"]), Canonical(joints=["idle"])]
+    found = OperatorSelection(groups).fit(shown)
+    assert found.operators_ == (groups[0],)
+
+
+def test_candidates_are_all_links_in_all_frames(task):
+    shown = task.demonstrations(3)[0]
+    shown = replace(
+        shown, frames={"a": shown.frames["a"], "map": Affine(np.eye(3), np.ones(3))}
+    )
+    texts = [format_operator(one) for one in candidate_operators(Poses(["l", "r"]), shown)]
+    kinds = ("position", "orientation")
+    places = ("l", "r", "l@a", "r@a", "r@l")
+    assert texts == ["canonical", *(f"{kind}:{place}" for place in places for kind in kinds)]
+    points = candidate_operators(Poses(["l"], orientation=False), shown)
+    assert points == [Canonical(), AbsolutePosition("l"), RelativePosition("l", "a")]
+    assert candidate_operators(None, shown) == [Canonical()]
+
+
+def test_two_demonstrations_are_too_few(task):
+    with pytest.raises(DataError, match="at least 3, got 2; name the operators"):
+        OperatorSelection(robot=HAND).fit(task.demonstrations(2))
+
+
+def test_candidates_that_do_not_fit_are_refused(task):
+    candidates = [Canonical(), RelativePosition("hand", "lid")]
+    with pytest.raises(UnknownNameError, match="frame 'lid' is not in the demonstration"):
+        OperatorSelection(candidates, HAND).fit(task.demonstrations(3))
+
+
+def test_before_fit_there_is_nothing_to_report():
+    with pytest.raises(NotFittedError, match="this OperatorSelection is not fitted yet"):
+        OperatorSelection().report()
+
+
+def test_it_is_a_step_of_a_pipeline(task):
+    pipeline = make_pipeline(LinearTimeNormalization(), OperatorSelection(robot=HAND))
+    assert relative(pipeline.fit(task.demonstrations(5))[-1]) == told(task)
+
+
+@pytest.fixture(scope="module")
+def model(task):
+    return TaskParameterizedGMM(12, "auto", HAND).fit(task.demonstrations(5))
+
+
+class TestAuto:
+    """``operators="auto"``: found by the model itself."""
+
+    def test_the_model_has_what_was_found(self, model, selection):
+        assert model.operators_ == selection.operators_
+        np.testing.assert_array_equal(model.operator_selection_.support_, selection.support_)
+        assert model.operators == "auto"
+
+    def test_situations_need_only_the_frames_that_matter(self, model, task):
+        assert model.frame_names_ == task.relevant
+
+    def test_it_is_about_as_good_as_the_model_that_was_told(self, model, selection, task):
+        other = TaskParameterizedGMM(12, selection.operators_, HAND)
+        unseen = task.demonstrations(10, seed=1, noise=False)
+        errors = [
+            float(
+                np.mean(
+                    [
+                        (a.joints - b.joints).norm(dim=-1).mean()
+                        for a, b in zip(one.predict(unseen), unseen, strict=True)
+                    ]
+                )
+            )
+            for one in (model, other.fit(task.demonstrations(5)))
+        ]
+        assert errors[0] == pytest.approx(errors[1])
+
+    def test_it_is_saved_with_the_operators_that_were_found(self, model, tmp_path):
+        model.save(tmp_path / "model")
+        again = TaskParameterizedGMM.load(tmp_path / "model")
+        assert again.operators_ == model.operators_
+        assert again.operators == list(model.operators_)
+        assert again.operator_selection_ is None
+
+    def test_a_selection_of_ones_own_is_asked(self, task):
+        mine = OperatorSelection(threshold=1e3)
+        model = TaskParameterizedGMM(4, mine, HAND).fit(task.demonstrations(3))
+        assert len(model.operators_) == 1
+        assert not hasattr(mine, "support_")
+        assert clone(model).get_params()["operators__threshold"] == 1e3
+
+    def test_what_is_left_out_is_left_out_of_the_selection_too(self, task):
+        """A frame in a wrong place, in one demonstration."""
+        shown, name = task.demonstrations(8), task.relevant[0]
+        wrong = Frame(shown[3].frames[name].position + 0.5, shown[3].frames[name].orientation)
+        shown[3] = replace(shown[3], frames={**shown[3].frames, name: wrong})
+        with pytest.warns(UserWarning, match="1 of 8 are unlike the others"):
+            model = TaskParameterizedGMM(8, "auto", HAND).fit(shown)
+        assert model.demonstration_weights_.tolist() == [1, 1, 1, 0, 1, 1, 1, 1]
+        alone = OperatorSelection(robot=HAND).fit([*shown[:3], *shown[4:]])
+        np.testing.assert_array_equal(model.operator_selection_.relevance_, alone.relevance_)
+
+    def test_each_fold_finds_its_own(self, task):
+        shown = task.demonstrations(5)
+        model = TaskParameterizedGMM(4, "auto", HAND)
+        [fold] = fit_folds(model, shown, [[0, 1, 2, 3]])
+        assert fold.operators_ == clone(model).fit(shown[:4]).operators_
+        assert fold.operator_selection_ is not None
+
+    def test_batches_are_refused(self, task):
+        shown = task.demonstrations(4)
+        with pytest.raises(DataError, match="fit an OperatorSelection to some of them"):
+            TaskParameterizedGMM(4, "auto", HAND).fit([shown[:2], shown[2:]])

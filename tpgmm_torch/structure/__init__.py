@@ -1,0 +1,1 @@
+"""What a skill is made of, found in demonstrations: operators that matter, components."""
