@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         TaskParameters,
     )
     from tpgmm_torch.regression.regression import Estimate
+    from tpgmm_torch.regression.via_points import ViaPoint
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.tracked_poses import Poses
@@ -89,6 +90,7 @@ __all__ = [
     "TrackingPlan",
     "Trajectory",
     "Trust",
+    "ViaPoint",
     "WaitingClock",
     "find_holds",
     "load_exported",
@@ -124,6 +126,7 @@ _HOMES = {
     ),
     "robots.tracked_poses": ("Poses",),
     "regression.regression": ("Estimate",),
+    "regression.via_points": ("ViaPoint",),
     "robots.robot": ("Robot",),
     "sensing.pose_filter": ("OneEuro",),
     "sensing.trust": ("Trust",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -49,14 +50,16 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
 from tpgmm_torch.plausibility.check import learning_report, summarize, summarized
-from tpgmm_torch.plausibility.findings import PLAUSIBILITY
+from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Finding, Report
 from tpgmm_torch.plausibility.outlying_demonstrations import left_out, outlying_demonstrations
 from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.sensing.pose_filter import OneEuro
@@ -209,6 +212,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         1 for each demonstration that was learned from, 0 for each that was left out; the
         mixing coefficients are ``weights_``. None for demonstrations in batches or in several
         processes, and for a model that was loaded or made from parameters.
+    via_points_ : tuple of ViaPoint
+        Those that the skill passes through, see :meth:`with_via_points`.
+    via_fade_ : float
+        For how long before and after them it is another [s].
     shown_ : Shown or None
         What the demonstrations showed: ranges of start postures and frames. None for a model
         that was made from parameters.
@@ -266,6 +273,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     operator_selection_: OperatorSelection | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
+    via_points_: tuple[ViaPoint, ...]
 
     #: What compiles; None until :meth:`compile` is called.
     _backend: str | None = None
@@ -472,6 +480,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         situations_report(situations, self.shown_, self.time_, self.kinematics_).act(
             self.plausibility
         )
+        via = self._conditioning()
         trajectories = rollout(
             self.regression(),
             situations,
@@ -480,7 +489,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             bounds,
             candidates,
             self.holds_,
+            via,
         )
+        if via is not None:
+            self._missed(via, situations, trajectories).act(self.plausibility)
         if self.shown_ is None or self.shown_.novelty is None:
             return trajectories
         novelty = self.shown_.novelty
@@ -529,6 +541,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         0.5
         """
         self._check_fitted()
+        if self.via_points_:
+            raise DataError(
+                "a step has no memory, and cannot tell how far via-points have moved the "
+                "robot: use controller()"
+            )
         kinematics, regression = self.kinematics_, self.regression()
         like = kinematics.lower
         known = {name: frame.to(like) for name, frame in (frames or {}).items()}
@@ -578,18 +595,17 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._check_fitted()
         check_compiler(backend)
         previous, self._backend = self._backend, backend
-        untried, self._untried = self._untried, False
         try:
             batch = () if n_robots == 1 else (n_robots,)
             like = self.time_
             start = like.new_zeros(*batch, self.kinematics_.n_joints)
             here = Frame(like.new_zeros(*batch, 3))
-            self.step(float(like[0]), start, dict.fromkeys(self.frame_names_, here))
+            limits = (self.kinematics_.lower, self.kinematics_.upper)
+            frames = dict.fromkeys(self.frame_names_, here)
+            self.regression().tick(like[0], start, frames, limits if self.keep_limits else None)
         except BaseException:
             self._backend = previous
             raise
-        finally:
-            self._untried = untried
         return self
 
     def export(
@@ -628,6 +644,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._check_fitted()
         if not isinstance(bounds, MotionBounds):
             bounds = self.motion_bounds(**(bounds or {}))
+        if self.via_points_:
+            raise DataError("export() knows no via-points: use controller()")
         if self.holds_ or not self.keep_limits or self.time_.device.type != "cpu":
             raise DataError(
                 "export() serves models on the CPU with keep_limits=True in which nothing is "
@@ -715,7 +733,96 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             impedance=impedance or Impedance(self.kinematics_),
             holds=self.holds_,
             novelty=None if self.shown_ is None else self.shown_.novelty,
+            via=self._conditioning(),
         )
+
+    def with_via_points(self, points: Iterable[ViaPoint | str], fade: float = 1.0) -> Self:
+        """The model, conditioned on via-points: nothing is learned anew.
+
+        :meth:`predict`, :meth:`controller` and :meth:`sample` pass through them; further than
+        ``fade`` from their times the skill is what it was. See
+        :mod:`tpgmm_torch.regression.conditioning`.
+
+        Parameters
+        ----------
+        points : iterable of ViaPoint or str
+            All that count; those that the model had are replaced, and none are left by ``[]``.
+            Text is for :meth:`ViaPoint.parse`. Frames that the model does not know have to be
+            in the situations then.
+        fade : float, default=1.0
+            For how long before and after a via-point the skill is another [s].
+
+        Returns
+        -------
+        TaskParameterizedGMM
+            Another one, which shares what was learned.
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError, NotFittedError
+            If a via-point is not of this robot, or not within the time of the skill.
+
+        Examples
+        --------
+        >>> time = np.linspace(0, 2, 50)
+        >>> shown = [Demonstration(time, (time * end)[:, None]) for end in (0.9, 1.0, 1.1)]
+        >>> model = TaskParameterizedGMM(n_components=2, blend=0).fit(shown)
+        >>> other = model.with_via_points([ViaPoint(1.0, "canonical", [1.3])], fade=0.5)
+        >>> [trajectory] = other.predict([Situation(joints=[0.0], time=[0.0, 1.0, 2.0])])
+        >>> [round(q, 2) for q in trajectory.joints[:, 0].tolist()]
+        [0.0, 1.3, 2.0]
+        """
+        self._check_fitted()
+        given = [ViaPoint.parse(p) if isinstance(p, str) else p for p in points]
+        begin, end = float(self.time_[0]), float(self.time_[-1])
+        for point in given:
+            if not isinstance(point, ViaPoint):
+                raise DataError(f"via-points are ViaPoint objects, got {type(point).__name__}")
+            if not begin <= point.time <= end:
+                raise DataError(
+                    f"the via-point {point} is at {point.time:g} s, but the skill lasts from "
+                    f"{begin:g} to {end:g} s"
+                )
+            references = point.operator.references()
+            point.operator.check(self.kinematics_, references)
+            if strangers := set(point.operator.links()) - set(self.kinematics_.links):
+                name, links = strangers.pop(), self.kinematics_.links
+                raise UnknownNameError("link", name, "the robot", links)
+        Conditioning.of(self.regression(), given, fade)
+        other = copy.copy(self)
+        other.via_points_, other.via_fade_ = tuple(given), float(fade)
+        operators = [*self.operators_, *(point.operator for point in given)]
+        other.frame_names_ = frame_names(operators, self.kinematics_)
+        return other
+
+    def _missed(
+        self,
+        via: Conditioning,
+        situations: Sequence[Situation],
+        trajectories: Sequence[Trajectory],
+    ) -> Report:
+        """Which trajectories do not pass through the via-points."""
+        findings = [
+            Finding(
+                "via-points",
+                "unlikely",
+                f"situation {n}: {point} is missed by {miss:.3g} m or rad",
+                "Can the robot reach it, in so short a time? A longer fade asks for less "
+                "speed, and keep_limits=False for what no robot has to follow",
+                episodes=(n,),
+                value=miss,
+            )
+            for n, (there, done) in enumerate(zip(situations, trajectories, strict=True))
+            for point, miss in via.missed(done.time, done.joints, there.frames)
+            if not self.holds_  # a frame that is held is not where the situation has it
+        ]
+        return Report.of(findings, f"{len(situations)} situations with via-points")
+
+    def _conditioning(self) -> Conditioning | None:
+        """Of the reproduction on the via-points, if there are some."""
+        if not self.via_points_:
+            return None
+        return Conditioning.of(self.regression(), self.via_points_, self.via_fade_)
 
     def sample(
         self,
@@ -920,6 +1027,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
         self.shown_ = self.demonstration_weights_ = self.operator_selection_ = None
+        self.shown_ = self.demonstration_weights_ = None
+        self.via_points_, self.via_fade_ = (), 1.0
         self._untried = True
         return self
 
@@ -1001,17 +1110,23 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             parameters["random_state"] = None
         if not isinstance(parameters["holds"], str | None):
             parameters["holds"] = [hold.to_list() for hold in parameters["holds"]]
-        config = {
+        config: dict[str, Any] = {
             "parameters": parameters,
             "operators": [encode(operator) for operator in self.operators_],
             "kinematics": encode(self.kinematics_),
-            "frames": list(self.frame_names_),
+            "frames": list(frame_names(self.operators_, self.kinematics_)),
             "holds": [hold.to_list() for hold in self.holds_],
             "n_iter": self.n_iter_,
             "converged": bool(self.converged_),
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
             "shown": None if self.shown_ is None else self.shown_.config(),
         }
+        if self.via_points_:
+            config["via_points"] = [
+                [one.time, encode(one.operator), one.value, one.tolerance]
+                for one in self.via_points_
+            ]
+            config["via_fade"] = self.via_fade_
         if self.acceleration_ is not None and self.jerk_ is not None:
             config["peaks"] = [self.acceleration_.tolist(), self.jerk_.tolist()]
         tensors = {"weights": self.weights_, "time": self.time_}
@@ -1082,6 +1197,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 model._set_peaks(acceleration, jerk)
             if config.get("shown") is not None:
                 model.shown_ = Shown.from_config(config["shown"])
+            if via := config.get("via_points"):
+                model = model.with_via_points(
+                    [
+                        ViaPoint(time, decode(one, custom), _via_value(value), tolerance)
+                        for time, one, value, tolerance in via
+                    ],
+                    config["via_fade"],
+                )
         except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, ModelFileError):
                 raise
@@ -1281,6 +1404,11 @@ def _first(situation: Situation) -> dict[str, Frame]:
     return {
         n: frame[0] if frame.batch_shape else frame for n, frame in situation.frames.items()
     }
+
+
+def _via_value(value: Sequence[Any]) -> Any:
+    """What JSON made a list of: numbers, or pairs of joints and numbers."""
+    return dict(value) if value and isinstance(value[0], Sequence) else value
 
 
 def _moved(tensors: Mapping[str, Tensor], device: str, path: str | Path) -> dict[str, Tensor]:

@@ -117,7 +117,7 @@ class CompiledRegression(Regression):
         if not math.isfinite(mean.sum().item()):  # the plain tick says what is wrong
             return super().tick(time, joints, frames, bounds)
         estimate = Estimate(mean, covariance, results[0][2] @ components.places)
-        return self._bounded(estimate, bounds)
+        return self.bounded(estimate, bounds)
 
     def __getstate__(self) -> dict[str, Any]:
         """What can be stored: graphs are compiled again."""

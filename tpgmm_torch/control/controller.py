@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.plausibility.situations import START
+from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -41,6 +42,8 @@ PUSH_MEMORY = 0.5
 #: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
 #: another one for each size, ends there, before whoever follows enlarges it.
 GRID = 2.0**32
+
+_Joints = TypeVar("_Joints", Tensor, Tensor | None)
 
 
 class Controller:
@@ -83,6 +86,8 @@ class Controller:
         What stiffness and damping are made with.
     novelty : Novelty, optional
         What tells how new the situation is.
+    via : Conditioning, optional
+        Via-points through which the robots pass.
 
     Attributes
     ----------
@@ -119,6 +124,7 @@ class Controller:
         feedback: str = "reference",
         impedance: Impedance | None = None,
         novelty: Novelty | None = None,
+        via: Conditioning | None = None,
     ) -> None:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
@@ -145,7 +151,7 @@ class Controller:
             # what is rounded keeps within them
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
             self._position_bounds = low / GRID, high / GRID
-        self._search = PostureSearch()
+        self._search, self._via = PostureSearch(), via
         self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
         self._gap_before: NDArray[np.float64] | None = None  # reference and robot, last tick
@@ -220,7 +226,8 @@ class Controller:
                 passed = torch.where(halted, 0.0, torch.as_tensor(passed, dtype=torch.float64))
             holding = self.holding
             observed = Observation(
-                measured, self._asked, None, holding.frames, last.estimate,
+                self._unbent(measured), self._unbent(self._asked), None,
+                holding.frames, last.estimate,
                 holding.state if holding.carries else None,
             )  # fmt: skip
             self._progress = before.advance(passed, observed)
@@ -247,11 +254,19 @@ class Controller:
                 self._inputs.poses.keys() - known, self._frames, stands, self.holding, dt
             )
         self.holding = self.holding.advance(time, stands, seen, told)
-        estimate = self._estimated(time, at)
+        before_bend = self._bend
+        at = self._unbent(at)
+        free = estimate = self._estimated(time, at)
+        if self._via is not None:
+            estimate, self._via = self._conditioned(time, free)
         shift = self._fade(estimate.joints, 0.0 if last is None else dt)
         wanted = self._shifted(estimate.joints, shift)
         if self._follower is not None and last is not None and not self._follows(wanted, dt):
-            wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
+            # what via-points ask for is not what the search is for
+            steady = wanted - (self._bend - before_bend)
+            found = self._searched(time, at, free, steady, dt)
+            if found is not free.joints:
+                wanted = self._shifted(found + (estimate.joints - free.joints), shift)
         if last is not None and ended is not None and bool(ended.any()):
             # for them it is as if all had come to the end
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
@@ -349,6 +364,28 @@ class Controller:
 
     def _carrying(self, joints: Tensor) -> RobotState:
         return self.holding.state(self._regression.kinematics.state(joints))
+
+    @property
+    def _bend(self) -> Tensor | float:
+        """By how much via-points moved the last estimate."""
+        shift = None if self._via is None else self._via.shift
+        return 0.0 if shift is None else shift
+
+    def _unbent(self, joints: _Joints) -> _Joints:
+        """Joints as they would be without via-points, for what knows of none."""
+        return joints if joints is None or self._via is None else joints - self._bend
+
+    def _conditioned(self, time: Tensor, free: Estimate) -> tuple[Estimate, Conditioning]:
+        """The estimate, given the via-points; as it is where they cannot be told."""
+        assert self._via is not None
+        holding = self.holding
+        attach = holding.state if holding.carries else None
+        try:
+            return self._via.advance(time, free, holding.frames, self._position_bounds, attach)
+        except TPGMMError:
+            if self._trust is None or self.command is None:
+                raise
+            return free, self._via
 
     def _estimated(self, time: Tensor, at: Tensor) -> Estimate:
         """What the model asks for; not finite for robots of which it cannot tell."""

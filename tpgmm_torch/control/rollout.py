@@ -14,6 +14,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.regression import PART, Estimate, Regression
 
 __all__ = ["rollout"]
@@ -27,6 +28,7 @@ def rollout(
     bounds: MotionBounds | None,
     candidates: bool,
     holds: Sequence[Hold] = (),
+    via: Conditioning | None = None,
 ) -> list[Trajectory]:
     """Closed kinematic loop: each reference is the state q_{t-1} of the next step.
 
@@ -46,6 +48,8 @@ def rollout(
         Whether to keep each operator's own estimate.
     holds : sequence of Hold, default=()
         From when to when links hold objects.
+    via : Conditioning, optional
+        Via-points through which they pass.
 
     Returns
     -------
@@ -56,7 +60,7 @@ def rollout(
     for members in _groups(situations):
         batch = [situations[index] for index in members]
         together = _run_together(
-            regression, batch, skill_time, blend, bounds, candidates, holds
+            regression, batch, skill_time, blend, bounds, candidates, holds, via
         )
         trajectories.update(zip(members, together, strict=True))
     return [trajectories[index] for index in range(len(situations))]
@@ -80,6 +84,7 @@ def _run_together(
     bounds: MotionBounds | None,
     candidates: bool,
     holds: Sequence[Hold],
+    via: Conditioning | None,
 ) -> list[Trajectory]:
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
@@ -103,6 +108,7 @@ def _run_together(
         blend=blend,
         holds=holds,
         bounds=bounds,
+        via=via,
         at_rest=False,  # a situation does not say how its robot moves
     )
     references: list[torch.Tensor] = []

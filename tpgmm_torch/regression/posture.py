@@ -42,9 +42,9 @@ from tpgmm_torch.operators.base import Reference
 from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.regression.kalman_update import TASKS
 from tpgmm_torch.regression.regression import Estimate, Regression
-from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["PostureSearch"]
+__all__ = ["PostureSearch", "Residual"]
 
 #: Steps that are tried in one tick: the time that they take is all that trouble may cost.
 TRIALS = 2
@@ -296,7 +296,7 @@ class _Cost:
             chosen = one.select(index)
             elapsed = (time - chosen.time_mean).unsqueeze(-1)
             mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
-            term = _Residual.of(operator, regression)
+            term = Residual.of(operator, regression.kinematics)
             self.local.append((term, mean, chosen.covariance))
         closed = any(operator.determines_joints for operator in regression.operators)
         self.prior = None if closed else torch.as_tensor(regression.prior_std).to(centre) ** -2
@@ -344,7 +344,7 @@ class _Cost:
 
 
 @dataclass(frozen=True, eq=False)
-class _Residual:
+class Residual:
     """The displacement that an operator asks for, and its exact derivative.
 
     A linearisation is exact where the displacement is small; of a rotation that is still to go,
@@ -359,6 +359,8 @@ class _Residual:
         Where the operator's quaternions are; None if it has none.
     turns : Tensor of shape (Q, 3), optional
         The rows of their displacements; None if they are not known.
+    half_gains : Tensor of shape (Q,)
+        Half of each quaternion operator's gain.
     leaves : tuple
         Position and orientation operators that refer to a frame, and their first rows.
     """
@@ -370,9 +372,9 @@ class _Residual:
     leaves: tuple[tuple[Any, int], ...]
 
     @classmethod
-    def of(cls, operator: Operator, regression: Regression) -> Self:
-        """For one of a regression's operators."""
-        kinematics, like = regression.kinematics, regression.kinematics.lower
+    def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
+        """For an ``operator`` on the joints of ``kinematics``."""
+        like = kinematics.lower
         starts = operator.quaternion_starts(kinematics)
         blocks = quaternions.quaternion_blocks(starts, operator.dimension(kinematics)).to(like)
         parts = operator.leaves if isinstance(operator, Stack) else (operator,)

@@ -140,7 +140,7 @@ class Regression:
 
         ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
         """
-        estimate = self._bounded(self._estimate(time, state, frames), bounds)
+        estimate = self.bounded(self._estimate(time, state, frames), bounds)
         if not candidates:
             return estimate
         return replace(estimate, candidates=self.candidates(time, state, frames, estimate))
@@ -165,7 +165,7 @@ class Regression:
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
             state = self.kinematics.state(joints) if given is None else given
-            return self._bounded(self._estimate(time, state, frames), bounds)
+            return self.bounded(self._estimate(time, state, frames), bounds)
         if given is not None:
             given = given.flatten(batch)
         joints = joints.expand(*batch, -1).flatten(0, -2)
@@ -184,7 +184,7 @@ class Regression:
         if activation.ndim > 1:
             activation = torch.cat([part.activation for part in parts])[back]
             activation = activation.unflatten(0, batch)
-        return self._bounded(Estimate(mean, covariance, activation), bounds)
+        return self.bounded(Estimate(mean, covariance, activation), bounds)
 
     def fuse(
         self,
@@ -388,8 +388,8 @@ class Regression:
         return Estimate(joints, covariance, weights @ components.places)
 
     @staticmethod
-    def _bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
-        """The estimate, given that joints keep within bounds if there are some."""
+    def bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
+        """An ``estimate``, given that joints keep within ``bounds`` if there are some."""
         if bounds is None:
             return estimate
         joints = within(estimate.joints, estimate.covariance, *bounds)

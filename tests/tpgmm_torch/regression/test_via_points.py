@@ -1,0 +1,83 @@
+"""Via-points as they are written, and what is refused."""
+
+import pytest
+import torch
+
+from tests.support.skills import hands, small_bottle
+from tpgmm_torch import Frame, ViaPoint
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "3.2:position:l_hand@bottle=0.0,0.0,0.1",
+        "1.5:position:l_hand + orientation:l_hand=0.3,0.1,0.2,1.0,0.0,0.0,0.0~0.01",
+        "0.25:canonical=l_elbow:0.4,r_elbow:-0.1~0.001",
+        "2.0:position:r_hand=0.3,0.1,0.2~1.0,1.0,0.0001",
+    ],
+)
+def test_text_is_read_and_written(text):
+    point = ViaPoint.parse(text)
+    assert str(point) == text
+    assert ViaPoint.parse(str(point)) == point
+
+
+@pytest.mark.parametrize(
+    "text", ["", "3.2", "position:l_hand=0,0,0", "a:canonical=1", "1:canonical=x,y", "1:hand=0"]
+)
+def test_other_text_is_refused(text):
+    with pytest.raises(DataError):
+        ViaPoint.parse(text)
+
+
+def test_a_frame_is_a_pose():
+    frame = Frame([0.1, 0.2, 0.3], [0.0, 1.0, 0.0, 0.0])
+    point = ViaPoint(1.0, "pose:l_hand", frame)
+    assert point.value == (0.1, 0.2, 0.3, 0.0, 1.0, 0.0, 0.0)
+
+
+def test_some_joints_go_by_name():
+    kinematics = small_bottle().kinematics_
+    wanted = ViaPoint(1.0, "canonical", {"l_elbow": 0.4}).coordinates(kinematics)
+    assert wanted.isfinite().sum() == 1
+    assert float(wanted[kinematics.joint_names.index("l_elbow")]) == 0.4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((1.0, "canonical", {"nose": 0.4}), UnknownNameError, "nose"),
+        ((1.0, "position:l_hand", [0.1, 0.2]), ShapeError, "2 numbers"),
+        ((1.0, "orientation:l_hand", [2.0, 0, 0, 0]), DataError, "norm 2"),
+        ((1.0, "position:l_hand", [0, 0, 0], [0.1, 0.1]), ShapeError, "2 tolerances"),
+        ((99.0, "position:l_hand", [0, 0, 0]), DataError, "lasts from"),
+        ((1.0, "position:nose", [0, 0, 0]), UnknownNameError, "nose"),
+    ],
+)
+def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        small_bottle().with_via_points([ViaPoint(*arguments)])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (1.0, "position:l_hand", {"x": 0.0}),
+        (1.0, "position:l_hand", []),
+        (float("nan"), "position:l_hand", [0, 0, 0]),
+        (1.0, "position:l_hand", [0, 0, 0], -1.0),
+        (1.0, None, [0, 0, 0]),
+    ],
+)
+def test_what_is_none_is_refused(arguments):
+    with pytest.raises(DataError):
+        ViaPoint(*arguments)
+
+
+def test_a_step_and_an_export_know_no_via_points(tmp_path):
+    model = hands().with_via_points(["1:position:left=0,0,0"])
+    with pytest.raises(DataError, match="controller"):
+        model.step(0.5, torch.zeros(14))
+    with pytest.raises(DataError, match="controller"):
+        model.export(tmp_path / "controller.pt2")
