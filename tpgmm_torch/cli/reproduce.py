@@ -50,6 +50,19 @@ def reproduce(
     units: options.Units = None,
     joints: options.Joints = None,
     rate: options.Rate = None,
+    via: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="A via-point, repeatable: TIME:OPERATOR=NUMBERS~TOLERANCE, as in "
+            "3.2:position:l_hand@bottle=0,0,0.1 or 3.2:canonical=l_elbow:0.4; in place of "
+            "those that were saved with the model.",
+            metavar="VIA",
+        ),
+    ] = None,
+    fade: Annotated[
+        float,
+        typer.Option(help="Seconds before and after a via-point that it changes.", min=1e-3),
+    ] = 1.0,
 ) -> None:
     """Reproduce a skill in new situations.
 
@@ -77,6 +90,8 @@ def reproduce(
         ]
     elif situations is not None:
         wanted = read_situations(situations, kinematics.joint_names)
+    if via:
+        fitted = fitted.with_via_points(via, fade)
     trajectories = fitted.predict(wanted, candidates=False)
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):

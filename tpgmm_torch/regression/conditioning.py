@@ -71,7 +71,7 @@ def wendland(distance: Tensor) -> Tensor:
     Parameters
     ----------
     distance : Tensor of shape (...)
-        r, not negative.
+        Not negative: r.
     """
     left = (1 - distance).clamp(min=0.0)
     return left**5 * (8 * distance**2 + 5 * distance + 1)
@@ -145,6 +145,10 @@ class Conditioning:
         How long before and after a via-point the reproduction is another [s].
     shift : Tensor of shape (..., n_joints), optional
         ``e_t`` of the last tick; None where nothing was moved.
+    clusters : tuple
+        What is asked for, by times; made by :meth:`of`.
+    moved : tuple of Tensor of shape (..., A n_joints), optional
+        ``e_a`` of each cluster at the last tick, to go on from.
 
     Raises
     ------
@@ -156,8 +160,8 @@ class Conditioning:
     points: Sequence[ViaPoint]
     fade: float
     shift: Tensor | None = None
-    _clusters: tuple[_Cluster, ...] = ()
-    _moved: tuple[Tensor | None, ...] = ()
+    clusters: tuple[_Cluster, ...] = ()
+    moved: tuple[Tensor | None, ...] = ()
 
     @classmethod
     def of(cls, regression: Regression, points: Sequence[ViaPoint], fade: float) -> Self:
@@ -202,17 +206,17 @@ class Conditioning:
         conditioning : Conditioning
             For the next tick.
         """
-        if not any(cluster.counts(time, self.fade) for cluster in self._clusters):
+        if not any(cluster.counts(time, self.fade) for cluster in self.clusters):
             if self.shift is None:
                 return estimate, self
-            return estimate, replace(self, shift=None, _moved=(None,) * len(self._clusters))
+            return estimate, replace(self, shift=None, moved=(None,) * len(self.clusters))
         if not bool(estimate.joints.isfinite().all()):  # of whom it cannot be told: as it was
             kept = estimate.joints if self.shift is None else estimate.joints + self.shift
             return replace(estimate, joints=kept), self
         look = _Look(self.regression, frames, bounds, attach)
         here, moved_by = look(time, estimate.joints), []
         shift, covariance = torch.zeros_like(here.joints), here.covariance
-        for cluster, last in zip(self._clusters, self._moved, strict=True):
+        for cluster, last in zip(self.clusters, self.moved, strict=True):
             there = None
             if cluster.counts(time, self.fade):
                 moved, narrowed, there = cluster.condition(time, self.fade, here, look, last)
@@ -220,7 +224,7 @@ class Conditioning:
             moved_by.append(there)
         given = replace(estimate, joints=here.joints + shift, covariance=covariance)
         conditioned = self.regression.bounded(given, bounds)
-        return conditioned, replace(self, shift=shift, _moved=tuple(moved_by))
+        return conditioned, replace(self, shift=shift, moved=tuple(moved_by))
 
     def missed(
         self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]
