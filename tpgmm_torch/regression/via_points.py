@@ -190,7 +190,7 @@ class ViaPoint:
         Parameters
         ----------
         n_displacements : int
-            m, of the operator.
+            Of the operator.
 
         Raises
         ------
