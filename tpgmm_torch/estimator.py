@@ -42,14 +42,20 @@ from tpgmm_torch.exceptions import (
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
+from tpgmm_torch.large_data.row_batches import StoredRows
 from tpgmm_torch.large_data.row_file import RowFile
-from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture, fit_subsets
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import MODEL, decode, encode
-from tpgmm_torch.plausibility.check import learning_report, summarize, summarized
+from tpgmm_torch.plausibility.check import (
+    episodes_report,
+    learning_report,
+    summarize,
+    summarized,
+)
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Finding, Report
 from tpgmm_torch.plausibility.outlying_demonstrations import left_out, outlying_demonstrations
 from tpgmm_torch.plausibility.shown import Shown
@@ -66,6 +72,7 @@ from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.training.hold_detection import holds_for
+from tpgmm_torch.training.kept_rows import KeptRows
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
@@ -78,6 +85,7 @@ from tpgmm_torch.training.training_rows import (
     check_shares,
     checked_batches,
     gather_rows,
+    on_grid,
     rows_in_memory,
     split_batches,
 )
@@ -268,12 +276,20 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "verbose": ["verbose"],
     }
 
+    weights_: Tensor
+    means_: list[Tensor]
+    covariances_: list[Tensor]
+    time_: Tensor
+    holds_: tuple[Hold, ...]
+    via_fade_: float
     shown_: Shown | None
     demonstration_weights_: Tensor | None
     operator_selection_: OperatorSelection | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
     via_points_: tuple[ViaPoint, ...]
+    #: What :meth:`partial_fit` goes on with.
+    _kept: KeptRows | None
 
     #: What compiles; None until :meth:`compile` is called.
     _backend: str | None = None
@@ -415,6 +431,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             self._learn(gathered, operators, kinematics, checkpoint, holds)
             self.shown_, self.demonstration_weights_ = shown, weights
             self.operator_selection_ = selection
+            self._kept = KeptRows.of(
+                gathered, list(map(len, known)), weights.nonzero()[:, 0].tolist()
+            )
             peaks = demonstrated_peaks(known, kinematics.joint_names)
             return self._set_peaks(*peaks)
         if self.selects:
@@ -444,6 +463,133 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             self._learn(gathered, operators, kinematics, checkpoint, holds)
             self.shown_ = shown
         return self._set_peaks(*seen.result(processes))
+
+    def partial_fit(
+        self,
+        X: Iterable[Demonstration] = (),
+        y: object = None,
+        *,
+        forget: int | Sequence[int] = 0,
+    ) -> Self:
+        """Go on learning, with more demonstrations or with fewer.
+
+        EM goes on from where it was, with the local data of the demonstrations of before,
+        which the model keeps, and of those: the result is what ``fit`` of all of them gives
+        with ``warm_start=True, robust=False`` and the holds of now, to rounding. With one
+        component it is that of any fit. No demonstration is left out for being unlike the
+        others: corrections are.
+
+        Parameters
+        ----------
+        X : iterable of Demonstration
+            In the time of the skill, that of ``time_``; of segments of it, only what they show
+            counts. :func:`tpgmm_torch.corrections.in_skill_time` brings others there.
+        y : ignored
+            Here for scikit-learn.
+        forget : int or sequence of int, default=0
+            How many of the oldest demonstrations not to learn from any longer, or which, as
+            they are counted in ``demonstration_weights_``.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError
+            If demonstrations are of another robot, or not in the time of the skill, if none is
+            left, or if those of before were not kept: they were read in batches, or not saved
+            with the model, ``save(path, demonstrations=True)``.
+        PlausibilityError
+            If they cannot be what they are taken for.
+        """
+        self._check_fitted()
+        kept, weights = self._kept, self.demonstration_weights_
+        if kept is None or weights is None or self.shown_ is None:
+            raise DataError(
+                "the model does not have the demonstrations that it was learned from: fit it "
+                "in one process, without batches, and save it with demonstrations=True "
+                "(tpgmm fit --keep-demonstrations)"
+            )
+        operators, kinematics = self.operators_, self.kinematics_
+        shown = list(X)
+        added = check_demonstrations(shown) if shown else []
+        peaks = None
+        if self.acceleration_ is not None and self.jerk_ is not None:
+            peaks = self.acceleration_, self.jerk_
+        seen, via, weights = self.shown_, (self.via_points_, self.via_fade_), weights.clone()
+        begun = len(weights)
+        if added:
+            for operator in operators:
+                operator.check(kinematics, added[0].frames)
+            episodes = summarize(added, kinematics)
+            episodes_report(episodes, kinematics).act(self.plausibility)
+            seen = seen.and_also(Shown.of(episodes, kinematics))
+            placed = [
+                on_grid(d, self.time_, kinematics) if kept.n_instants else (d, 0) for d in added
+            ]
+            added = [one for one, _ in placed]
+            expected = self.regression().expected
+            rows = local_data(added, operators, kinematics, expected, self.holds_)
+            arrays = [row.cpu().numpy() for row in rows]
+            kept = kept.and_also(arrays, [first for _, first in placed], begun)
+            weights = torch.cat((weights, weights.new_ones(len(added))))
+            if peaks is not None and min(map(len, added)) > 3:
+                more = demonstrated_peaks(added, kinematics.joint_names)
+                like = peaks[0]
+                peaks = (
+                    torch.maximum(peaks[0], more[0].to(like)),
+                    torch.maximum(peaks[1], more[1].to(like)),
+                )
+        forgotten = self._forgotten(forget, weights)
+        weights[forgotten] = 0.0
+        kept = kept.without(forgotten)
+        self._learn_again(kept)
+        self.shown_, self.demonstration_weights_, self._kept = seen, weights, kept
+        self.via_points_, self.via_fade_ = via
+        operators = (*operators, *(point.operator for point in self.via_points_))
+        self.frame_names_ = frame_names(operators, kinematics)
+        return self if peaks is None else self._set_peaks(*peaks)
+
+    @staticmethod
+    def _forgotten(forget: int | Sequence[int], weights: Tensor) -> list[int]:
+        """The numbers of demonstrations that are not to be learned from any longer."""
+        there = weights.nonzero()[:, 0].tolist()
+        if isinstance(forget, int):
+            if not 0 <= forget < len(there):
+                raise DataError(f"forget is from 0 to {len(there) - 1} here, got {forget}")
+            return list(there[:forget])
+        if strangers := sorted(set(forget) - set(there)):
+            raise DataError(
+                f"there are no demonstrations {strangers} to forget; learned from are {there}"
+            )
+        return list(forget)
+
+    def _learn_again(self, kept: KeptRows) -> None:
+        """EM from where it was, on rows that were kept."""
+        operators, kinematics, before = self.operators_, self.kinematics_, self.mixture_
+        widths = block_widths(operators, kinematics)
+        table, members, group_size = kept.table(widths, self.time_)
+        moments = column_moments(StoredRows(table[members]))
+        shares = members.sum() / (kept.n_instants or len(members) / len(kept.rows))
+        mixture = BlockGaussianMixture(
+            **self._shared_settings(operators, kinematics)
+            | {
+                "reg_covar": regularization(
+                    moments,
+                    operators,
+                    kinematics,
+                    reg_covar=self.reg_covar,
+                    covariance_type=self.covariance_type,
+                ),
+                "n_demonstrations": float(shares),
+                "weights_init": before.weights_,
+                "means_init": before.means_,
+                "covariances_init": before.unshrunk_covariances,
+            }
+        )
+        fit_subsets([mixture], table, members[None], group_size, [moments])
+        self.set_mixture(mixture, operators, kinematics, self.time_, self.holds_)
 
     def predict(
         self, X: Situation | Sequence[Situation], *, candidates: bool = True
@@ -1026,8 +1172,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_iter_ = getattr(mixture, "n_iter_", 0)
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
-        self.shown_ = self.demonstration_weights_ = self.operator_selection_ = None
         self.shown_ = self.demonstration_weights_ = None
+        self.operator_selection_ = self._kept = None
         self.via_points_, self.via_fade_ = (), 1.0
         self._untried = True
         return self
@@ -1089,10 +1235,17 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         kinematics = robot.to(time.dtype, model.device)
         return model.set_mixture(mixture, checked, kinematics, time, holds)
 
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, *, demonstrations: bool = False) -> None:
         """Write the fitted model to a directory (config.json, model.safetensors), atomically.
 
         A ``random_state`` that is not an int is not kept: it has no meaning for a fitted model.
+
+        Parameters
+        ----------
+        path : str or Path
+        demonstrations : bool, default=False
+            Whether to keep what :meth:`partial_fit` needs, the demonstrations' local data:
+            8 bytes for each time step and coordinate.
 
         Raises
         ------
@@ -1134,6 +1287,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             zip(self.means_, self.covariances_, strict=True)
         ):
             tensors |= {f"means.{j}": mean, f"covariances.{j}": covariance}
+        if demonstrations:
+            if self._kept is None or self.demonstration_weights_ is None:
+                raise DataError("the model does not have its demonstrations: fit it again")
+            config["kept"] = [self._kept.first, self._kept.numbers, self._kept.n_instants]
+            tensors["demonstration_weights"] = self.demonstration_weights_
+            for j, covariance in enumerate(self.mixture_.unshrunk_covariances):
+                tensors[f"unshrunk.{j}"] = covariance
+            for m, rows in enumerate(self._kept.rows):
+                tensors[f"rows.{m}"] = torch.from_numpy(np.ascontiguousarray(rows))
         MODEL.write(path, config, tensors)
 
     @classmethod
@@ -1162,7 +1324,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             kinematics = decode(config["kinematics"], custom)
             for operator in operators:
                 operator.check(kinematics, config["frames"])
-            if len(tensors) != 2 + 2 * len(operators) or not operators:
+            kept = config.get("kept")
+            more = 0 if kept is None else 1 + len(operators) + len(kept[0])
+            if len(tensors) != 2 + 2 * len(operators) + more or not operators:
                 raise ModelFileError(
                     f"{path} does not fit together: {len(operators)} operators, but the "
                     f"tensors {sorted(tensors)}"
@@ -1197,6 +1361,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 model._set_peaks(acceleration, jerk)
             if config.get("shown") is not None:
                 model.shown_ = Shown.from_config(config["shown"])
+            if kept is not None:
+                first, numbers, n_instants = kept
+                rows = tuple(tensors[f"rows.{m}"].numpy() for m in range(len(first)))
+                model._kept = KeptRows(rows, tuple(first), tuple(numbers), n_instants)
+                model.demonstration_weights_ = tensors["demonstration_weights"]
+                unshrunk = [here[f"unshrunk.{j}"] for j in range(len(operators))]
+                model.mixture_.unshrunk_covariances = unshrunk
             if via := config.get("via_points"):
                 model = model.with_via_points(
                     [

@@ -21,6 +21,7 @@ from tpgmm_torch import (
     Robot,
     TaskParameterizedGMM,
     Trust,
+    ViaPoint,
     parse_clock,
 )
 from tpgmm_torch.events.text import parse_event
@@ -109,6 +110,11 @@ class TPGMMConfig(StatePolicyConfig):
         From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
         the aligned skill. By default it is found in frames that are read at every step
         (``follow_frames``); an empty list stands for nothing.
+    via_points : list of str, optional
+        Poses or postures at times of the skill, ``["3.2:position:l_hand@bottle=0,0,0.1"]``, as
+        :meth:`tpgmm_torch.ViaPoint.parse` reads them.
+    via_fade : float, default=1.0
+        For how long before and after a via-point the skill is another [s].
     robot : dict or str, optional
         The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
         the URDF in it; to begin with, the path of a URDF or ``"upper_body"``. None for
@@ -222,6 +228,8 @@ class TPGMMConfig(StatePolicyConfig):
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
     holds: list[str] | None = None
+    via_points: list[str] | None = None
+    via_fade: float = 1.0
     robot: dict[str, Any] | str | None = None
     links: list[str] = field(default_factory=list)
     joints: list[str] | str | None = None
@@ -370,6 +378,11 @@ class TPGMMConfig(StatePolicyConfig):
         """Write down what a fitted model is beside its mixture."""
         self.n_steps = len(model.time_)
         self.holds = list(map(str, model.holds_))
+        self.via_points = list(map(str, model.via_points_)) or None
+        self.via_fade = model.via_fade_
+        for text, point in zip(self.via_points or (), model.via_points_, strict=True):
+            if ViaPoint.parse(text) != point:
+                raise DataError(f"the via-point {text} is of an operator that has no text")
         self.shown = None if model.shown_ is None else model.shown_.config()
         self.peaks = None
         if model.acceleration_ is not None and model.jerk_ is not None:
@@ -382,7 +395,13 @@ class TPGMMConfig(StatePolicyConfig):
         if self.peaks is not None:
             like = model.kinematics_.lower
             model.acceleration_, model.jerk_ = (like.new_tensor(peak) for peak in self.peaks)
+        if self.via_points:
+            return model.with_via_points(self.via_points, self.via_fade)
         return model
+
+    def via_operators(self) -> list[Operator]:
+        """Whose coordinates the via-points are."""
+        return [ViaPoint.parse(text).operator for text in self.via_points or ()]
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters."""

@@ -136,7 +136,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.validate_features()
         self.kinematics = kinematics.to(getattr(torch, config.dtype))
         self.operators = tuple(operators)
-        required = frame_names(operators, self.kinematics)
+        required = frame_names([*operators, *config.via_operators()], self.kinematics)
         # an object that only stands where links do is told from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
         known |= {*(config.frames or ()), *poses_named(config.environment_names)}

@@ -33,7 +33,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("events", "structure"),
         ("control",),
         ("estimator",),
-        ("model_selection", "plotting", "viewing"),
+        ("corrections", "model_selection", "plotting", "viewing"),
         ("cli",),
     ),
     "tpgmm_datasets": (

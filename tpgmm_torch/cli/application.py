@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tpgmm_torch.cli import fit, plot, reproduce, view
+from tpgmm_torch.cli import correct, fit, plot, reproduce, view
 from tpgmm_torch.cli.commands import Commands
 
 __all__ = ["app"]
@@ -21,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (fit, reproduce, plot, view):
+for module in (fit, correct, reproduce, plot, view):
     app.registered_commands += module.app.registered_commands
 
 

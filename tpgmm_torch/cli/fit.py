@@ -129,6 +129,13 @@ def fit(
             "not with --batch-episodes."
         ),
     ] = True,
+    keep_demonstrations: Annotated[
+        bool,
+        learning(
+            "Save what 'tpgmm correct' needs of the episodes with the model, 8 bytes for each "
+            "step and coordinate; not with --batch-episodes or --format lerobot."
+        ),
+    ] = False,
     random_state: Annotated[int, learning("Seed of what is random.")] = 0,
     checkpoint: Annotated[
         Path | None,
@@ -170,11 +177,17 @@ def fit(
     from tpgmm_torch.cli.training_data import read_training_data
     from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.large_data.checkpoints import Checkpoint
     from tpgmm_torch.large_data.processes import joined_processes
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = model_format(output_format)
+    if keep_demonstrations and (write is not None or batch_episodes is not None):
+        raise DataError(
+            "--keep-demonstrations is for the format 'tpgmm', without --batch-episodes; 'tpgmm "
+            "correct' makes the policy of it"
+        )
     operators: Any = "auto"
     if operator != ["auto"]:
         operators = [parse_operator(text) for text in operator or ()]
@@ -213,7 +226,7 @@ def fit(
         if processes.rank > 0:
             return
     if write is None:
-        model.save(out)
+        model.save(out, demonstrations=keep_demonstrations)
     else:
         write(model, out, recordings.signals())
     _report(model, durations, steps, data.aligned)

@@ -406,11 +406,20 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             processes=processes,
         )
 
+    @property
+    def unshrunk_covariances(self) -> list[Tensor]:
+        """Where EM ended, before covariances were shrunk; one tensor per block."""
+        return getattr(self, "_unshrunk", None) or self.covariances_
+
+    @unshrunk_covariances.setter
+    def unshrunk_covariances(self, covariances: Sequence[Tensor]) -> None:
+        self._unshrunk = list(covariances)
+
     def _initial_parameters(self) -> tuple[Any, Any, Any]:
         """Weights, means and covariances as far as they are given, else None."""
         if self.warm_start and hasattr(self, "weights_"):
             # where EM ended, which what was shrunk thereafter is not
-            return self.weights_, self.means_, getattr(self, "_unshrunk", self.covariances_)
+            return self.weights_, self.means_, self.unshrunk_covariances
         return self.weights_init, self.means_init, self.covariances_init
 
     def _starts(
@@ -457,7 +466,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         best = max(fits, key=lambda fit: fit.bounds[-1])
         self.n_features_in_ = sum(units.widths)
         self._set(units.restore(best.parameters))
-        self._unshrunk = self.covariances_
+        self.unshrunk_covariances = self.covariances_
         self._set(units.restore(self._shrunk(best.parameters, n_rows)))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
@@ -621,7 +630,8 @@ def fit_subsets(
     X : array of shape (n_samples, n_features)
         All rows.
     members : array of bool, of shape (S, n_samples)
-        The rows of each mixture: ``group_size`` of its own from each group of all.
+        The rows of each mixture. Where its start is drawn, ``group_size`` of its own from each
+        group of all.
     group_size : int, default=1
         So many consecutive rows of ``X`` share one responsibility.
     moments : sequence of ColumnMoments, optional

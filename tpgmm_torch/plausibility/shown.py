@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -145,6 +145,36 @@ class Shown:
             compared.tolist(),
             frames,
             Novelty.of(starts, compared, first_poses, moving),
+        )
+
+    def and_also(self, other: Shown) -> Shown:
+        """What was shown, by demonstrations that came first and by ``other``, later ones."""
+        share = other.n_demonstrations / (self.n_demonstrations + other.n_demonstrations)
+        frames = {}
+        for name, one in self.frames.items():
+            two = other.frames.get(name, one)
+            mean, more = np.array(one.mean), np.array(two.mean)
+            away = more - mean
+            covariance = (1 - share) * np.array(one.covariance) + share * (
+                np.array(two.covariance) + (1 - share) * np.outer(away, away)
+            )
+            centre = np.array(one.orientation)
+            turned = float(angles_to(np.array([two.orientation]), centre).max()) + two.angle
+            frames[name] = ShownFrame(
+                np.minimum(one.low, two.low).tolist(),
+                np.maximum(one.high, two.high).tolist(),
+                (mean + share * away).tolist(),
+                covariance.tolist(),
+                one.orientation,
+                max(one.angle, turned),
+                one.link if one.link == two.link else None,
+            )
+        return replace(
+            self,
+            n_demonstrations=self.n_demonstrations + other.n_demonstrations,
+            start_low=np.minimum(self.start_low, other.start_low).tolist(),
+            start_high=np.maximum(self.start_high, other.start_high).tolist(),
+            frames=frames,
         )
 
     def config(self) -> dict[str, Any]:

@@ -14,6 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from tpgmm_torch.alignment.base import retime, steps_at
+from tpgmm_torch.alignment.features import quaternion_columns
+from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
@@ -30,6 +33,7 @@ __all__ = [
     "check_shares",
     "checked_batches",
     "gather_rows",
+    "on_grid",
     "rows_in_memory",
     "share_one_grid",
     "split_batches",
@@ -208,6 +212,42 @@ def typical_time(demonstrations: Sequence[Demonstration]) -> Tensor:
     demonstrations : sequence of Demonstration
     """
     return sorted(demonstrations, key=lambda d: d.duration)[len(demonstrations) // 2].time
+
+
+def on_grid(
+    demonstration: Demonstration, grid: Tensor, kinematics: Kinematics
+) -> tuple[Demonstration, int]:
+    """A demonstration at the instants of a skill that it shows, and which is the first.
+
+    Parameters
+    ----------
+    demonstration : Demonstration
+        In the time of the skill, all of it or a segment.
+    grid : Tensor of shape (T,)
+        The instants [s].
+    kinematics : Kinematics
+
+    Raises
+    ------
+    DataError
+        If it is not in the time of the skill.
+    """
+    time, instants = demonstration.time, grid.to(demonstration.time)
+    if torch.equal(time, instants):
+        return demonstration, 0
+    step = float(instants.diff().max())
+    early, late = float(time[0] - instants[0]), float(time[-1] - instants[-1])
+    inside = ((instants >= time[0]) & (instants <= time[-1])).nonzero()[:, 0]
+    if early < -step or late > step or len(inside) < 2:
+        raise DataError(
+            f"a demonstration goes from {float(time[0]):.4g} to {float(time[-1]):.4g} s, the "
+            f"skill from {float(instants[0]):.4g} to {float(instants[-1]):.4g} s: bring it "
+            "into the time of the skill, tpgmm_torch.corrections.in_skill_time(model, ...)"
+        )
+    there = instants[inside]
+    blocks = quaternion_columns(demonstration, kinematics)
+    path = steps_at(demonstration, as_array(there))
+    return retime(demonstration, path, there, blocks), int(inside[0])
 
 
 def gather_rows(

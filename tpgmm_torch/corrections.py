@@ -1,0 +1,114 @@
+"""Corrections of a running skill, in the time of the skill."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, NotFittedError
+
+__all__ = ["in_skill_time"]
+
+#: What differs by this [rad], [m], or is twice as fast or slow, is one unit apart.
+JOINTS, LINKS, SLOPE = 0.1, 0.05, math.log(2.0)
+#: A person is at most so many times slower or faster than the skill.
+MOST = 4.0
+#: Instants of the skill that are compared, at most.
+STEPS = 400
+
+
+def in_skill_time(
+    model: TaskParameterizedGMM, demonstrations: Sequence[Demonstration]
+) -> list[Demonstration]:
+    """Bring what a person showed into the time of a skill, as ``partial_fit`` wants it.
+
+    What is shown may be the whole skill or a segment, that in which a person took over. It
+    begins where the skill, reproduced with its frames, is most like its beginning, and ends
+    where it is most like its end, in joints and in poses of links; of places that explain
+    both, those count at which it is about as fast as the skill. In between time is linear:
+    what differs in the middle is the correction.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Fitted.
+    demonstrations : sequence of Demonstration
+        Each of at least two time steps, on a clock of its own.
+
+    Returns
+    -------
+    list of Demonstration
+        With times from ``time_[0]`` to ``time_[-1]``, or within.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError, NotFittedError
+        If the demonstrations do not fit the model.
+
+    Examples
+    --------
+    >>> time = torch.linspace(0, 2, 101, dtype=torch.float64)
+    >>> shown = [Demonstration(time, (time**2 * end)[:, None]) for end in (0.9, 1.0, 1.1)]
+    >>> model = TaskParameterizedGMM(n_components=6).fit(shown)
+    >>> segment = Demonstration(time[:51], (time[25:76] ** 2)[:, None])
+    >>> [placed] = in_skill_time(model, [segment])
+    >>> round(float(placed.time[0]), 1), round(float(placed.time[-1]), 1)
+    (0.5, 1.5)
+    """
+    if not hasattr(model, "weights_"):
+        raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
+    skill = copy.copy(model.with_via_points([]))
+    # what the model says, and not how a robot gets there
+    skill.blend, skill.keep_limits, skill.plausibility = 0.0, False, "ignore"
+    return [_placed(skill, one, number) for number, one in enumerate(demonstrations)]
+
+
+def _placed(skill: TaskParameterizedGMM, shown: Demonstration, number: int) -> Demonstration:
+    kinematics, grid = skill.kinematics_, skill.time_
+    if len(shown) < 2:
+        raise DataError(f"demonstration {number} has one time step: it shows no motion")
+    shown = shown.reordered(kinematics.joint_names)
+    count = min(STEPS, max(len(grid), 2))
+    time = torch.linspace(float(grid[0]), float(grid[-1]), count, dtype=grid.dtype)
+    situation = Situation(shown.joints[0], Situation.of(shown).frames, time)
+    [reproduced] = skill.predict([situation], candidates=False)
+    path, ends = (
+        _features(skill, joints) for joints in (reproduced.joints, shown.joints[[0, -1]])
+    )
+    begin, end = (((path - one) ** 2).mean(axis=1) for one in ends)
+    instants = as_array(time)
+    lasts = instants[None, :] - instants[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.log(lasts / shown.duration)
+    possible = np.abs(slope) <= math.log(MOST)
+    if not possible.any():
+        raise DataError(
+            f"demonstration {number} lasts {shown.duration:.4g} s, more than {MOST:g} times as "
+            f"long or short as any part of the skill of {instants[-1] - instants[0]:.4g} s"
+        )
+    cost = begin[:, None] + end[None, :] + (slope / SLOPE) ** 2
+    first, last = np.unravel_index(np.where(possible, cost, np.inf).argmin(), cost.shape)
+    scale = float((instants[last] - instants[first]) / shown.duration)
+    begun = float(shown.time[0])
+    return Demonstration(
+        instants[first] + scale * (shown.time - begun),
+        shown.joints,
+        shown.frames,
+        shown.joint_names,
+        {name: instants[first] + scale * (at - begun) for name, at in shown.events.items()},
+    )
+
+
+def _features(skill: TaskParameterizedGMM, joints: torch.Tensor) -> Array:
+    """Joints and positions of links (T, D), in units of what counts as a difference."""
+    state = skill.kinematics_.state(joints)
+    parts = [state.joints / JOINTS]
+    parts += [state.position(link) / LINKS for link in skill.kinematics_.links]
+    return as_array(torch.cat(parts, dim=-1))
