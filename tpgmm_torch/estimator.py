@@ -74,6 +74,7 @@ from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.kept_rows import KeptRows
 from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
     check_operators,
@@ -416,11 +417,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             chosen = self.operators if selection is None else selection.operators_
             operators = check_operators(chosen)
             kinematics = self._kinematics_for(known, operators)
-            weights, shown, found = self._examined(known, operators, kinematics)
+            # which of them are unlike the others is seen about their mean, too
+            based = with_mean_orientations(operators, known, kinematics)
+            weights, shown, found = self._examined(known, based, kinematics)
             known = [each for each, weight in zip(known, weights, strict=True) if weight > 0]
             holds = (
                 holds_for(self.holds, known, operators, kinematics) if found is None else found
             )
+            operators = with_mean_orientations(operators, known, kinematics, holds)
             gathered = rows_in_memory(
                 known,
                 operators,
@@ -450,6 +454,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         kinematics = self._kinematics_for(head, operators)
         # the first batch of all says it for those that have not been read yet
         holds = processes.gather(holds_for(self.holds, head, operators, kinematics))[0]
+        based = with_mean_orientations(operators, head, kinematics, holds)
+        operators = processes.gather(based)[0]
         seen = DemonstratedPeaks(kinematics.joint_names)
         episodes: list[EpisodeSummary] = []
         with RowFile() as file:
@@ -1153,7 +1159,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Raises
         ------
         DataError
-            If operators refer to objects that may be carried, and ``fusion="covariance"``.
+            If operators refer to objects that may be carried, and ``fusion="covariance"``; if
+            they are in tangent space, and ``activation="product"``.
         """
         carried = carried_objects(operators, kinematics)
         if carried and self.fusion == "covariance":
@@ -1161,6 +1168,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 f"operators refer to {list(carried)} as things that the robot may carry. Of "
                 "joints that do not move these they say nothing, which fusion='covariance' "
                 "would take for a wish to stand still: use fusion='information'"
+            )
+        tangent = [o for o in operators if o.rotation_vector_starts(kinematics)]
+        if tangent and self.activation == "product":
+            raise DataError(
+                f"activation='product' asks how operators move with time, and the base of "
+                f"{tangent} moves along: use activation='time' or geometry='quaternion'"
             )
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_, self.time_ = frame_names(operators, kinematics), time

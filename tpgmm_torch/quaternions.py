@@ -26,9 +26,13 @@ __all__ = [
     "hemisphere_sign",
     "hemisphere_signs",
     "identity",
+    "interpolate",
+    "inverse_left_jacobian",
+    "left_jacobian",
     "left_matrix",
     "log",
     "match_hemisphere",
+    "mean",
     "normalize",
     "product",
     "quaternion_blocks",
@@ -55,6 +59,9 @@ OUTER = (
 #: By how much R^T R of a rotation matrix may differ from the identity: data rounded to three
 #: digits are off by up to 2 * 3 * 0.5e-3.
 ROTATION_TOLERANCE = 3e-3
+
+#: Steps of :func:`mean` at most; a few are the rule.
+MEAN_STEPS = 100
 
 #: What :func:`_constant` has made.
 CONSTANTS: dict[tuple[torch.dtype, torch.device], dict[str, Tensor]] = {}
@@ -252,6 +259,101 @@ def log(q: Tensor) -> Tensor:
     # angle / sin(angle / 2), with its series where the angle vanishes
     scale = torch.where(small, 2.0 + square / 3.0, 2.0 * torch.atan2(sine, real) / sine)
     return scale * vector
+
+
+def left_jacobian(rotation_vector: Tensor) -> Tensor:
+    """``J_l(y)`` (..., 3, 3) of a ``rotation_vector`` y: how ``exp(y)`` turns when y changes.
+
+    ``exp(y + dy) = exp(J_l(y) dy) exp(y)`` to first order.
+
+    Its determinant, ``(sin(|y|/2) / (|y|/2))^2``, is the volume of rotations per volume of
+    rotation vectors. Sola, Deray, Atchuthan: A micro Lie theory for state estimation in
+    robotics, 2018, eq. (145).
+
+    Examples
+    --------
+    >>> quarter = torch.tensor([0.0, 0.0, torch.pi / 2])
+    >>> round(float(torch.linalg.det(left_jacobian(quarter))), 3)
+    0.811
+    """
+    cross, square, angle, small = _cross_and_angle(rotation_vector)
+    one = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
+    two = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
+    return _eye(cross) + one * cross + two * cross @ cross
+
+
+def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:
+    """The inverse of :func:`left_jacobian` (eq. 146).
+
+    Parameters
+    ----------
+    rotation_vector : Tensor of shape (..., 3)
+        Of less than a full turn.
+    """
+    cross, square, angle, small = _cross_and_angle(rotation_vector)
+    exact = (1 - 0.5 * angle / torch.tan(0.5 * angle)) / angle.square()
+    return (
+        _eye(cross)
+        - 0.5 * cross
+        + torch.where(small, 1 / 12 + square / 720, exact) * (cross @ cross)
+    )
+
+
+def _eye(like: Tensor) -> Tensor:
+    return torch.eye(3, dtype=like.dtype, device=like.device)
+
+
+def _cross_and_angle(vector: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """``[y]x``, and ``|y|^2``, ``|y|`` (1 where it is small) and whether it is, (..., 1, 1)."""
+    eye = _eye(vector).expand(*vector.shape, 3)
+    cross = torch.linalg.cross(vector.unsqueeze(-1).expand_as(eye), eye, dim=-2)
+    square = vector.square().sum(-1)[..., None, None]
+    small = square < 1e-4
+    return cross, square, torch.where(small, torch.ones_like(square), square).sqrt(), small
+
+
+def mean(q: Tensor) -> Tensor:
+    """Karcher mean (..., 4) of rotations: to it their squared angles add up to the least.
+
+    Signs of quaternions do not matter. It is looked for from the eigenvector of
+    ``sum q q^T`` to the largest eigenvalue, which decides where there are several.
+
+    Parameters
+    ----------
+    q : Tensor of shape (..., N, 4)
+        Unit quaternions.
+
+    Examples
+    --------
+    >>> turns = torch.tensor([0.1, 0.2, 0.6]).double()[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    >>> round(float(log(mean(-exp(turns)))[2]), 6)
+    0.3
+    """
+    found = torch.linalg.eigh(q.mT @ q).eigenvectors[..., -1]
+    for _ in range(MEAN_STEPS):
+        step = log(product(conjugate(found).unsqueeze(-2), q)).mean(-2)
+        found = normalize(product(found, exp(step)))
+        if float(step.abs().amax()) < 1e2 * torch.finfo(q.dtype).eps:
+            break
+    return found
+
+
+def interpolate(time: Tensor, knots: Tensor, q: Tensor) -> Tensor:
+    """Orientations (..., 4) at ``time`` (...) of a path, by slerp; before and behind its ends.
+
+    Parameters
+    ----------
+    time : Tensor of shape (...)
+    knots : Tensor of shape (T,)
+        Ascending times.
+    q : Tensor of shape (T, 4)
+        Unit quaternions at these.
+    """
+    if len(knots) == 1:
+        return q[0].expand(*time.shape, 4)
+    high = torch.searchsorted(knots, time.detach().contiguous()).clamp(1, len(knots) - 1)
+    begin, end = knots[high - 1], knots[high]
+    return slerp(q[high - 1], q[high], ((time - begin) / (end - begin)).clamp(0, 1))
 
 
 def slerp(a: Tensor, b: Tensor, fraction: Tensor | float) -> Tensor:

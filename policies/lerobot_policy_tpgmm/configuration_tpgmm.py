@@ -377,6 +377,8 @@ class TPGMMConfig(StatePolicyConfig):
     def note(self, model: TaskParameterizedGMM) -> None:
         """Write down what a fitted model is beside its mixture."""
         self.n_steps = len(model.time_)
+        # with the paths that it found
+        self.operators = [_description(operator) for operator in model.operators_]
         self.holds = list(map(str, model.holds_))
         self.via_points = list(map(str, model.via_points_)) or None
         self.via_fade = model.via_fade_

@@ -253,7 +253,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """The fitted model that the policy is."""
         device = self.mixture.time.device
         kinematics = self.kinematics.to(device=device)
-        model = self.config.estimator(kinematics, list(self.operators))
+        model = self.config.estimator(kinematics, self.config.decoded_operators())
         model.device = str(device)
         return self.config.recall(self.mixture.to_estimator(model))
 

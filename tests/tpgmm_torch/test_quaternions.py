@@ -378,3 +378,40 @@ def test_gradients_at_no_rotation_are_exact(dtype):
 def test_no_rotation_is_the_same_on_every_type():
     assert torch.equal(Q.identity(torch.float32), torch.tensor([1.0, 0.0, 0.0, 0.0]))
     assert Q.identity().dtype == torch.float64
+
+
+# The tangent space
+
+
+@given(axes, st.one_of(st.floats(0, 6), st.sampled_from([0.0, 1e-9, 0.99e-2, 1.01e-2])))
+def test_the_left_jacobian_is_the_derivative_of_exp(axis, angle):
+    y = axis * angle
+    jacobian = Q.left_jacobian(y)
+    steps = 1e-5 * torch.eye(3, dtype=torch.float64)
+    back = Q.conjugate(Q.exp(y - steps))
+    turned = Q.log(Q.product(Q.exp(y + steps), back)) / 2e-5
+    assert_equal(jacobian, turned.mT, 1e-8)
+    inverse = Q.inverse_left_jacobian(y)
+    if angle < 5:
+        assert_equal(inverse @ jacobian, torch.eye(3, dtype=torch.float64), 1e-9)
+    half = angle / 2
+    volume = (math.sin(half) / half) ** 2 if half else 1.0
+    assert float(torch.linalg.det(jacobian)) == pytest.approx(volume, abs=1e-9)
+
+
+def test_jacobians_have_finite_gradients_where_nothing_turns():
+    y = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
+    for function in (Q.left_jacobian, Q.inverse_left_jacobian):
+        [gradient] = torch.autograd.grad(function(y).sum() + function(y)[..., 0, 1].sum(), y)
+        assert bool(gradient.isfinite().all())
+
+
+@given(st.lists(axes, min_size=3, max_size=6), units)
+def test_to_the_mean_the_turns_add_up_to_nothing(directions, turn):
+    q = Q.exp(torch.stack(directions) * 1.2)
+    found = Q.mean(q)
+    assert_equal(Q.log(Q.product(Q.conjugate(found), q)).sum(0), torch.zeros(3).double(), 1e-9)
+    signs = torch.tensor([(-1.0) ** i for i in range(len(q))])[:, None]
+    assert_same_rotation(Q.mean(q * signs), found, 1e-9)
+    assert_same_rotation(Q.mean(Q.product(turn, q)), Q.product(turn, found), 1e-7)
+    assert_same_rotation(Q.mean(torch.stack((q, q)))[1], found, 1e-9)

@@ -111,6 +111,8 @@ def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
         return [names[column] for column in operator.columns(names)]
     if isinstance(operator, AbsolutePosition | RelativePosition):
         return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
+    if operator.rotation_vector_starts(kinematics) == (0,):
+        return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
     if isinstance(operator, AbsoluteOrientation | RelativeOrientation):
         return [f"{operator.link}\nq{part}" for part in "wxyz"]
     return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]

@@ -71,7 +71,7 @@ class CompiledRegression(Regression):
     ------
     DataError
         At the first tick, if the model is not one of a :class:`Robot` with :class:`Canonical`
-        and position and orientation operators that refer to objects.
+        and position and orientation operators that refer to objects, none in tangent space.
     """
 
     backend: str = "inductor"
@@ -161,7 +161,8 @@ class CompiledRegression(Regression):
         if terms is None or not terms.fixed:
             raise DataError(
                 "compile() serves models with robot=Robot.from_urdf(...), Canonical() and "
-                "position and orientation operators in the base frame or an object's, "
+                "position and orientation operators (geometry='quaternion') in the base frame "
+                "or an object's, "
                 f"fusion='information', activation='time'; this one has {self.kinematics!r} "
                 f"and {list(self.operators)}: use it as it is"
             )

@@ -112,7 +112,8 @@ class Look:
         """
         with torch.inference_mode():
             terms = self._instants.exponents(self._state, self._frames)
-        return self._instants.log_likelihood(*terms, window)
+            along = self._instants.along_paths(self._state, self._frames, window)
+        return self._instants.log_likelihood(*terms, along, window)
 
     def reference(self, time: Array) -> Estimate | None:
         """What the skill would tell the robots at times (B,) [s]; None if it says nothing."""
@@ -138,13 +139,15 @@ class _Instants:
         log_h: Array = activation.numpy(force=True).astype(np.float64)
         weights = np.exp(log_h)
         width = int((weights > NEGLIGIBLE).sum(1).max())
-        self._heaviest = np.argsort(-log_h, 1)[:, :width]  # (G, A)
+        self._heaviest: NDArray[np.int64] = np.argsort(-log_h, 1)[:, :width]  # (G, A)
         self._log_h: Array = np.take_along_axis(log_h, self._heaviest, 1)
         centre = first.time_mean.numpy(force=True).astype(np.float64)
         self._elapsed = instants[:, None] - centre[self._heaviest]
         operators: list[Operator] = []
         conditionals: list[Conditionals] = []
-        self._parts: list[_Coordinates] = []
+        self._parts: list[tuple[Operator, _Coordinates]] = []
+        self._followers: list[tuple[Operator, _Coordinates]] = []  # along paths
+        self._times = times
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
             leaves = operator.leaves if isinstance(operator, Stack) else (operator,)
             sizes = [leaf.dimension(kinematics) for leaf in leaves]
@@ -160,7 +163,10 @@ class _Instants:
             conditionals.append(one)
             starts = operator.quaternion_starts(kinematics)
             sizes = [leaf.dimension(kinematics) for leaf in seen]
-            self._parts.append(_Coordinates(one, weights, sizes, starts, first))
+            paths = operator.path_variances(kinematics)
+            part = _Coordinates(one, weights, sizes, starts, first, paths)
+            follows = operator.at(times[0]) is not operator
+            (self._followers if follows else self._parts).append((operator, part))
         self._operators = operators
         self.regression: Regression | None = regression
         if operators != list(regression.operators):
@@ -168,26 +174,39 @@ class _Instants:
             settings |= {"operators": operators, "conditionals": conditionals}
             self.regression = Regression(**settings) if operators else None
         nothing = np.zeros(len(centre))
-        self._constant = sum((part.constant for part in self._parts), nothing)
-        self._curvature = sum((part.curvature for part in self._parts), nothing)
+        both = [*self._parts, *self._followers]
+        self._constant = sum((part.constant for _, part in both), nothing)
+        self._curvature = sum((part.curvature for _, part in self._parts), nothing)
 
     def exponents(self, state: RobotState, frames: Mapping[str, Frame]) -> tuple[Array, Array]:
         """``|W (x - mu)|^2`` and its slope over time, summed over the operators, (B, K)."""
         square: Array = np.zeros((1, len(self._constant)))
         slope = square
-        for operator, part in zip(self._operators, self._parts, strict=True):
+        for operator, part in self._parts:
             local = np.atleast_2d(_local(operator, state, frames))
             one, other = part(local)
             square, slope = square + one.T, slope + other.T
         return square, slope
 
-    def log_likelihood(self, square: Array, slope: Array, window: slice) -> Array:
+    def along_paths(
+        self, state: RobotState, frames: Mapping[str, Frame], window: slice
+    ) -> Array:
+        """``-0.5 |W (x(t) - mu(t))|^2`` of coordinates that follow paths, (B, G, A) or 0."""
+        exponent: Array = np.zeros((1, 1, 1))
+        index, elapsed = self._heaviest[window], self._elapsed[window]
+        for operator, part in self._followers:
+            at = operator.at(self._times[window, None])
+            local = at.coordinates(state, frames).numpy(force=True)  # (G, B, D)
+            exponent = exponent + part.at_instants(local, index, elapsed)
+        return exponent
+
+    def log_likelihood(self, square: Array, slope: Array, along: Array, window: slice) -> Array:
         """``log p(x | t)`` at the instants of a window, (B, G), up to a constant."""
         # -0.5 |W (x - mu(t))|^2 as a polynomial of the time since the component's mean
         index, elapsed = self._heaviest[window], self._elapsed[window]
         base = self._log_h[window] + self._constant[index]
         base -= 0.5 * elapsed**2 * self._curvature[index]
-        exponent = base - 0.5 * square[:, index] + elapsed * slope[:, index]
+        exponent = base - 0.5 * square[:, index] + elapsed * slope[:, index] + along
         most = exponent.max(-1)
         total = most + np.log(np.exp(exponent - most[..., None]).sum(-1))
         return np.where(np.isfinite(most).all(-1, keepdims=True), total, 0.0)
@@ -203,6 +222,7 @@ class _Coordinates:
         sizes: Sequence[int],
         starts: Iterable[int],
         first: Conditionals,
+        paths: Sequence[float],
     ) -> None:
         mean, gain, covariance = (
             tensor.numpy(force=True).astype(np.float64)
@@ -210,12 +230,12 @@ class _Coordinates:
         )
         groups = np.repeat(np.arange(len(sizes)), sizes)
         # how far coordinates move in the skill, alike for those of one leaf
-        moved = (weights @ mean).var(0)
+        moved = (weights @ mean).var(0) + np.array(paths)
         slack = SLACK**2 * np.array([moved[groups == group].mean() for group in groups])
         factor = np.linalg.cholesky(covariance + np.diag(slack))
         self.size = mean.shape[1]
         self._white = np.linalg.inv(factor)  # (K, D, D)
-        self._mean = mean
+        self._mean, self._gain = mean, gain
         self._rate = (self._white @ gain[..., None])[..., 0]
         self._blocks = quaternions.quaternion_blocks(tuple(starts), self.size).numpy()
         self.constant = -np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(1)
@@ -229,6 +249,14 @@ class _Coordinates:
             local = local * (1 + (np.copysign(1.0, inner) - 1) @ self._blocks)
         white = self._white @ np.swapaxes(local - self._mean[:, None], 1, 2)  # (K, D, B)
         return (white**2).sum(1), (self._rate[:, :, None] * white).sum(1)
+
+    def at_instants(self, local: Array, index: NDArray[np.int64], elapsed: Array) -> Array:
+        """``-0.5 |W (x - mu)|^2`` (B, G, A) of coordinates (G, B, D), of components (G, A)."""
+        expected = self._mean[index] + self._gain[index] * elapsed[..., None]
+        residual = local[:, :, None] - expected[:, None]  # (G, B, A, D)
+        white = np.einsum("gaij,gbaj->gbai", self._white[index], residual)
+        square: Array = (white**2).sum(-1).swapaxes(0, 1)
+        return -0.5 * square
 
 
 def _local(operator: Operator, state: RobotState, frames: Mapping[str, Frame]) -> Array:

@@ -158,6 +158,21 @@ class Operator(ABC):
         """Where unit quaternions begin among the local coordinates; none by default."""
         return ()
 
+    def rotation_vector_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
+        """Where rotation vectors [rad] begin among the coordinates; none by default."""
+        return ()
+
+    def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Variances of the path that the coordinates follow, which theirs lack; zero if none.
+
+        What says how far something moves in the skill, has to add them to the coordinates'.
+        """
+        return (0.0,) * self.dimension(kinematics)
+
+    def at(self, time: Tensor) -> Operator:
+        """The operator at ``time`` (...) [s]: itself, unless its coordinates follow a path."""
+        return self
+
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """Standard deviations below which agreement in a coordinate means nothing.
 
@@ -220,7 +235,8 @@ class Operator(ABC):
         if holds:
             time = demonstration.time.to(state.joints)
             state, frames = held_objects(state, time, frames, holds)
-        local = self.coordinates(state, frames)
+        at = self.at(demonstration.time.to(state.joints))
+        local = at.coordinates(state, frames)
         if tuple(local.shape) != (len(demonstration), self.dimension(kinematics)):
             raise ShapeError(
                 f"{self!r} has {self.dimension(kinematics)} coordinates, but its coordinates() "

@@ -226,8 +226,8 @@ def pose_terms(
     Parameters
     ----------
     operators : tuple of Operator
-        Position and orientation operators; others, and those that refer to their own link,
-        speak for themselves.
+        Position and orientation operators; others, those in tangent space, and those that
+        refer to their own link speak for themselves.
     links : tuple of str
     dtype : torch.dtype
     device : torch.device
@@ -239,6 +239,8 @@ def pose_terms(
     for operator in operators:
         if type(operator) not in (*POSITIONS, *ORIENTATIONS):
             return None
+        if operator.rotation_vector_starts(None):
+            return None  # logarithms and their Jacobians are not bilinear
         link, *references = *operator.links(), *operator.references()
         if link in references:
             return None

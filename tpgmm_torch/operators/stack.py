@@ -126,6 +126,25 @@ class Stack(Operator):
             column += operator.dimension(kinematics)
         return tuple(starts)
 
+    def rotation_vector_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
+        """Those of the members, shifted to their columns."""
+        starts: list[int] = []
+        column = 0
+        for operator in self.operators:
+            starts += [column + s for s in operator.rotation_vector_starts(kinematics)]
+            column += operator.dimension(kinematics)
+        return tuple(starts)
+
+    def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
+        """Those of the members, side by side."""
+        return tuple(v for o in self.operators for v in o.path_variances(kinematics))
+
+    def at(self, time: Tensor) -> Operator:
+        """The stack of what the members are then."""
+        members = [operator.at(time) for operator in self.operators]
+        same = all(now is one for now, one in zip(members, self.operators, strict=True))
+        return self if same else Stack(*members)
+
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """Those of the members, side by side."""
         return tuple(t for o in self.operators for t in o.tolerances(kinematics))

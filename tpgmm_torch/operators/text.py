@@ -7,7 +7,8 @@ is where a carried bottle is on a tray, ``canonical`` the joints themselves, and
 ``canonical:left_*,waist`` some of them.
 ``parameters@shelf`` takes task parameters A, b of the situation, on the joints,
 ``parameters:l_hand@shelf`` on a link's position. ``~`` and a number behind a term is its
-tolerance, ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad].
+tolerance, ``position:l_hand@bottle~0.002`` [m], ``canonical~0.05`` [rad]. Orientations in
+tangent space are ``orientation[tangent]:l_hand@bottle`` and ``pose[tangent]:l_hand@bottle``.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ KINDS: dict[str, tuple[Callable[[str], Operator], Callable[..., Operator]]] = {
     "orientation": (AbsoluteOrientation, RelativeOrientation),
 }
 TERM = re.compile(
-    r"(?P<kind>position|orientation|pose):(?P<link>[^\s:@+]+)"
+    r"(?P<kind>position|orientation|pose)(\[(?P<geometry>quaternion|tangent)\])?:(?P<link>[^\s:@+]+)"
     r"(@(?P<held>held:)?(?P<frame>[^\s:@+]+))?"
 )
 #: Task parameters: of the joints or of a link, and how many columns A has.
@@ -47,7 +48,8 @@ GRAMMAR = (
     "'canonical', or 'canonical:JOINTS' (some, by name or pattern, joined by commas), or "
     "'position:LINK', 'orientation:LINK' or 'pose:LINK' (both of them), each with '@FRAME' "
     "behind it if seen from a frame or another link, '@held:FRAME' if from an object as the "
-    "robot carries it (LINK may be an object too), or 'parameters@NAME' or "
+    "robot carries it (LINK may be an object too), and '[tangent]' before the colon if "
+    "orientations are rotation vectors, or 'parameters@NAME' or "
     "'parameters:LINK@NAME' (with '[D]' behind it if A has D columns), all but 'pose' perhaps "
     "with a tolerance, '~NUMBER', behind it; '+' stacks them, as in "
     "'position:l_hand@bottle + orientation:l_hand@bottle'"
@@ -64,7 +66,8 @@ def parse_operator(text: str) -> Operator:
         and names or patterns of joints, joined by commas; or ``position``,
         ``orientation`` or ``pose`` (both), a colon and a link or an object that is carried;
         ``@`` and the name of a frame or of another link make it relative, ``@held:`` to an
-        object as it is carried. ``parameters@NAME``, ``parameters:LINK@NAME`` are
+        object as it is carried; ``[tangent]`` behind ``orientation`` or ``pose`` is the
+        geometry of the orientation. ``parameters@NAME``, ``parameters:LINK@NAME`` are
         :class:`TaskParameters`. ``~0.01`` behind a term that is one operator is its tolerance.
 
     Raises
@@ -103,11 +106,16 @@ def _term(term: str, text: str) -> list[Operator]:
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
     kind, link, frame, held = (match[name] for name in ("kind", "link", "frame", "held"))
+    if match["geometry"] and kind == "position":
+        raise DataError(f"operator {text!r}: {term!r} is a position, which has no geometry")
     pairs = KINDS.values() if kind == "pose" else [KINDS[kind]]
-    return [
+    operators = [
         relative(link, frame, held=bool(held)) if frame else absolute(link)
         for absolute, relative in pairs
     ]
+    if match["geometry"]:
+        operators[-1] = replace(operators[-1], geometry=match["geometry"])  # type: ignore[type-var]
+    return operators
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
@@ -125,7 +133,7 @@ def format_operator(operator: Operator) -> str:
     ----------
     operator : Operator
         Operators that have no such text, like a user's own, are given by their ``repr``. The
-        gain of orientations is left out.
+        gain and the path of orientations are left out.
 
     Examples
     --------
@@ -146,6 +154,8 @@ def format_operator(operator: Operator) -> str:
             places = [f"@{name}" for name in operator.references()]
             link, *held = operator.links()
             places += [f"@held:{name}" for name in held]
+            if operator.rotation_vector_starts(None):
+                kind += "[tangent]"
             return f"{kind}:{link}" + "".join(places) + _tolerance(operator)
     return repr(operator)
 

@@ -126,6 +126,9 @@ def _coordinates(
             for start in leaf.quaternion_starts(kinematics):
                 others[start : start + 4] = False
                 yield leaf, 2 * local[..., start : start + 4], NEAR_ANGLE
+            for start in leaf.rotation_vector_starts(kinematics):
+                others[start : start + 3] = False
+                yield leaf, local[..., start : start + 3], NEAR_ANGLE
             local = local[..., others]
             spread = local.flatten(0, 1).amax(0) - local.flatten(0, 1).amin(0)
             if not bool((spread > 0).any()):

@@ -123,7 +123,8 @@ class KalmanUpdate:
         if self.task is None:
             steps = conditionals.at(time) - state.joints.unsqueeze(-2)
             return steps, conditionals.covariance
-        at = self.task.linearize(state, frames)
+        task = self.task.at(time)
+        at = task.linearize(state, frames)
         assert at.jacobian is not None and at.matrix is not None
         batch = gaussians.common_shape(
             at.jacobian.shape[:-2],
@@ -141,7 +142,7 @@ class KalmanUpdate:
         if self._blocks is not None:
             present = at.present
             if present is None:
-                present = self.task.coordinates(state, frames)
+                present = task.coordinates(state, frames)
             # of q and -q, which are one rotation, the mean is the one that is nearer
             local = mean.narrow(-1, 0, width)
             signs = quaternions.hemisphere_signs(local, present, self._blocks)

@@ -296,7 +296,7 @@ class _Cost:
             chosen = one.select(index)
             elapsed = (time - chosen.time_mean).unsqueeze(-1)
             mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
-            term = Residual.of(operator, regression.kinematics)
+            term = Residual.of(operator.at(time), regression.kinematics)
             self.local.append((term, mean, chosen.covariance))
         closed = any(operator.determines_joints for operator in regression.operators)
         self.prior = None if closed else torch.as_tensor(regression.prior_std).to(centre) ** -2
@@ -350,7 +350,8 @@ class Residual:
     A linearisation is exact where the displacement is small; of a rotation that is still to go,
     ``delta = eps_wanted conj(eps) = (w, v)`` with ``r = g v``, the derivative is
     ``-g/2 (w + v x) J_o``, and of what is seen from a frame that turns by ``J_of`` with the
-    joints there are ``-g v x J_of`` and, of a position, ``-r x J_of`` more.
+    joints there are ``-g v x J_of`` and, of a position, ``-r x J_of`` more. In tangent space
+    the linearisation's is exact.
 
     Parameters
     ----------
@@ -380,6 +381,9 @@ class Residual:
         parts = operator.leaves if isinstance(operator, Stack) else (operator,)
         rows, gains, leaves, row = [], [], [], 0
         for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
+            if leaf.rotation_vector_starts(kinematics):  # whose derivative is exact
+                row += 3
+                continue
             if isinstance(leaf, AbsoluteOrientation | RelativeOrientation):
                 rows.append([row, row + 1, row + 2])
                 gains.append(leaf.gain / 2)

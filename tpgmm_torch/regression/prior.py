@@ -93,6 +93,7 @@ def _size(
     squares = []
     for operator, mean, covariance in zip(operators, means, covariances, strict=True):
         turns = {s + i for s in operator.quaternion_starts(kinematics) for i in range(4)}
+        turns |= {s + i for s in operator.rotation_vector_starts(kinematics) for i in range(3)}
         if operator.links():
             columns = [1 + i for i in range(mean.shape[-1] - 1) if i not in turns]
             second = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)

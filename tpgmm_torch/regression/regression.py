@@ -408,6 +408,7 @@ class Regression:
         """
         for operator, one in zip(self.operators, conditionals, strict=True):
             mean, gain, covariance = one.at(time), one.gain, one.covariance
+            operator = operator.at(time)
             starts = operator.quaternion_starts(self.kinematics)
             if starts:
                 present = operator.coordinates(state, frames).unsqueeze(-2)

@@ -74,7 +74,8 @@ def local_data(
     if expected is None:
         widths = [1 + operator.dimension(kinematics) for operator in operators]
         together = torch.cat(rows)
-        mask = constant_columns(together.amin(0), together.amax(0), widths)
+        turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
+        mask = constant_columns(together.amin(0), together.amax(0), widths, turns)
         together = torch.where(mask, together[0], together)
         rows = list(together.split([len(row) for row in rows]))
     return rows
@@ -119,11 +120,14 @@ def at_equal_phase(templates: Sequence[Tensor]) -> Sides:
     return expected
 
 
-def constant_columns(smallest: Tensor, largest: Tensor, widths: Sequence[int]) -> Tensor:
+def constant_columns(
+    smallest: Tensor, largest: Tensor, widths: Sequence[int], turns: Sequence[bool]
+) -> Tensor:
     """Which columns vary by rounding alone: learned, they would be certain beyond reason.
 
     Rounding is measured by the largest coordinate of the operator, from which it comes: think
-    of a quaternion that turns about one axis.
+    of a quaternion that turns about one axis. Rotation vectors come from quaternions, which
+    are of size 1.
 
     Parameters
     ----------
@@ -131,6 +135,8 @@ def constant_columns(smallest: Tensor, largest: Tensor, widths: Sequence[int]) -
         Of each column, in the precision of the data.
     widths : sequence of int
         ``1 + D_j`` for each operator; each block begins with time.
+    turns : sequence of bool
+        For each operator, whether there are rotation vectors among its coordinates.
 
     Returns
     -------
@@ -139,10 +145,10 @@ def constant_columns(smallest: Tensor, largest: Tensor, widths: Sequence[int]) -
     # recorded poses went through more than our own rounding
     rounding = max(100 * torch.finfo(smallest.dtype).eps, 1e-10)
     masks = []
-    for low, high in zip(
-        smallest.split(list(widths)), largest.split(list(widths)), strict=True
+    for low, high, turn in zip(
+        smallest.split(list(widths)), largest.split(list(widths)), turns, strict=True
     ):
-        size = torch.maximum(low.abs(), high.abs())[1:].max()
+        size = torch.maximum(low.abs(), high.abs())[1:].max().clamp(min=float(turn))
         masks.append(high - low <= rounding * size)
     return torch.cat(masks)
 

@@ -94,6 +94,9 @@ def regularization(
 ) -> NDArray[np.float64]:
     """``reg_covar`` and the operators' tolerances, as shares of each column's variance.
 
+    For coordinates that are deviations from a path, ``reg_covar`` is relative to the variance
+    of both: it is the same whether a base moves or stands.
+
     Parameters
     ----------
     moments : ColumnMoments
@@ -119,4 +122,7 @@ def regularization(
     for operator, (_, *given) in zip(operators, tolerances, strict=True):
         if not all(0 <= tolerance < math.inf for tolerance in given):
             raise DataError(f"a tolerance is a number of at least 0, {operator!r} has {given}")
-    return reg_covar + (np.concatenate(tolerances) / torch.cat(units.scales).numpy()) ** 2
+    scales = torch.cat(units.scales).numpy()
+    paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]
+    own = reg_covar * (1 + np.concatenate(paths) / scales**2)
+    return own + (np.concatenate(tolerances) / scales) ** 2

@@ -305,6 +305,7 @@ def gather_rows(
         torch.from_numpy(moments.smallest).to(reference),
         torch.from_numpy(moments.largest).to(reference),
         widths,
+        [bool(operator.rotation_vector_starts(kinematics)) for operator in operators],
     )
     file.make_constant(constant.cpu().numpy(), reference[0].cpu().numpy())
     time = _typical_time(file, spans, processes).to(reference)

@@ -196,6 +196,7 @@ class Learner:
             model = config.estimator(kinematics, list(self._operators)).fit(aligned)
             mixture.copy_from(model)
             config.note(model)
+            self._operators = model.operators_
             log.info(
                 "%d components fitted by %d steps of EM: the policy is trained",
                 config.n_components,

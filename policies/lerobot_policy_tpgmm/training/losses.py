@@ -85,7 +85,7 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
     """
     points = []
     for j, operator in enumerate(model.operators):
-        local = operator.coordinates(samples.state, samples.poses)
+        local = operator.at(samples.time).coordinates(samples.state, samples.poses)
         expected = model.expected(j, samples.time)
         starts = operator.quaternion_starts(model.kinematics)
         blocks = quaternions.quaternion_blocks(starts, local.shape[1]).to(local)

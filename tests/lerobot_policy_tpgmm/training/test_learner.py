@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.policies import loaded
 from tests.support.skills import HANDLING, HANDS, same
 from tests.support.training import (
     FPS,
@@ -215,3 +216,20 @@ def test_a_policy_that_knows_no_data_set_cannot_be_trained(waves, tmp_path):
     policy = type(fresh(waves, **WAVES)).from_pretrained(tmp_path)
     with pytest.raises(DataError, match="dataset_meta="):
         policy.forward(epoch(waves, 10)[0])
+
+
+def test_orientations_in_tangent_space_are_learned_kept_and_followed(handlings, tmp_path):
+    """Their mean path is part of the configuration once it is found."""
+    text = "pose[tangent]:left@cup + pose[tangent]:right@cup"
+    policy = trained(handlings, **(HANDLINGS | {"operators": [text]}))
+    skill = policy.to_estimator()
+    assert all(o.path for o in skill.operators_[0].operators if hasattr(o, "path"))
+    policy.save_pretrained(tmp_path)
+    again = loaded(tmp_path, ds_meta=handlings.meta)
+    assert again.to_estimator().operators_ == skill.operators_
+    shown = load_lerobot(handlings.root)
+    found = again.to_estimator().score_samples(shown)
+    np.testing.assert_allclose(found, skill.score_samples(shown), rtol=1e-9)
+    goes_on = resumed(tmp_path, handlings)
+    losses = [goes_on.forward(batch)[0] for batch in epoch(handlings, 32) * 2]
+    assert all(bool(loss.isfinite()) for loss in losses)

@@ -37,6 +37,8 @@ OPERATORS = [
     Canonical(0.1, ("left_*",)),
     RelativePosition("l_hand", "bottle", tolerance=1e-5),
     Stack(AbsoluteOrientation("l_hand", tolerance=0.1), TaskParameters("shelf", tolerance=2.0)),
+    RelativeOrientation("r_hand", "bottle", held=True, tolerance=0.1, geometry="tangent"),
+    Stack(AbsoluteOrientation("l_hand", geometry="tangent"), AbsoluteOrientation("r_hand")),
 ]
 
 

@@ -1,0 +1,392 @@
+"""Models whose orientations are deviations from the demonstrations' mean, on the sphere."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.skills import few_bottles
+from tests.support.worlds import LEFT, OBJECT, moved, upper_body
+from tpgmm_torch import (
+    AbsoluteOrientation,
+    Canonical,
+    Demonstration,
+    Frame,
+    Poses,
+    RelativeOrientation,
+    RelativePosition,
+    Situation,
+    Stack,
+    TaskParameterizedGMM,
+    quaternions,
+)
+from tpgmm_torch.control import localization
+from tpgmm_torch.control.localization import Localizer
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.posture import _Cost
+from tpgmm_torch.training.mean_orientations import with_mean_orientations
+
+HAND = Poses(("hand",))
+TIME = torch.linspace(0, 3, 60, dtype=torch.float64)
+ABSOLUTE = AbsoluteOrientation("hand", geometry="tangent")
+RELATIVE = RelativeOrientation("hand", OBJECT, geometry="tangent")
+
+
+def recordings(seed=0, count=8, spread=0.7, signs=True):
+    """A hand that turns by two radians, differently each time, seen with random signs."""
+    rng = np.random.default_rng(seed)
+    share = ((1 - torch.cos(math.pi * TIME / 3)) / 2)[:, None]
+    turn = quaternions.exp(2 * share * torch.tensor([0.6, 0.0, 0.8]).double())
+    shown = []
+    for _ in range(count):
+        apart, other = torch.from_numpy(spread * rng.standard_normal((2, 3)))
+        vector = apart + 0.2 * torch.sin(math.pi * TIME / 3)[:, None] * other
+        long = vector.norm(dim=1, keepdim=True)
+        q = quaternions.product(turn, quaternions.exp(vector * (2.4 / long).clamp(max=1)))
+        if signs:
+            q = q * torch.from_numpy(rng.choice([-1.0, 1.0], (len(TIME), 1)))
+        pose = torch.cat((0.1 * share * torch.ones(3), q), 1)
+        seen = quaternions.exp(torch.from_numpy(rng.standard_normal(3)))
+        frame = Frame(torch.from_numpy(rng.standard_normal(3)), seen)
+        shown.append(Demonstration(TIME, pose, {OBJECT: frame}))
+    return shown
+
+
+def fitted(demonstrations, *operators, **settings):
+    settings = {"robust": False, "plausibility": "ignore", "blend": 0.0} | settings
+    return TaskParameterizedGMM(5, operators, HAND, **settings).fit(demonstrations)
+
+
+@cache
+def model(*operators):
+    return fitted(recordings(), *operators)
+
+
+def angles(a, b):
+    """Between orientations [rad]."""
+    turn = quaternions.product(quaternions.conjugate(a), b)
+    return torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
+
+
+def reproduced(skill, start, frames):
+    [found] = skill.predict([Situation(start, frames)], candidates=False)
+    return quaternions.normalize(found.joints[:, 3:])
+
+
+def orientations(demonstrations):
+    return torch.stack([one.joints[:, 3:] for one in demonstrations], 1)
+
+
+def mean_of(demonstrations):
+    return quaternions.mean(orientations(demonstrations))
+
+
+def test_the_path_is_the_karcher_mean_at_each_instant():
+    shown = recordings()
+    [found] = with_mean_orientations([ABSOLUTE], shown, HAND)
+    local = torch.stack([found.local(one, HAND) for one in shown])
+    assert float(local.mean(0).abs().max()) < 1e-12
+    together = with_mean_orientations(
+        [Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown, HAND
+    )
+    assert together[0].operators[1].path is not None
+    assert with_mean_orientations(together, shown[:2], HAND) == together
+
+
+def test_a_demonstration_that_is_over_counts_with_its_last_orientation():
+    one, other = recordings(count=2)
+    short = Demonstration(TIME[:30], other.joints[:30], other.frames)
+    [found] = with_mean_orientations([ABSOLUTE], [one, short], HAND)
+    last = torch.stack((one.joints[-1, 3:], other.joints[29, 3:]))
+    row = torch.tensor(found.path[-1][1:], dtype=torch.float64)
+    assert float(angles(row, quaternions.mean(last))) < 1e-9
+
+
+def test_signs_of_recorded_quaternions_mean_nothing():
+    plain, seen = recordings(signs=False), recordings(signs=True)
+    # signs were drawn after each motion: make them of the same motions
+    rng = np.random.default_rng(5)
+    seen = [
+        Demonstration(
+            TIME,
+            torch.cat(
+                (
+                    one.joints[:, :3],
+                    one.joints[:, 3:] * torch.from_numpy(rng.choice([-1.0, 1.0], (60, 1))),
+                ),
+                1,
+            ),
+            {OBJECT: Frame(one.frames[OBJECT].position, -one.frames[OBJECT].orientation)},
+        )
+        for one in plain
+    ]
+    first, second = (fitted(shown, ABSOLUTE, RELATIVE) for shown in (plain, seen))
+    for one, other in zip(
+        (*first.means_, *first.covariances_),
+        (*second.means_, *second.covariances_),
+        strict=True,
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
+
+
+def test_turning_the_world_turns_what_is_reproduced():
+    shown = recordings()
+    turned = [
+        Demonstration(
+            TIME,
+            torch.cat((pose.position, pose.orientation), 1),
+            {OBJECT: moved(one.frames[OBJECT])},
+        )
+        for one in shown
+        for pose in [moved(Frame(one.joints[:, :3], one.joints[:, 3:]))]
+    ]
+    here, there = model(ABSOLUTE, RELATIVE), fitted(turned, ABSOLUTE, RELATIVE)
+    for one, other in zip(
+        (*here.means_, *here.covariances_), (*there.means_, *there.covariances_), strict=True
+    ):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-10)
+    frame = recordings(seed=9, count=1)[0].frames[OBJECT]
+    start = torch.cat((torch.zeros(3).double(), mean_of(shown)[0]))
+    pose = moved(Frame(start[:3], start[3:]))
+    found = reproduced(here, start, {OBJECT: frame})
+    other = reproduced(
+        there, torch.cat((pose.position, pose.orientation)), {OBJECT: moved(frame)}
+    )
+    expected = moved(Frame(torch.zeros(60, 3).double(), found)).orientation
+    assert float(angles(other, expected).max()) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_orientations_far_apart_are_reproduced_better_than_in_four_coordinates(seed):
+    """The mean of demonstrations that lie more than 90 degrees apart, at half the error."""
+    shown = recordings(seed)
+    q = orientations(shown)
+    assert float(angles(q[:, :, None], q[:, None]).max()) > math.pi / 2
+    wanted = mean_of(shown)
+    start = torch.cat((torch.zeros(3).double(), wanted[0]))
+    plain, tangent = (
+        angles(reproduced(fitted(shown, operator), start, {}), wanted).mean()
+        for operator in (AbsoluteOrientation("hand"), ABSOLUTE)
+    )
+    assert float(tangent) <= 0.5 * float(plain)
+
+
+def one_gaussian(operator, mean, covariance, q0, precise):
+    """A model of one component about a posture, on the upper body."""
+    n = len(q0)
+    means = [torch.cat((torch.zeros(1), m))[None].double() for m in (mean, q0)]
+    covariances = [
+        torch.block_diag(torch.ones(1, 1).double(), c)[None]
+        for c in (covariance, precise * torch.eye(n).double())
+    ]
+    return TaskParameterizedGMM.from_parameters(
+        [1.0], means, covariances, [0.0, 1.0], operators=[operator, Canonical()],
+        robot=upper_body(), keep_limits=False,
+    )  # fmt: skip
+
+
+def test_for_small_spread_it_agrees_with_the_quaternion_form():
+    """The fused joints differ by the square of how far the mean is, as exp does from 1 + y."""
+    robot = upper_body()
+    q0 = ((robot.lower + robot.upper) / 2).double()
+    state = robot.state(q0)
+    frame = Frame(torch.ones(3).double(), torch.tensor([0.5, 0.5, -0.5, 0.5]).double())
+    turn = quaternions.conjugate(frame.orientation)
+    base = quaternions.product(turn, state.orientation(LEFT))
+    rng = np.random.default_rng(2)
+    direction = torch.from_numpy(rng.standard_normal(3))
+    factor = torch.from_numpy(rng.standard_normal((3, 3)))
+    covariance = factor @ factor.T + 0.1 * torch.eye(3)
+    differences, step = [], 0.0
+    for size in (0.02, 0.01):
+        y = size * direction
+        path = ((0.0, *base.tolist()),)
+        tangent = RelativeOrientation(LEFT, OBJECT, geometry="tangent", path=path)
+        small = size**2 * covariance
+        wanted = quaternions.product(base, quaternions.exp(y))
+        # an orientation's turn is twice what its quaternion moves, none along the radius
+        embedding = 0.5 * quaternions.left_matrix(wanted)[:, 1:]
+        four = embedding @ small @ embedding.T + size**2 * wanted[:, None] * wanted
+        models = (
+            one_gaussian(tangent, y, small, q0, size**2),
+            one_gaussian(RelativeOrientation(LEFT, OBJECT), wanted, four, q0, size**2),
+        )
+        one, other = (m.step(0.5, q0, {OBJECT: frame}) for m in models)
+        step = float((one.joints - q0).norm())
+        differences.append(float((one.joints - other.joints).norm()))
+        spread = (one.covariance - other.covariance).norm() / one.covariance.norm()
+        assert float(spread) < 3 * size
+    assert 0 < differences[0] < 0.05 * step * 2
+    assert differences[1] < 0.3 * differences[0]
+
+
+def test_the_density_is_normalised_over_rotations():
+    """``N(y) / |J_l(y)|`` is a density on SO(3), whose volume is 8 pi^2 [rad^3]."""
+    regression = model(ABSOLUTE).regression()
+    rng = np.random.default_rng(0)
+    q = quaternions.normalize(torch.from_numpy(rng.standard_normal((60_000, 4))))
+    state = HAND.state(torch.cat((torch.zeros(60_000, 3), q), 1))
+    time = torch.full((60_000,), 1.3, dtype=torch.float64)
+    [operator] = regression.operators
+    local = operator.at(time[0]).coordinates(state, {})
+    volume = torch.linalg.det(quaternions.left_jacobian(local))
+    when = regression.log_density(time[:1], [local[:1]])  # of time alone, without the rotation
+    marginals = regression._marginals.log_activation(time[:1, None]).logsumexp(-1)
+    log_time = marginals - 0.5 * math.log(2 * math.pi)
+    assert bool(when.isfinite())
+    density = (regression.log_density(time, [local]) - log_time).exp() / volume
+    # what lies beyond half a turn from the base has no coordinates: little at this spread
+    assert float(density.mean()) * 8 * math.pi**2 == pytest.approx(1.0, abs=0.05)
+
+
+def test_gradients_are_finite_where_nothing_is_left_to_turn_and_elsewhere():
+    skill = model(RELATIVE)
+    for turn in ([0.0, 0.0, 0.0], [1.0, -2.0, 0.5]):
+        frame = quaternions.exp(torch.tensor([0.1, 0.3, 0.2]).double()).requires_grad_()
+        base = skill.operators_[0]._path[1][0]
+        q = quaternions.product(
+            quaternions.product(frame.detach(), base),
+            quaternions.exp(torch.tensor(turn).double()),
+        )
+        start = torch.cat((torch.zeros(3).double(), q)).requires_grad_()
+        found = skill.step(0.0, start, {OBJECT: Frame._from(torch.zeros(3).double(), frame)})
+        gradients = torch.autograd.grad(
+            found.joints.square().sum() + found.covariance.sum(), (start, frame)
+        )
+        assert all(bool(g.isfinite().all()) for g in gradients)
+        assert all(float(g.abs().max()) > 0 for g in gradients)
+
+
+def test_a_model_is_what_it_was_after_saving_it(tmp_path):
+    skill = model(RELATIVE, ABSOLUTE)
+    skill.save(tmp_path / "skill")
+    again = TaskParameterizedGMM.load(tmp_path / "skill")
+    assert again.operators_ == skill.operators_
+    shown = recordings(seed=3, count=2)
+    np.testing.assert_array_equal(again.score_samples(shown), skill.score_samples(shown))
+    start, frames = shown[0].joints[0], dict(shown[0].frames)
+    assert torch.equal(reproduced(again, start, frames), reproduced(skill, start, frames))
+
+
+def test_batches_lie_about_the_mean_of_the_first():
+    shown = recordings()
+    streamed = fitted([shown[:5], shown[5:]], ABSOLUTE)
+    assert streamed.operators_ == with_mean_orientations([ABSOLUTE], shown[:5], HAND)
+    wanted = mean_of(shown)
+    start = torch.cat((torch.zeros(3).double(), wanted[0]))
+    assert float(angles(reproduced(streamed, start, {}), wanted).mean()) < 0.1
+
+
+def test_orientations_that_never_vary_are_as_certain_as_in_four_coordinates():
+    """Rounding is no spread: what all demonstrations share is regularised like the rest."""
+    still = torch.tensor([0.1, -0.7, 0.5, 0.5]).double()
+    still = (still / still.norm()).expand(60, 4)
+    shown = [
+        Demonstration(TIME, torch.cat((k * TIME[:, None].expand(60, 3), still), 1), {})
+        for k in (0.9, 1.0, 1.1)
+    ]
+    for operator in (AbsoluteOrientation("hand"), ABSOLUTE):
+        skill = fitted(shown, operator)
+        assert float(torch.linalg.eigvalsh(skill.covariances_[0]).min()) > 1e-9
+
+
+def test_the_time_of_a_product_is_refused():
+    with pytest.raises(DataError, match="activation='time'"):
+        fitted(recordings(), ABSOLUTE, activation="product")
+
+
+def test_the_printed_fusion_agrees():
+    start = torch.cat((torch.zeros(3).double(), mean_of(recordings())[0]))
+    printed = fitted(recordings(), ABSOLUTE, fusion="covariance", epsilon=1e-9)
+    one, other = (reproduced(m, start, {}) for m in (printed, model(ABSOLUTE)))
+    assert float(angles(one, other).max()) < 1e-3
+
+
+@cache
+def handling():
+    """Where the whole of a skill is in tangent space: two arms, and a bottle that is new."""
+    hands = [
+        Stack(
+            RelativePosition(hand, "bottle"),
+            RelativeOrientation(hand, "bottle", geometry="tangent"),
+        )
+        for hand in ("l_hand", "r_hand")
+    ]
+    skill = TaskParameterizedGMM(8, [Stack(*hands), Canonical()], upper_body())
+    return skill.fit(few_bottles())
+
+
+def test_an_instant_of_a_skill_is_found():
+    skill, demonstration = handling(), few_bottles()[0]
+    begin, end = demonstration.time[[0, -1]].tolist()
+    localizer = Localizer(skill.regression(), begin, end)
+    state = skill.kinematics_.state(demonstration.joints)
+    look = localizer.look(state, dict(demonstration.frames))
+    found = localizer.instants[look.log_likelihood().argmax(1)]
+    before = demonstration.time.numpy() < 8  # then it shakes, and instants are alike
+    assert np.median(np.abs(found - demonstration.time.numpy())[before]) < 0.1
+    part = slice(20, 60)
+    np.testing.assert_allclose(
+        look.log_likelihood(part), look.log_likelihood()[:, part], rtol=1e-9
+    )
+
+
+def test_the_likelihood_of_an_instant_is_that_of_the_coordinates_then(monkeypatch):
+    monkeypatch.setattr(localization, "SLACK", 0.0)
+    monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
+    regression = model(RELATIVE, ABSOLUTE).regression()
+    localizer = Localizer(regression, 0.0, 3.0)
+    shown = recordings(seed=4, count=1)[0]
+    for state in (HAND.state(shown.joints[[7, 31]]), HAND.state(shown.joints[[11]])):
+        got = localizer.look(state, dict(shown.frames)).log_likelihood()
+        for row, joints in zip(got, state.joints, strict=True):
+            alone = HAND.state(joints)
+            time = torch.from_numpy(localizer.instants)
+            local = [
+                operator.at(time).coordinates(alone, shown.frames)
+                for operator in regression.operators
+            ]
+            joint = regression.log_density(time, local).numpy()
+            marginals = regression._marginals.log_activation(time[:, None]).logsumexp(-1)
+            expected = joint - marginals.numpy()
+            np.testing.assert_allclose(row - row.max(), expected - expected.max(), atol=1e-6)
+
+
+def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
+    """Finite differences, far from what is wanted: the linearisation's Jacobian is exact."""
+    skill = handling()
+    regression, time = skill.regression(), torch.tensor(4.4, dtype=torch.float64)
+    frame = few_bottles()[0].frames["bottle"]
+    generator = torch.Generator().manual_seed(0)
+    joints = few_bottles()[0].joints[:1].to(torch.float64)
+    joints = joints + 0.3 * torch.randn(1, 17, generator=generator, dtype=torch.float64)
+    index = regression.tick(time, joints[0], {"bottle": frame}).activation.argmax()
+    cost = _Cost(
+        regression, index.expand(1, 1), time, joints, {"bottle": frame.expand((1,))},
+        regression.kinematics.state,
+    )  # fmt: skip
+    _, downhill, _ = cost(joints[None])
+    steps = 1e-6 * torch.eye(17, dtype=torch.float64)
+    slope = torch.stack(
+        [(cost((joints + s)[None])[0] - cost((joints - s)[None])[0]).squeeze() for s in steps]
+    )
+    assert float((slope / 2e-6 + downhill[0, 0]).abs().max() / downhill.abs().max()) < 1e-6
+
+
+def test_a_controller_and_a_batch_run_it():
+    skill, shown = handling(), few_bottles()[0]
+    frames = {"bottle": shown.frames["bottle"]}
+    one = skill.controller(shown.joints[0], frames, clock="even")
+    many = skill.controller(shown.joints[0].expand(3, -1), frames, clock="even")
+    for _ in range(30):
+        alone, together = one.step(0.04), many.step(0.04)
+        torch.testing.assert_close(together.reference[1], alone.reference, rtol=0, atol=1e-9)
+    estimate = skill.step(4.0, shown.joints[10], frames, candidates=True)
+    assert [c.mean.shape for c in estimate.candidates] == [(17,), (17,)]
+
+
+def test_what_compiles_no_logarithms_says_so():
+    with pytest.raises(DataError, match="geometry='quaternion'"):
+        handling().compile("eager")
