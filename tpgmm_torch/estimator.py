@@ -575,7 +575,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """EM from where it was, on rows that were kept."""
         operators, kinematics, before = self.operators_, self.kinematics_, self.mixture_
         widths = block_widths(operators, kinematics)
-        table, members, group_size = kept.table(widths, self.time_)
+        turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
+        table, members, group_size = kept.table(widths, turns, self.time_)
         moments = column_moments(StoredRows(table[members]))
         shares = members.sum() / (kept.n_instants or len(members) / len(kept.rows))
         mixture = BlockGaussianMixture(

@@ -96,7 +96,7 @@ class KeptRows:
         )
 
     def table(
-        self, widths: Sequence[int], like: torch.Tensor
+        self, widths: Sequence[int], turns: Sequence[bool], like: torch.Tensor
     ) -> tuple[Array, NDArray[np.bool_], int]:
         """All rows, which of them count, and how many share a responsibility.
 
@@ -106,6 +106,8 @@ class KeptRows:
         ----------
         widths : sequence of int
             ``1 + D_j`` of each operator.
+        turns : sequence of bool
+            For each operator, whether there are rotation vectors among its coordinates.
         like : Tensor
             Of the model's precision, which says what varies by rounding alone.
 
@@ -133,6 +135,6 @@ class KeptRows:
                 )
             table, members = grid.reshape(n * group, -1), counts.ravel()
         known = torch.from_numpy(table[members]).to(like)
-        constant = constant_columns(known.amin(0), known.amax(0), widths).cpu().numpy()
+        constant = constant_columns(known.amin(0), known.amax(0), widths, turns).cpu().numpy()
         table[:, constant] = table[np.flatnonzero(members)[0], constant]
         return table, members, group
