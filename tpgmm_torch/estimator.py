@@ -1027,10 +1027,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """Mean log-likelihood per time step of (new) demonstrations; higher is better.
 
         The density is that of time and of all operators' local coordinates,
-        ``sum_i pi_i N(t | i) prod_j N(X_t^(j) | t, i)``. Time counts once, however many
-        operators there are, so that it makes no difference whether independent coordinates
-        come in one operator or in several. Models that look at *other* coordinates describe
-        other data, in other units, and are not comparable: use
+        ``sum_i pi_i N(t | i) prod_j p(X_t^(j) | t, i)``. N demonstrations tell means and
+        covariances up to so much only: p is the predictive density of one more, Student's t
+        with N - 1 degrees of freedom, which is wider than the normal law and becomes it with
+        N. With ``covariance_shrinkage=0``, as in the paper, and where the model does not know
+        its demonstrations, p is the normal law. Time counts once, however many
+        operators there are, so that under the normal law it makes no difference whether
+        independent coordinates come in one operator or in several. Models that look at
+        *other* coordinates describe other data, in other units, and are not comparable: use
         :func:`tpgmm_torch.metrics.make_scorer` for those.
 
         Unlike ``lower_bound_``, :meth:`bic` and :meth:`aic`, which are EM's and count time
@@ -1042,12 +1046,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
         """Mean log-likelihood per time step of each demonstration, (n,); see :meth:`score`."""
         rows, regression = self._rows(X), self.regression()
+        n_samples = None
+        if self.shown_ is not None and self.covariance_shrinkage != 0:
+            n_samples = self.shown_.n_demonstrations
         widths = block_widths(self.operators_, self.kinematics_)
         scores = []
         for row in rows:
             blocks = torch.from_numpy(row).to(self.means_[0]).split(list(widths), 1)
             local = [block[:, 1:] for block in blocks]
-            scores.append(float(regression.log_density(blocks[0][:, 0], local).mean()))
+            density = regression.log_density(blocks[0][:, 0], local, n_samples)
+            scores.append(float(density.mean()))
         return np.array(scores)
 
     def bic(self, X: Sequence[Demonstration]) -> float:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, multivariate_t, norm
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 from sklearn.model_selection import GridSearchCV, KFold, LeaveOneOut, cross_val_score
@@ -650,7 +650,9 @@ def test_a_model_of_known_parameters_takes_arrays():
         blend=0.0,
     )
     assert torch.equal(known.predict(shown)[0].joints, model.predict(shown)[0].joints)
-    assert known.score([shown]) == model.score([shown])
+    assert known.shown_ is None  # nor how many demonstrations there were
+    normal = copy.copy(model).set_params(covariance_shrinkage=0)
+    assert known.score([shown]) == normal.score([shown])
     assert (known.n_iter_, known.n_components) == (0, 6)
     refused(
         lambda: TaskParameterizedGMM.from_parameters(
@@ -1001,7 +1003,7 @@ def test_signs_of_recorded_quaternions_mean_nothing():
 
 def test_a_score_is_the_mean_over_all_time_steps():
     uneven = [*waves(2), *waves(1, length=12)]
-    model = canonical().fit(waves())
+    model = canonical(covariance_shrinkage=0).fit(waves())
     values = model.score_samples(uneven)
     assert values.shape == (3,)
     assert model.score(uneven) == pytest.approx(values @ [30, 30, 12] / 72)
@@ -1013,7 +1015,7 @@ def test_a_score_is_the_mean_over_all_time_steps():
 
 
 def test_time_counts_once_however_many_operators_there_are():
-    model, [shown] = hands(), handlings(1)
+    model, [shown] = hands_model(covariance_shrinkage=0).fit(handlings()), handlings(1)
     rows = local_data([shown], model.operators_, HANDS, model.regression().expected)[0].numpy()
     sides, component = np.split(rows, 2, axis=1), []
     for k in range(len(model.weights_)):
@@ -1031,7 +1033,9 @@ def test_time_counts_once_however_many_operators_there_are():
 
 def test_packages_of_independent_coordinates_are_comparable():
     """With diagonal covariances one operator of all coordinates is as many operators."""
-    apart = hands_model(covariance_type="diag", operators=[*HANDLING]).fit(handlings())
+    apart = hands_model(
+        covariance_type="diag", operators=[*HANDLING], covariance_shrinkage=0
+    ).fit(handlings())
     means = torch.cat([apart.means_[0], apart.means_[1][:, 1:]], 1)
     covariances = torch.diag_embed(
         torch.cat(
@@ -1043,6 +1047,33 @@ def test_packages_of_independent_coordinates_are_comparable():
         operators=[Stack(*HANDLING)], robot=HANDS,
     )  # fmt: skip
     assert together.score(handlings()) == pytest.approx(apart.score(handlings()), rel=1e-12)
+
+
+def test_the_score_is_the_predictive_density_of_one_more_demonstration():
+    model, [shown] = canonical(n_components=3).fit(waves()), waves(1)
+    count, component = len(waves()), []
+    for k, part in enumerate(zip(model.means_[0], model.covariances_[0], strict=True)):
+        mean, covariance = (each.numpy() for each in part)
+        gain = covariance[1:, 0] / covariance[0, 0]
+        given = covariance[1:, 1:] - np.outer(gain, covariance[0, 1:])
+        scale = given * (count + 1) / (count - 1)
+        logs = norm(mean[0], np.sqrt(covariance[0, 0])).logpdf(shown.time.numpy())
+        for t, (time, joints) in enumerate(zip(shown.time, shown.joints, strict=True)):
+            expected = mean[1:] + gain * (float(time) - mean[0])
+            logs[t] += multivariate_t(expected, scale, df=count - 1).logpdf(joints.numpy())
+        component.append(float(model.weights_[k].log()) + logs)
+    expected = np.logaddexp.reduce(component).mean()
+    assert model.score([shown]) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_few_demonstrations_are_not_certain_of_what_comes_next(n):
+    far = [replace(one, joints=one.joints + 1.0) for one in waves(1)]
+    model = canonical().fit(waves(n))
+    wide = model.score(far)
+    model.set_params(covariance_shrinkage=0)  # of the same mixture
+    assert np.isfinite(wide) and wide > model.score(far) + 50
 
 
 def test_another_motion_is_less_likely():

@@ -136,11 +136,39 @@ class Conditionals(_OfComponents):
         elapsed = time.unsqueeze(-1) - self.time_mean
         return torch.addcmul(self.mean, self.gain, elapsed.unsqueeze(-1))
 
-    def log_density(self, local: Tensor, time: Tensor) -> Tensor:
-        """``log N(x_t | t)`` of coordinates (T, D) at times (T,), by component, (T, K)."""
+    def log_density(
+        self, local: Tensor, time: Tensor, n_samples: float | None = None
+    ) -> Tensor:
+        """``log N(x_t | t)`` of coordinates (T, D) at times (T,), by component, (T, K).
+
+        Parameters
+        ----------
+        local : Tensor of shape (T, D)
+        time : Tensor of shape (T,)
+        n_samples : float, optional
+            How many independent samples n a component was learned from. Given that, the
+            density of a new one: Student's t with n - 1 degrees of freedom around the same
+            mean, of the scale matrix ``(n + 1) / (n - 1)`` times the covariance [1]_.
+
+        References
+        ----------
+        .. [1] A. Gelman et al.: Bayesian Data Analysis, 3rd ed., section 3.2: the posterior
+           predictive of a normal law of unknown mean and variance.
+        """
         residual = (local.unsqueeze(-2) - self.at(time)).movedim(-2, 0)
         white = gaussians.whiten(self.covariance, residual.mT, "the covariance of a component")
         logdet = gaussians.cholesky(self.covariance, "the covariance of a component")
         logdet = 2 * logdet.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        constant = local.shape[-1] * math.log(2 * math.pi) + logdet
-        return -0.5 * (white.square().sum(-2) + constant.unsqueeze(-1)).mT
+        size, squares = local.shape[-1], white.square().sum(-2)
+        if n_samples is None:
+            constant = size * math.log(2 * math.pi) + logdet
+            return -0.5 * (squares + constant.unsqueeze(-1)).mT
+        freedom = max(n_samples - 1.0, 1.0)  # one sample leaves the widest law
+        scale = (n_samples + 1) / freedom
+        constant = (
+            math.lgamma((freedom + size) / 2)
+            - math.lgamma(freedom / 2)
+            - 0.5 * (size * math.log(freedom * math.pi * scale) + logdet)
+        )
+        tail = 0.5 * (freedom + size) * torch.log1p(squares / (freedom * scale))
+        return (constant.unsqueeze(-1) - tail).mT

@@ -222,7 +222,9 @@ class Regression:
         weights = torch.softmax(self._marginals.log_activation(time.unsqueeze(-1)), -1)
         return (weights.unsqueeze(-2) @ self.conditionals[operator].at(time)).squeeze(-2)
 
-    def log_density(self, time: Tensor, local: Sequence[Tensor]) -> Tensor:
+    def log_density(
+        self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
+    ) -> Tensor:
         """``log sum_i pi_i N(t | i) prod_j N(X_t^(j) | t, i)``: time counts once.
 
         Parameters
@@ -230,6 +232,9 @@ class Regression:
         time : Tensor of shape (T,)
         local : sequence of Tensor of shape (T, D_j)
             Local coordinates of each operator.
+        n_samples : float, optional
+            Of a component: Student's t in place of the normal law N(X_t^(j) | t, i), see
+            :meth:`Conditionals.log_density`.
 
         Returns
         -------
@@ -237,7 +242,7 @@ class Regression:
         """
         total = self._marginals.log_activation(time.unsqueeze(-1)) - 0.5 * math.log(2 * math.pi)
         for one, coordinates in zip(self.conditionals, local, strict=True):
-            total = total + one.log_density(coordinates, time)
+            total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
     def windows(self, begin: float, end: float) -> tuple[Tensor, Tensor, Tensor]:
