@@ -390,3 +390,16 @@ def test_a_controller_and_a_batch_run_it():
 def test_what_compiles_no_logarithms_says_so():
     with pytest.raises(DataError, match="geometry='quaternion'"):
         handling().compile("eager")
+
+
+def test_what_is_learned_later_lies_about_the_same_mean():
+    shown = recordings()
+    skill = fitted(shown[:6], ABSOLUTE)
+    before = skill.operators_
+    skill.partial_fit(shown[6:])
+    assert skill.operators_ == before
+    wanted = mean_of(shown)
+    start = torch.cat((torch.zeros(3).double(), wanted[0]))
+    near = angles(reproduced(skill, start, {}), wanted).mean()
+    # the mean of all in the tangent space of the mean of six
+    assert float(near) < 0.5 * float(angles(mean_of(shown[:6]), wanted).mean())
