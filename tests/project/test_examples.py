@@ -23,11 +23,13 @@ CLAIMS = {
         ),
     ),
     "plot_03_orientation_sign.py": (
-        1,
+        2,
         lambda v: (
             max(v["errors"]["four plain numbers"]) > 90
             and max(v["errors"]["an orientation"]) < 10
-            and max(v["degrees_off"](v["turning"](tilt)).max() for tilt in v["tilts"]) < 17
+            and max(v["degrees_off"](one).max() for one in v["recordings"]) < 17
+            and max(v["between"](a, b).max() for a in v["far"] for b in v["far"]) > 90
+            and v["off"]["tangent"].mean() < 0.5 * v["off"]["quaternion"].mean()
         ),
     ),
     "plot_04_competing_constraints.py": (
