@@ -28,12 +28,13 @@ __all__ = ["Outlying", "left_out", "outlying_demonstrations"]
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
 #: What is nearer to the median is like the others: a share of the range of coordinates,
-NEAR = 0.02
+NEAR = 0.005
 #: and an angle [rad].
 NEAR_ANGLE = 0.05
-#: So many robust standard deviations from the median are unlike the others (at most 5 of those
-#: who are not, on real recordings), where they last for so long [s].
-UNLIKE, LONG = 7.0, 1.0
+#: So many robust standard deviations from the median are unlike the others, where they last for
+#: so long [s]. On real recordings: at most 6.1 of those who are not, at least 11.6 of those
+#: whose frame was taken at a wrong instant, 5 to 15 cm beside the right one.
+UNLIKE, LONG = 8.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -68,9 +69,9 @@ def outlying_demonstrations(
     """Demonstrations far from the median of all, at instants at which the others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
-    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than seven
-    times 1.4826 times the median distance from the median, for a second in all. Where the
-    others agree to less than 2 % of the range of an operator's coordinates, or 0.05 rad, that
+    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than eight
+    times 1.4826 times the median distance from the median, for half a second in all. Where the
+    others agree to less than 0.5 % of the range of an operator's coordinates, or 0.05 rad, that
     counts as their distance.
 
     Parameters

@@ -22,6 +22,12 @@ def misplaced(demonstration, shift=0.3):
     return replace(demonstration, frames={"cup": Frame(there, cup.orientation)})
 
 
+def test_a_frame_a_hand_s_breadth_beside_its_place_is_found():
+    # as one that was taken from the hand at a wrong instant, shortly before it closes
+    shown = [misplaced(d, 0.1) if i in (3, 8) else d for i, d in enumerate(handlings(10))]
+    assert episodes(shown) == [3, 8]
+
+
 def some_misplaced(n, wrong):
     shown = handlings(n)
     return [misplaced(d) if index in wrong else d for index, d in enumerate(shown)]
