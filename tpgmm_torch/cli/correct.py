@@ -15,9 +15,9 @@ __all__ = ["app"]
 app = typer.Typer()
 
 EXAMPLE = (
-    "Example: tpgmm fit DATASET ... --keep-demonstrations --out out/model; lerobot-rollout "
-    "--strategy.type=dagger ...; tpgmm correct out/model --dataset CORRECTIONS "
-    "--policy out/policy"
+    "Example: tpgmm correct out/model --dataset out/corrections --policy out/policy, after "
+    "tpgmm fit ... --keep-demonstrations --out out/model and lerobot-rollout "
+    "--strategy.type=dagger ..."
 )
 
 
@@ -73,7 +73,7 @@ def correct(
     recordings = options.recordings(
         dataset, robot, frame, episodes, units, joints, rate, plausibility, event
     )
-    shown = recordings.demonstrations()
+    shown = recordings.corrections()
     if placed:
         shown = in_skill_time(fitted, shown)
     fitted.partial_fit(shown, forget=forget)

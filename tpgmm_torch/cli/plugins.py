@@ -36,6 +36,9 @@ class Recordings(Protocol):
     ) -> Iterable[Sequence[Demonstration]]:
         """The same in batches of ``size`` episodes; a share of them for each process."""
 
+    def corrections(self) -> list[Demonstration]:
+        """What a person did, where the set tells it from what a policy did."""
+
     def signals(self) -> Any:
         """Names, units and rate of states and actions: what a policy must know."""
 

@@ -23,6 +23,9 @@ FRAME = re.compile(
     r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
 )
 
+#: The column that says when a person took over.
+INTERVENTION = "intervention"
+
 
 class Recordings(plugins.Recordings):
     """A LeRobot data set as the options of a command describe it.
@@ -84,11 +87,57 @@ class Recordings(plugins.Recordings):
 
         return EpisodeBatches(self.dataset, size, processes=processes or ALONE, **self.options)
 
+    def corrections(self) -> list[Demonstration]:
+        """What a person did: where the set has ``intervention``, only that; else all."""
+        import numpy as np
+
+        from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
+        from tpgmm_datasets.reader import open_recording
+        from tpgmm_torch.exceptions import DataError
+
+        shown = self.demonstrations()
+        recording = open_recording(self.dataset, **self.options)
+        layout = recording.assembly.layout
+        if INTERVENTION not in layout.features:
+            return shown
+        flags = [layout.features[INTERVENTION]]
+        rows = read_episodes(layout, recording.episodes, flags, Relaxed(()))
+        segments = []
+        for demonstration, row in zip(shown, rows, strict=True):
+            flag = row.values[INTERVENTION][:, 0].astype(bool)
+            edges = np.flatnonzero(np.diff(np.concatenate(([False], flag, [False]))))
+            for first, last in edges.reshape(-1, 2):
+                segment = _between(demonstration, row.time[first], row.time[last - 1])
+                segments += [segment] if segment is not None else []
+        if not segments:
+            raise DataError(
+                f"{self.dataset} has no row with {INTERVENTION!r}: nobody took over"
+            )
+        return segments
+
     def signals(self) -> Signals:
         """What a policy that was learned from it must know."""
         from tpgmm_datasets.signals import Signals
 
         return Signals.of(self.dataset, **self.options)
+
+
+def _between(demonstration: Demonstration, begin: float, end: float) -> Demonstration | None:
+    """A segment of a demonstration; None where that has no motion."""
+    from tpgmm_torch.data.demonstrations import Demonstration
+
+    time = demonstration.time
+    inside = (time >= begin) & (time <= end)
+    if int(inside.sum()) < 2:
+        return None
+    frames = demonstration.frames.items()
+    return Demonstration(
+        time[inside],
+        demonstration.joints[inside],
+        {name: frame[inside] if frame.batch_shape else frame for name, frame in frames},
+        demonstration.joint_names,
+        {name: at for name, at in demonstration.events.items() if begin <= at <= end},
+    )
 
 
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:

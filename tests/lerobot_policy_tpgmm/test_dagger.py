@@ -1,0 +1,179 @@
+"""A person takes over while LeRobot's ``dagger`` strategy runs the policy; then it goes on."""
+
+import json
+import math
+from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.dataset import DatasetRecordConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.rollout import context as rollout_context
+from lerobot.rollout.configs import DAggerStrategyConfig, RolloutConfig
+from lerobot.rollout.strategies import dagger
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.command_line import output
+from tests.support.policies import pose
+from tests.support.skills import bottle_demonstrations, small_bottle
+from tpgmm_torch import Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import PlausibilityWarning
+
+PLUGINS = Path(__file__).parents[1] / "support" / "plugins"
+NAMES = small_bottle().kinematics_.joint_names
+JOINTS = [f"{name}.pos" for name in NAMES]
+POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+RATE, LONG = 20, 13.6
+#: From when to when a person leads the robot [s].
+BEGIN, END = 2.0, 4.0
+
+
+def reproduced(model, shown):
+    time = torch.linspace(0, LONG, round(LONG * RATE) + 1, dtype=torch.float64)
+    [trajectory] = model.predict([Situation(shown.joints[0], shown.frames, time)])
+    return trajectory.joints
+
+
+class Person:
+    """Leads the robot along the skill, but lifts an elbow on the way; presses the keys."""
+
+    name, is_connected, feedback_features = "person", True, {}
+
+    def __init__(self, path):
+        self.path, self.ticks, self.led = path, 0, 0
+        self.events = None
+
+    def connect(self):
+        pass
+
+    def disconnect(self):
+        pass
+
+    def tick(self):
+        """Once for each observation: pause, correct, pause, go on, stop."""
+        self.ticks += 1
+        keys = {40: "pause_resume", 44: "correction", 86: "correction", 90: "pause_resume"}
+        if self.ticks in keys:
+            self.events.request_transition(keys[self.ticks])
+        if self.ticks == 130:
+            self.events.stop_recording.set()
+
+    def get_action(self):
+        share = min(self.led / 40, 1.0)
+        joints = self.path[round(BEGIN * RATE) + self.led].clone()
+        joints[NAMES.index("l_elbow")] -= 0.3 * math.sin(math.pi * share)
+        self.led += 1
+        return dict(zip(JOINTS, joints.tolist(), strict=True))
+
+
+def test_a_person_corrects_and_the_policy_goes_on(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(PLUGINS)
+    from lerobot_robot_bimanual import BimanualConfig
+
+    shown = bottle_demonstrations()[5]
+    model, path = small_bottle(), reproduced(small_bottle(), shown)
+    model.save(tmp_path / "model", demonstrations=True)
+    start = dict(zip(JOINTS, shown.joints[0].tolist(), strict=True))
+    start |= dict(zip(POSE_NAMES, pose(shown.frames["bottle"]).tolist(), strict=True))
+    (tmp_path / "start.json").write_text(json.dumps(start))
+    TPGMMPolicy.from_estimator(
+        model, fps=RATE, state_names=list(start), action_names=JOINTS
+    ).save_pretrained(tmp_path / "policy")
+
+    policy = PreTrainedConfig.from_pretrained(tmp_path / "policy")
+    policy.pretrained_path = tmp_path / "policy"
+    person = Person(path)
+    monkeypatch.setattr(rollout_context, "make_teleoperator_from_config", lambda _: person)
+    monkeypatch.setattr(dagger, "precise_sleep", lambda _: None)
+    monkeypatch.setattr(dagger, "log_say", lambda *_: None)
+    config = RolloutConfig(
+        robot=BimanualConfig(start=tmp_path / "start.json", log=tmp_path / "log.json"),
+        teleop=SimpleNamespace(type="person"),
+        policy=policy,
+        strategy=DAggerStrategyConfig(num_episodes=2, smooth_handover=False),
+        dataset=DatasetRecordConfig(
+            "local/rollout_corrections", "shake", tmp_path / "set", RATE, push_to_hub=False
+        ),
+        fps=RATE,
+        task="shake",
+        play_sounds=False,
+        return_to_initial_position=False,
+    )
+    context = rollout_context.build_rollout_context(config, Event())
+    strategy = dagger.DAggerStrategy(config.strategy)
+    person.events = strategy._events
+    robot = context.hardware.robot_wrapper.inner
+    observe = robot.get_observation
+    robot.get_observation = lambda: (person.tick(), observe())[1]
+    strategy.setup(context)
+    with pytest.warns(PlausibilityWarning, match="start posture"):  # in the midst of the skill
+        strategy.run(context)
+    strategy.teardown(context)
+
+    sent = json.loads((tmp_path / "log.json").read_text())
+    moved = np.array([[action[name] for name in JOINTS] for action in sent])
+    assert person.led > 35
+    # it went on from where the person left, without a jump, along the skill
+    after = moved[-35:]
+    assert np.abs(np.diff(moved[-40:], axis=0)).max() < 0.2
+    places = np.abs(path.numpy()[None] - after[:, None]).max(-1).argmin(1) / RATE
+    assert END - 0.5 < places[-1] < END + 3.0
+
+    printed = output(
+        "correct", tmp_path / "model", "--dataset", tmp_path / "set", "--policy",
+        tmp_path / "corrected", "--frame", "bottle=observation.state[17:24]",
+        "--plausibility", "ignore",
+    )  # fmt: skip
+    assert "learned from 5 demonstrations" in printed
+    begin, _, end = printed.splitlines()[0].split()[1:4]
+    assert abs(float(begin) - BEGIN) < 0.5 and abs(float(end) - END) < 0.5
+    corrected = TaskParameterizedGMM.load(tmp_path / "model")
+    bent = reproduced(corrected, shown) - path
+    elbow = bent[:, NAMES.index("l_elbow")]
+    middle = round((BEGIN + END) / 2 * RATE)
+    assert -0.3 < float(elbow[middle]) < -0.005
+    assert float(bent[round(6 * RATE) :].abs().max()) < 0.02
+    again = TPGMMPolicy.from_pretrained(tmp_path / "corrected").to_estimator()
+    assert torch.allclose(again.means_[0], corrected.means_[0])
+    assert list(TPGMMPolicy.from_pretrained(tmp_path / "corrected").config.state_names) == [
+        *start
+    ]
+
+
+def test_of_a_set_with_both_only_what_a_person_did_counts(tmp_path):
+    model, shown = small_bottle(), bottle_demonstrations()[5]
+    model.save(tmp_path / "model", demonstrations=True)
+    path = reproduced(model, shown).float().numpy()
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (17,), "names": list(NAMES)},
+        "observation.environment_state": {
+            "dtype": "float32", "shape": (7,),
+            "names": [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")],
+        },
+        "action": {"dtype": "float32", "shape": (17,), "names": list(NAMES)},
+        "intervention": {"dtype": "bool", "shape": (1,), "names": None},
+    }  # fmt: skip
+    recorded = LeRobotDataset.create(
+        "local/both", RATE, features, root=tmp_path / "set", use_videos=False
+    )
+    for step, joints in enumerate(path[:200]):
+        recorded.add_frame(
+            {
+                "observation.state": joints,
+                "observation.environment_state": pose(shown.frames["bottle"]).float().numpy(),
+                "action": joints,
+                "intervention": np.array([60 <= step < 100 or 140 <= step < 160]),
+                "task": "shake",
+            }
+        )
+    recorded.save_episode()
+    recorded.finalize()
+    printed = output("correct", tmp_path / "model", "--dataset", tmp_path / "set")
+    places = [line.split()[1:4:2] for line in printed.splitlines()[:2]]
+    found = np.array(places, dtype=float)
+    np.testing.assert_allclose(found, [[3.0, 4.95], [7.0, 7.95]], atol=0.25)
+    assert "learned from 6 demonstrations" in printed
