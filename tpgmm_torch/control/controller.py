@@ -254,19 +254,17 @@ class Controller:
                 self._inputs.poses.keys() - known, self._frames, stands, self.holding, dt
             )
         self.holding = self.holding.advance(time, stands, seen, told)
-        before_bend = self._bend
         at = self._unbent(at)
-        free = estimate = self._estimated(time, at)
+        estimate = self._estimated(time, at)
         if self._via is not None:
-            estimate, self._via = self._conditioned(time, free)
+            estimate, self._via = self._conditioned(time, estimate)
         shift = self._fade(estimate.joints, 0.0 if last is None else dt)
         wanted = self._shifted(estimate.joints, shift)
-        if self._follower is not None and last is not None and not self._follows(wanted, dt):
-            # what via-points ask for is not what the search is for
-            steady = wanted - (self._bend - before_bend)
-            found = self._searched(time, at, free, steady, dt)
-            if found is not free.joints:
-                wanted = self._shifted(found + (estimate.joints - free.joints), shift)
+        # robots that via-points lead are late for another reason than what is searched for
+        bent = self._via is not None and self._via.shift is not None
+        following = self._follower is not None and last is not None and not bent
+        if following and not self._follows(wanted, dt):
+            wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
         if last is not None and ended is not None and bool(ended.any()):
             # for them it is as if all had come to the end
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)

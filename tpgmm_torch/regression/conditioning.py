@@ -213,7 +213,7 @@ class Conditioning:
         if not bool(estimate.joints.isfinite().all()):  # of whom it cannot be told: as it was
             kept = estimate.joints if self.shift is None else estimate.joints + self.shift
             return replace(estimate, joints=kept), self
-        look = _Look(self.regression, frames, bounds, attach)
+        look = _Look(self.regression, frames, attach)
         here, moved_by = look(time, estimate.joints), []
         shift, covariance = torch.zeros_like(here.joints), here.covariance
         for cluster, last in zip(self.clusters, self.moved, strict=True):
@@ -260,7 +260,6 @@ class _Look:
 
     regression: Regression
     frames: Mapping[str, Frame]
-    bounds: tuple[Tensor, Tensor] | None
     attach: Callable[[RobotState], RobotState] | None
 
     def state(self, joints: Tensor) -> RobotState:
@@ -270,7 +269,7 @@ class _Look:
     def __call__(self, time: Tensor, joints: Tensor) -> Estimate:
         """At ``time``, linearised at ``joints``."""
         given = joints if self.attach is None else self.state(joints)
-        return self.regression.tick(time, given, self.frames, self.bounds)
+        return self.regression.tick(time, given, self.frames)
 
 
 @dataclass(frozen=True, eq=False)

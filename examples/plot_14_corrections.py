@@ -1,0 +1,77 @@
+r"""
+Correcting a skill
+==================
+
+A fitted skill is changed in two ways without fitting it from the beginning: by a *via-point*, a
+posture that it shall pass through at one time, and by a *correction*, a segment that somebody
+showed and that is merged with the demonstrations.
+"""
+
+# sphinx_gallery_thumbnail_number = 1
+import copy
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoint
+from tpgmm_torch.corrections import in_skill_time
+
+# %%
+# A skill of one joint
+# --------------------
+
+time = np.linspace(0, 4, 200)
+generator = np.random.default_rng(0)
+
+
+def demonstrate():
+    """A wave, whose height and offset differ."""
+    height, offset = generator.normal(1, 0.05), generator.normal(0, 0.05)
+    return Demonstration(time, (height * np.sin(1.5 * time) + offset)[:, None])
+
+
+model = TaskParameterizedGMM(n_components=12, blend=0).fit([demonstrate() for _ in range(6)])
+situation = Situation(joints=[0.0], time=time)
+[before] = model.predict([situation])
+
+# %%
+# A via-point
+# -----------
+# At second 2 the joint shall be at 0.5. A second before and after that, the skill is as it was.
+
+[through] = model.with_via_points([ViaPoint(2.0, "canonical", [0.5])]).predict([situation])
+
+# %%
+# A correction
+# ------------
+# Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in the
+# skill that belongs is found, and the two oldest demonstrations are forgotten.
+
+part = np.linspace(2.5, 3.5, 80)
+lower = np.sin(1.5 * part) - 0.4 * np.sin(np.pi * (part - 2.5)) ** 2
+shown = Demonstration(1.2 * (part - 2.5), lower[:, None])
+again = Demonstration(0.9 * (part - 2.5), lower[:, None] + 0.02)
+placed = in_skill_time(model, [shown, again])
+corrected = copy.deepcopy(model).partial_fit(placed, forget=2)
+[after] = corrected.predict([situation])
+print([f"{float(p.time[0]):.2f} to {float(p.time[-1]):.2f} s" for p in placed])
+print("demonstrations that count:", corrected.demonstration_weights_.tolist())
+
+# %%
+# The picture
+# -----------
+# Bands are one standard deviation: at the via-point there is none left.
+
+figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
+for axis, bent, title in zip(axes, (through, after), ("via-point", "correction"), strict=True):
+    for one, colour, label in ((before, "tab:gray", "before"), (bent, "tab:blue", title)):
+        mean, std = one.joints[:, 0], one.covariance[:, 0, 0].sqrt()
+        axis.plot(time, mean, color=colour, label=label)
+        axis.fill_between(time, mean - std, mean + std, color=colour, alpha=0.2)
+    axis.set(title=title, xlabel="time [s]")
+axes[0].plot(2.0, 0.5, "o", color="tab:red")
+for one in placed:
+    axes[1].plot(one.time, one.joints[:, 0], "--", color="tab:red", linewidth=1)
+axes[0].set_ylabel("joint [rad]")
+axes[1].legend()
+plt.show()
