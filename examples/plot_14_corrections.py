@@ -44,8 +44,8 @@ situation = Situation(joints=[0.0], time=time)
 # %%
 # A correction
 # ------------
-# Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in the
-# skill that belongs is found, and the two oldest demonstrations are forgotten.
+# Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in
+# the skill that belongs is found, and the two oldest demonstrations are forgotten.
 
 part = np.linspace(2.5, 3.5, 80)
 lower = np.sin(1.5 * part) - 0.4 * np.sin(np.pi * (part - 2.5)) ** 2
