@@ -79,6 +79,14 @@ CLAIMS = {
             and abs(float(v["change"] - v["predicted"])) < 1e-9
         ),
     ),
+    "plot_14_corrections.py": (
+        1,
+        lambda v: (
+            abs(float(v["through"].joints[np.abs(v["time"] - 2).argmin(), 0]) - 0.5) < 0.05
+            and all(abs(float(p.time[0]) - 2.5) < 0.1 for p in v["placed"])
+            and 0.05 < float((v["before"].joints - v["after"].joints).max()) < 0.3
+        ),
+    ),
 }
 
 
