@@ -70,6 +70,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.structure.component_selection import ComponentSelection
 from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.kept_rows import KeptRows
@@ -108,8 +109,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     Parameters
     ----------
-    n_components : int, default=10
-        K, the number of Gaussians.
+    n_components : int, "auto" or ComponentSelection, default=10
+        K, the number of Gaussians. "auto" finds it by the likelihood of demonstrations that
+        are left out, :class:`~tpgmm_torch.structure.component_selection.ComponentSelection`,
+        of at least three.
     operators : sequence of Operator, "auto" or OperatorSelection, optional
         Candidate projection operators, one subspace each; the default is ``[Canonical()]``.
         "auto" finds those that matter, :class:`OperatorSelection`, in at least three
@@ -196,6 +199,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Local means mu_i^(j), time first, one tensor per operator.
     covariances_ : list of Tensor of shape (K, 1 + D_j, 1 + D_j)
         Local covariances Sigma_i^(j).
+    n_components_ : int
+    component_selection_ : ComponentSelection or None
+        How likely what was left out is with each number; None where it was given.
     operators_ : tuple of Operator
     operator_selection_ : OperatorSelection or None
         Which were found, and why; None where they were given, and for a model that was loaded.
@@ -249,7 +255,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     """
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
-        "n_components": [Interval(Integral, 1, None, closed="left")],
+        "n_components": [
+            Interval(Integral, 1, None, closed="left"),
+            StrOptions({"auto"}),
+            ComponentSelection,
+        ],
         "operators": [StrOptions({"auto"}), OperatorSelection, "array-like", tuple, None],
         "robot": [Kinematics, None],
         "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
@@ -286,6 +296,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     shown_: Shown | None
     demonstration_weights_: Tensor | None
     operator_selection_: OperatorSelection | None
+    component_selection_: ComponentSelection | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
     via_points_: tuple[ViaPoint, ...]
@@ -299,7 +310,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     def __init__(
         self,
-        n_components: int = 10,
+        n_components: int | str | ComponentSelection = 10,
         operators: Sequence[Operator] | str | OperatorSelection | None = None,
         robot: Kinematics | None = None,
         *,
@@ -356,8 +367,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     @property
     def selects(self) -> bool:
-        """Whether :meth:`fit` finds the operators."""
-        return isinstance(self.operators, str | OperatorSelection)
+        """Whether :meth:`fit` finds operators or the number of components itself."""
+        found = isinstance(self.operators, str | OperatorSelection)
+        return found or not isinstance(self.n_components, Integral)
 
     def check_parameters(self) -> None:
         """Check types and ranges of the parameters, as :meth:`fit` does before it begins.
@@ -432,9 +444,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 responsibilities=self.responsibilities,
                 holds=holds,
             )
-            self._learn(gathered, operators, kinematics, checkpoint, holds)
+            components = self._components(known, gathered, operators, kinematics, holds)
+            number = None if components is None else components.n_components_
+            self._learn(gathered, operators, kinematics, checkpoint, holds, number)
             self.shown_, self.demonstration_weights_ = shown, weights
-            self.operator_selection_ = selection
+            self.operator_selection_, self.component_selection_ = selection, components
             self._kept = KeptRows.of(
                 gathered, list(map(len, known)), weights.nonzero()[:, 0].tolist()
             )
@@ -442,9 +456,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             return self._set_peaks(*peaks)
         if self.selects:
             raise DataError(
-                'operators="auto" compares all demonstrations with each other, which those in '
-                "batches or in several processes are not: fit an OperatorSelection to some of "
-                "them, and give its operators_"
+                'operators="auto" and n_components="auto" compare all demonstrations with each '
+                "other, which those in batches or in several processes are not: fit a model to "
+                "some of them, and give its operators_ and n_components_"
             )
         operators = check_operators(self.operators)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -580,7 +594,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         moments = column_moments(StoredRows(table[members]))
         shares = members.sum() / (kept.n_instants or len(members) / len(kept.rows))
         mixture = BlockGaussianMixture(
-            **self._shared_settings(operators, kinematics)
+            **self._shared_settings(operators, kinematics, self.n_components_)
             | {
                 "reg_covar": regularization(
                     moments,
@@ -1111,6 +1125,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators: Sequence[Operator],
         kinematics: Kinematics,
         n_demonstrations: int,
+        n_components: int | None = None,
     ) -> BlockGaussianMixture:
         """The mixture that :meth:`fit` learns from rows of local data.
 
@@ -1125,8 +1140,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             What they act on.
         n_demonstrations : int
             That the rows are of.
+        n_components : int, optional
+            By default that of the model.
         """
-        settings = self._shared_settings(operators, kinematics)
+        settings = self._shared_settings(operators, kinematics, n_components)
         settings |= {"group_size": group_size, "n_demonstrations": n_demonstrations}
         settings["reg_covar"] = regularization(
             moments,
@@ -1194,8 +1211,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_iter_ = getattr(mixture, "n_iter_", 0)
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
-        self.shown_ = self.demonstration_weights_ = None
-        self.operator_selection_ = self._kept = None
+        self.n_components_ = len(self.weights_)
+        self.shown_ = self.demonstration_weights_ = self._kept = None
+        self.operator_selection_ = self.component_selection_ = None
         self.via_points_, self.via_fade_ = (), 1.0
         self._untried = True
         return self
@@ -1247,7 +1265,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
         checked = check_operators(operators)
         mixture = BlockGaussianMixture.from_parameters(
-            weights, means, covariances, **model._shared_settings(checked, robot)
+            weights, means, covariances, **model._shared_settings(checked, robot, len(weights))
         )
         # it checked them; what it keeps went through their factors, and was rounded
         mixture.weights_ = weights
@@ -1283,6 +1301,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         }
         if not isinstance(parameters["random_state"], int):
             parameters["random_state"] = None
+        parameters["n_components"] = self.n_components_
         if not isinstance(parameters["holds"], str | None):
             parameters["holds"] = [hold.to_list() for hold in parameters["holds"]]
         config: dict[str, Any] = {
@@ -1444,11 +1463,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         kinematics: Kinematics,
         checkpoint: Checkpoint | None,
         holds: Sequence[Hold],
+        n_components: int | None = None,
     ) -> Self:
         """Fit the mixture to rows, and take over what it learned."""
         moments = column_moments(learning.rows, learning.processes)
+        group_size, count = learning.group_size, learning.n_demonstrations
         mixture = self.unfitted_mixture(
-            moments, learning.group_size, operators, kinematics, learning.n_demonstrations
+            moments, group_size, operators, kinematics, count, n_components
         )
         mixture.fit_rows(
             learning.rows,
@@ -1458,13 +1479,38 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
 
+    def _components(
+        self,
+        demonstrations: Sequence[Demonstration],
+        learning: LearningRows,
+        operators: tuple[Operator, ...],
+        kinematics: Kinematics,
+        holds: Sequence[Hold],
+    ) -> ComponentSelection | None:
+        """Find the number of components, where none is given."""
+        if isinstance(self.n_components, Integral):
+            return None
+        own = isinstance(self.n_components, ComponentSelection)
+        selection = clone(self.n_components) if own else ComponentSelection()
+        fold = clone(self).set_params(warm_start=False)
+
+        def make(
+            number: int, moments: ColumnMoments, size: int, n: int
+        ) -> BlockGaussianMixture:
+            return fold.unfitted_mixture(moments, size, operators, kinematics, n, number)
+
+        def condition(mixture: BlockGaussianMixture) -> Regression:
+            fold.set_mixture(mixture, operators, kinematics, learning.time, holds)
+            return fold.regression()
+
+        return selection.choose(demonstrations, learning, make, condition, holds)
+
     def _selection(self, demonstrations: Sequence[Demonstration]) -> OperatorSelection | None:
         """Find the operators that matter, where none are given."""
-        if not self.selects:
+        if not isinstance(self.operators, str | OperatorSelection):
             return None
-        selection = OperatorSelection()
-        if isinstance(self.operators, OperatorSelection):
-            selection = clone(self.operators)
+        own = isinstance(self.operators, OperatorSelection)
+        selection = clone(self.operators) if own else OperatorSelection()
         shared = {name: getattr(self, name) for name in ("holds", "robust", "dtype", "device")}
         selection.set_params(**shared)
         if selection.robot is None:
@@ -1524,10 +1570,15 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         return kinematics_for(demonstrations, operators, self.robot, self.dtype, self.device)
 
     def _shared_settings(
-        self, operators: Sequence[Operator], kinematics: Kinematics
+        self,
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+        n_components: int | None = None,
     ) -> dict[str, Any]:
         """What the mixture has of the estimator's parameters, and its blocks."""
         settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
+        if n_components is not None:
+            settings["n_components"] = n_components
         return settings | {"blocks": block_widths(operators, kinematics), "timed_blocks": True}
 
     def _situation(self, given: Situation | Demonstration) -> Situation:

@@ -230,6 +230,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         if fps is None and len(time) > 1:
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
         settings = {name: getattr(model, name) for name in HYPERPARAMETERS}
+        settings["n_components"] = model.n_components_
         if not isinstance(settings["random_state"], int):
             settings["random_state"] = None
         config = TPGMMConfig(

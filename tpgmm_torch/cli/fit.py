@@ -88,7 +88,15 @@ def fit(
             "frames were recorded over time."
         ),
     ] = None,
-    n_components: Annotated[int, learning("K, the number of Gaussians.", min=1)] = 10,
+    n_components: Annotated[
+        Any,
+        learning(
+            "K, the number of Gaussians; 'auto' finds it by the likelihood of episodes that "
+            "are left out.",
+            parser=options.count_or_auto,
+            metavar="auto | INTEGER",
+        ),
+    ] = 10,
     covariance_type: Annotated[
         Literal["full", "diag", "tied", "spherical"], learning("Shape of the covariances.")
     ] = "full",
@@ -264,7 +272,7 @@ def _report(
         shown = f"{max(hold.begin, 0.0):.2f} s to {end} (in {hold.share:.0%} of them)"
         lines[f"{hold.frame} held"] = f"by {hold.link} from {shown}"
     lines |= {
-        "components": f"{model.n_components} ({model.covariance_type})",
+        "components": f"{model.n_components_} ({model.covariance_type})",
         "iterations": f"{model.n_iter_}, {converged}",
     }
     if aligned:

@@ -213,6 +213,19 @@ def number_or_auto(text: str) -> float | str:
         raise typer.BadParameter(f"{text!r} is neither a number nor 'auto'") from error
 
 
+def count_or_auto(text: str | int) -> int | str:
+    """The positive integer that an option's text is, or "auto".
+
+    Raises
+    ------
+    typer.BadParameter
+        If it is neither.
+    """
+    if text == "auto" or (str(text).isdecimal() and int(text) > 0):
+        return "auto" if text == "auto" else int(text)
+    raise typer.BadParameter(f"{text!r} is neither a positive integer nor 'auto'")
+
+
 def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
     """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
     from tpgmm_torch.alignment import (

@@ -134,3 +134,16 @@ def test_fit_finds_operators_and_says_why(dataset, tmp_path):
     assert "left out is off by" in printed and "decides there" in printed
     model = TaskParameterizedGMM.load(tmp_path / "model")
     assert "bottle" in model.frame_names_
+
+
+def test_fit_finds_the_number_of_components(dataset, tmp_path):
+    steady = ("--rate", 2, "--alignment", "linear", *CALMLY)
+    options = ("--operator", "canonical", "--n-components", "auto", *steady)
+    printed = output("fit", dataset, *UPPER_BODY, *options, "--out", tmp_path / "model")
+    model = TaskParameterizedGMM.load(tmp_path / "model")
+    assert f"components       {model.n_components_} (full)" in printed.splitlines()
+
+
+def test_what_is_no_number_of_components_is_refused(dataset, tmp_path):
+    line = refusal("fit", dataset, "--n-components", "some", "--out", tmp_path / "model")
+    assert "'some' is neither a positive integer nor 'auto'" in line

@@ -253,5 +253,5 @@ class TestAuto:
 
     def test_batches_are_refused(self, task):
         shown = task.demonstrations(4)
-        with pytest.raises(DataError, match="fit an OperatorSelection to some of them"):
+        with pytest.raises(DataError, match="fit a model to some of them"):
             TaskParameterizedGMM(4, "auto", HAND).fit([shown[:2], shown[2:]])
