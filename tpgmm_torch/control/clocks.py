@@ -60,6 +60,8 @@ ELSEWHERE = 2.0
 JUMP = 0.3
 #: For how long a robot is known to be elsewhere before time moves there [s].
 PATIENCE = 0.05
+#: For how long time stands when a robot was pushed: where to is found, and it is let go [s].
+UNDECIDED = 0.3
 #: A robot returns whose error falls below that share of itself between two corrections.
 RETURNING = 0.9
 #: So far behind the time a robot may be, beyond its lag [s]; twice, and time stands still.
@@ -67,8 +69,8 @@ GRACE = 0.2
 #: A robot that moves by less has not moved [rad or m].
 STILL = 0.01
 #: A robot is missed late if time goes on for longer after it has come to rest [s].
-PAUSE = 1.0
-#: Below that share of its speed, time stands.
+PAUSE = 0.1
+#: Below that share of its speed, time stands, and a robot is led.
 STANDS = 0.05
 #: The most that time hurries, in units of its speed.
 HURRY = 2.0
@@ -93,6 +95,8 @@ class Observation:
         What the reference was made from.
     attach : callable, optional
         Adds what robots carry to their state: :meth:`Holding.state`.
+    pushed : Tensor of bool of shape (...), optional
+        Robots that somebody else has just moved, faster than their references.
     """
 
     joints: Tensor | None
@@ -101,6 +105,7 @@ class Observation:
     frames: Mapping[str, Frame]
     estimate: Estimate | None = None
     attach: Callable[[RobotState], RobotState] | None = None
+    pushed: Tensor | None = None
 
 
 class Progress(ABC):
@@ -413,9 +418,10 @@ class LocalizingClock(WaitingClock):
     situation, is as near to the robot as :class:`WaitingClock` expects it to be.
 
     Time waits for a robot that is behind, hurries after one that is ahead, and moves to where
-    a robot is that was brought to another place: :attr:`Progress.relocalized` says so. Where
-    no place explains what is observed, time waits. A robot that was stopped in a pause of the
-    skill is missed late: when it moves again, time goes back to when it came to rest.
+    a robot is that was brought to another place: :attr:`Progress.relocalized` says so. Of one
+    that was pushed, no place is believed before it was looked at; until then time stands. Where
+    no place explains what is observed, time waits. A robot that was stopped is missed late:
+    when it moves again, time goes back to when it came to rest.
 
     Parameters
     ----------
@@ -473,8 +479,10 @@ class LocalizingClock(WaitingClock):
             moved=no,
             rest=waiting.expected,
             rested=waiting.now,
+            told=waiting.expected,
             stalled=no,
             returned=waiting.now - math.inf,
+            undecided=waiting.error,
         )
         return progress.located(frames) if self.initial == "anywhere" else progress
 
@@ -514,10 +522,14 @@ class LocalizingProgress(WaitingProgress):
         The posture that a robot has not left since.
     rested : array of shape (...)
         The time when it came there [s].
+    told : array of shape (..., n_joints)
+        Their reference then.
     stalled : bool array of shape (...)
-        Robots that were waited for meanwhile.
+        Robots that have not moved since, although their references have.
     returned : array of shape (...)
         Where time has gone back to last, which it does once [s].
+    undecided : array of shape (...)
+        For how long time stands for a robot that was pushed [s].
     """
 
     localizer: Localizer
@@ -534,8 +546,10 @@ class LocalizingProgress(WaitingProgress):
     moved: Flags
     rest: Array
     rested: Array
+    told: Array
     stalled: Flags
     returned: Array
+    undecided: Array
 
     @property
     def relocalized(self) -> Tensor:
@@ -551,9 +565,16 @@ class LocalizingProgress(WaitingProgress):
 
     def advance(self, dt: float | Tensor, observation: Observation) -> Self:
         """From where the robots are; see :meth:`Progress.advance`."""
-        new = self._went(dt, observation)
-        now, measured, astray = new["now"], new["measured"], new["error"] > self.clock.tolerance
-        since = self.since + (_array(dt) if isinstance(dt, Tensor) else dt)
+        if observation.pushed is not None:
+            lost = self._lost(observation.pushed.numpy(force=True))
+            return lost.advance(dt, replace(observation, pushed=None))
+        new, passed = self._went(dt, observation), _array(dt) if isinstance(dt, Tensor) else dt
+        pushed, reference = self.undecided > 0, _array(observation.reference)
+        for key, stands in (("now", self.now), ("rate", 0.0)):
+            new[key] = np.where(pushed | self.stalled, stands, new[key])
+        now, measured = new["now"], new["measured"]
+        astray = (new["error"] > self.clock.tolerance) | pushed
+        since = self.since + passed
         due = since > (1 - 1e-6) * self.localizer.step
         new["since"] = np.where(due, 0.0, since)
         left = np.abs(measured - self.rest).max(-1) > STILL
@@ -561,6 +582,8 @@ class LocalizingProgress(WaitingProgress):
         stood: dict[str, Any] = {
             "rest": np.where(left[..., None], measured, self.rest),
             "rested": np.where(left, now, self.rested),
+            "told": np.where(left[..., None], reference, self.told),
+            "undecided": np.maximum(self.undecided - passed, 0.0),
         }
         if not (astray | self.localized).any():
             return replace(
@@ -573,14 +596,19 @@ class LocalizingProgress(WaitingProgress):
                 stalled=no,
                 moved=no,
             )
-        # one that was stopped and is let go does again what it has not done
-        back = left & self.stalled & (now > self.rested + PAUSE)
+        # one that does not move at all although it should is stopped, and is led from there;
+        # let go, it does again what it has not done
+        stopped = (
+            np.abs(reference - self.told).max(-1) > self.clock.tolerance * self.clock.floor
+        )
+        stopped &= now > self.rested + PAUSE
+        back = left & self.stalled & (now > self.rested + PAUSE) & ~pushed
         back &= np.abs(self.rested - self.returned) > JUMP
         went = replace(
             self,
             **new,
             **stood,
-            stalled=(self.stalled | (new["rate"] < STANDS)) & astray & ~left,
+            stalled=(self.stalled | stopped) & astray & ~left,
             before=np.where(due | ~astray, now, self.before),
             reached=np.where(astray, self.reached, now),
             stood=np.where(astray[..., None], self.stood, measured),
@@ -596,10 +624,24 @@ class LocalizingProgress(WaitingProgress):
             return went
         return replace(
             went._relocated(back, self.rested),
-            rested=np.where(back, self.rested, went.rested),
             returned=np.where(back, self.rested, went.returned),
             localized=went.localized & ~back,
         )
+
+    def _lost(self, robots: Flags) -> Self:
+        """Robots that may be anywhere, the nearer the sooner."""
+        return replace(
+            self,
+            undecided=np.where(robots, UNDECIDED, self.undecided),
+            weights=np.where(robots[..., None], self._anywhere(self.now), self.weights),
+            localized=self.localized | robots,
+            lost=self.lost | robots,
+        )
+
+    def _anywhere(self, now: Array) -> Array:
+        """The belief about robots that are not where they should be."""
+        apart = np.abs(self.localizer.instants - now[..., None]) / ELSEWHERE
+        return _normalized(np.exp(-apart) + 0.01)
 
     def _relocated(self, robots: Flags, time: Array) -> Self:
         """The time of some robots moved elsewhere, from where they stand on."""
@@ -612,6 +654,9 @@ class LocalizingProgress(WaitingProgress):
             place=np.where(robots, time, self.place),
             stood=np.where(joints, self.measured, self.stood),
             expected=np.where(joints, self.measured, self.expected),
+            rest=np.where(joints, self.measured, self.rest),
+            told=np.where(joints, self.measured, self.told),
+            rested=np.where(robots, time, self.rested),
             rate=np.where(robots, 0.0, self.rate),
             sure=np.where(robots, 0.0, self.sure),
             moved=self.moved | robots,
@@ -639,31 +684,32 @@ class LocalizingProgress(WaitingProgress):
         shift = np.maximum(now - before, 0.0) / localizer.step
         belief = move(self.weights[rows], shift, SPREAD * passed / localizer.step**2)
         localized, lost = self.localized[rows], (self.localized & self.lost)[rows]
+        pushed = went.undecided[rows] > 0
         belief = np.where(localized[:, None], belief, self._near(before))
-        # where no place nearby explains what is seen it is elsewhere, the nearer the sooner
-        apart = np.abs(localizer.instants - now[:, None]) / ELSEWHERE
-        anywhere = _normalized(np.exp(-apart) + 0.01)
-        belief = np.where(lost[:, None], 0.9 * belief + 0.1 * anywhere, belief)
+        # where no place nearby explains what is seen it is elsewhere
+        belief = np.where(lost[:, None], 0.9 * belief + 0.1 * self._anywhere(now), belief)
         look = went._look(rows, observation.frames, observation.attach)
         [inside] = np.nonzero(belief.any(0))
         window = slice(inside[0], inside[-1] + 1)
-        evidence = EVIDENCE * passed[:, None] * look.log_likelihood(window)
+        # the first looks at one that was pushed have nothing to do with those before
+        worth = np.where(pushed, 1.0, EVIDENCE * passed)
+        evidence = worth[:, None] * look.log_likelihood(window)
         belief[:, window] = _posterior(belief[:, window], evidence)
         place = local_mode(belief, localizer.instants)
         explained = self._explains(place, measured, look)
         place = np.clip(place + clock.lag * clock.speed, self.begin, self.end)
         # one that is held stands where it stood, and is nowhere that it has not been
         distance = np.abs(measured - went.stood[rows]).max(-1)
-        moved = distance > 2 * clock.tolerance * clock.floor
+        moved = pushed | (distance > 2 * clock.tolerance * clock.floor)
         place = np.where(moved, place, np.minimum(place, went.reached[rows]))
         # a slow one is between where it was when it last followed and the present time
         slow = (place > went.reached[rows] - JUMP) & (place < now + JUMP)
         elsewhere = explained & moved & ~slow
         error = went.error[rows]
-        elsewhere &= error > 2 * clock.tolerance
+        elsewhere &= pushed | (error > 2 * clock.tolerance)
         # one that was held, and is let go, returns to the reference: it goes nowhere else
         known = localized & (self.sure[rows] == 0)
-        elsewhere &= ~(known & (error < RETURNING * self.strayed[rows]))
+        elsewhere &= pushed | ~(known & (error < RETURNING * self.strayed[rows]))
         sure = np.where(elsewhere, self.sure[rows] + passed, 0.0)
         moves = elsewhere & (self.sure[rows] > 0) & (sure > PATIENCE)
         went = replace(

@@ -225,14 +225,15 @@ class Controller:
             if halted is not None:
                 passed = torch.where(halted, 0.0, torch.as_tensor(passed, dtype=torch.float64))
             holding = self.holding
+            away = None if measured is None else self._driven_away(measured, dt)
             observed = Observation(
                 self._unbent(measured), self._unbent(self._asked), None,
                 holding.frames, last.estimate,
-                holding.state if holding.carries else None,
+                holding.state if holding.carries else None, away,
             )  # fmt: skip
             self._progress = before.advance(passed, observed)
             if measured is not None:
-                if (away := self._driven_away(measured, dt)) is not None:
+                if away is not None:
                     self._stand(away, measured)
                     self._brought = self._brought | away
                 if bool((moved := self._progress.relocalized).any()):

@@ -83,7 +83,7 @@ class Trust:
     frame_jump: float = 0.06
     turn_jump: float = 0.6
     largest_gap: float = 0.3
-    largest_push: float = 0.1
+    largest_push: float = 0.06
     lag: float = 0.15
     lead: float = 0.015
     longest_step: float = 0.5
