@@ -278,7 +278,7 @@ def test_robots_are_held_for_ten_seconds(shaking):
     run = localizing(shaking, 24, dt=0.05)
     run.run(END + 15, between(since, since + 10))
     times = torch.stack(run.times)
-    # time only goes back, and once, to where a robot was stopped, or to the beginning of a pause
+    # time only goes back, and once, to where a robot was stopped, or a pause began
     again = torch.stack(run.relocalized)
     gone = times.diff(dim=0)
     assert again.sum(0).max() <= 1
