@@ -297,6 +297,39 @@ def test_robots_are_held_for_ten_seconds(shaking):
     assert away.max() < 0.6  # the shaking has 1.3 rad/s
 
 
+@pytest.mark.parametrize("seconds", [0.5, 1.0, 5.0])
+def test_what_a_stopped_robot_missed_is_done(shaking, seconds):
+    """In the midst of reaching, bringing and shaking: nothing is left out, nor done twice."""
+    since = torch.tensor([2.2, 2.6, 7.7, 8.3, 11.1, 12.0, 13.1, 14.0], dtype=torch.float64)
+    run = localizing(shaking, len(since), dt=0.02)
+    run.run(float(since.max()) + seconds + 1.0, between(since, since + seconds))
+    times = torch.stack(run.times)
+    released = ((since + seconds) / run.dt).long()
+    for k, tick in enumerate(released.tolist()):
+        onwards = times[tick : tick + 25, k]  # half a second
+        assert float(onwards.min()) == pytest.approx(float(since[k]), abs=0.06)
+        missed = posture(shaking, onwards.min()) - posture(shaking, since[k])
+        assert missed.abs().max() < 0.05
+
+
+def test_where_a_robot_was_pushed_to_is_looked_up(shaking):
+    """Pushed back by as little as a slow servo may lag, it is where it was; else it is late."""
+    start, place = 2.6, 2.2
+    target = posture(shaking, place)
+    assert 0.05 < (target - posture(shaking, start)).abs().max() < 0.13
+    found = []
+    for pushed in (torch.tensor(True), None):
+        run = localizing(shaking, dt=0.02)
+        run.run(start)
+        seen = Observation(target, run.reference, None, {}, run.estimate, None, pushed)
+        run.progress, run.joints = run.progress.advance(run.dt, seen), target
+        run.run(0.26, held(target))
+        found.append((float(run.progress.time), sum(map(int, run.relocalized))))
+    (time, moves), (late, waited) = found
+    assert moves == 1 and time == pytest.approx(place, abs=0.1)
+    assert waited == 0 and late > start
+
+
 @pytest.mark.parametrize("dt", [0.04, 0.01, 0.002])
 @pytest.mark.parametrize("shift", [-2.0, 2.0])
 def test_a_robot_that_is_pushed_goes_on_from_where_it_is(shaking, shift, dt):
