@@ -79,6 +79,19 @@ CLAIMS = {
             and abs(float(v["change"] - v["predicted"])) < 1e-9
         ),
     ),
+    "plot_11_what_matters.py": (
+        1,
+        lambda v: (
+            v["model"].frame_names_ == ("cup", "tray")
+            and v["selection"].support_.sum() == 3
+            # the cup while the hand rests at it, the tray at the end
+            and [
+                v["selection"].candidates_[int(v["selection"].relevance_[k].argmax())].frame
+                for k in (22, -1)
+            ]
+            == ["cup", "tray"]
+        ),
+    ),
     "plot_14_corrections.py": (
         1,
         lambda v: (

@@ -639,8 +639,12 @@ class LocalizingProgress(WaitingProgress):
         )
 
     def _anywhere(self, now: Array) -> Array:
-        """The belief about robots that are not where they should be."""
-        apart = np.abs(self.localizer.instants - now[..., None]) / ELSEWHERE
+        """The belief about robots that are not where they should be.
+
+        Ahead counts twice: of places that look alike, those that leave something out are worse.
+        """
+        apart = self.localizer.instants - now[..., None]
+        apart = np.maximum(2 * apart, -apart) / ELSEWHERE
         return _normalized(np.exp(-apart) + 0.01)
 
     def _relocated(self, robots: Flags, time: Array) -> Self:
@@ -691,8 +695,8 @@ class LocalizingProgress(WaitingProgress):
         look = went._look(rows, observation.frames, observation.attach)
         [inside] = np.nonzero(belief.any(0))
         window = slice(inside[0], inside[-1] + 1)
-        # the first looks at one that was pushed have nothing to do with those before
-        worth = np.where(pushed, 1.0, EVIDENCE * passed)
+        # while time stands for one that was pushed, what is seen is worth one observation
+        worth = passed * np.where(pushed, 1 / UNDECIDED, EVIDENCE)
         evidence = worth[:, None] * look.log_likelihood(window)
         belief[:, window] = _posterior(belief[:, window], evidence)
         place = local_mode(belief, localizer.instants)

@@ -312,22 +312,22 @@ def test_what_a_stopped_robot_missed_is_done(shaking, seconds):
         assert missed.abs().max() < 0.05
 
 
-def test_where_a_robot_was_pushed_to_is_looked_up(shaking):
-    """Pushed back by as little as a slow servo may lag, it is where it was; else it is late."""
-    start, place = 2.6, 2.2
+def test_time_stands_until_it_is_known_where_a_robot_was_pushed_to(shaking):
+    """No further than a slow servo lags: of one that only is late, time goes on."""
+    start, place = 2.6, 2.0
     target = posture(shaking, place)
-    assert 0.05 < (target - posture(shaking, start)).abs().max() < 0.13
-    found = []
+    assert 0.05 < (target - posture(shaking, start)).abs().max() < 0.2
     for pushed in (torch.tensor(True), None):
         run = localizing(shaking, dt=0.02)
         run.run(start)
+        began = float(run.progress.time)
         seen = Observation(target, run.reference, None, {}, run.estimate, None, pushed)
         run.progress, run.joints = run.progress.advance(run.dt, seen), target
+        assert (float(run.progress.time) == began) == (pushed is not None)
         run.run(0.26, held(target))
-        found.append((float(run.progress.time), sum(map(int, run.relocalized))))
-    (time, moves), (late, waited) = found
-    assert moves == 1 and time == pytest.approx(place, abs=0.1)
-    assert waited == 0 and late > start
+        if pushed is not None:
+            assert sum(map(int, run.relocalized)) == 1
+            assert float(run.progress.time) == pytest.approx(place, abs=0.1)
 
 
 @pytest.mark.parametrize("dt", [0.04, 0.01, 0.002])
