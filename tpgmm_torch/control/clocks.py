@@ -598,11 +598,10 @@ class LocalizingProgress(WaitingProgress):
             )
         # one that does not move at all although it should is stopped, and is led from there;
         # let go, it does again what it has not done
-        stopped = (
-            np.abs(reference - self.told).max(-1) > self.clock.tolerance * self.clock.floor
-        )
-        stopped &= now > self.rested + PAUSE
-        back = left & self.stalled & (now > self.rested + PAUSE) & ~pushed
+        late = now > self.rested + PAUSE
+        told = np.abs(reference - self.told).max(-1)
+        stopped = late & (told > self.clock.tolerance * self.clock.floor)
+        back = late & left & self.stalled & ~pushed
         back &= np.abs(self.rested - self.returned) > JUMP
         went = replace(
             self,
