@@ -184,6 +184,24 @@ class Demonstration(_PlainFrames):
             raise UnknownNameError("event", name, "the demonstration", known)
         return known[name]
 
+    def at_steps(self, chosen: slice | Tensor) -> Demonstration:
+        """The demonstration at some of its time steps, with the events between them.
+
+        Parameters
+        ----------
+        chosen : slice or Tensor
+            Ascending numbers of time steps, or a mask (T,).
+        """
+        time = self.time[chosen]
+        begin, end = float(time[0]), float(time[-1])
+        return replace(
+            self,
+            time=time,
+            joints=self.joints[chosen],
+            frames={n: f[chosen] if f.batch_shape else f for n, f in self.frames.items()},
+            events={name: at for name, at in self.events.items() if begin <= at <= end},
+        )
+
     def reordered(self, joint_names: Sequence[str]) -> Demonstration:
         """The same demonstration with its joint columns in the order of ``joint_names``.
 

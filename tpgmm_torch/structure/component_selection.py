@@ -222,13 +222,10 @@ class ComponentSelection(BaseEstimator):  # type: ignore[misc]
         steps = torch.linspace(0, len(demonstration) - 1, min(len(demonstration), INSTANTS))
         index = steps.round().long()
         like = kinematics.lower
-        motion = demonstration.reordered(kinematics.joint_names)
-        time = motion.time.to(like)[index]
-        state = kinematics.state(motion.joints.to(like)[index])
-        frames = {
-            name: (frame[index] if frame.batch_shape else frame).to(like)
-            for name, frame in motion.frames.items()
-        }
+        motion = demonstration.at_steps(index).reordered(kinematics.joint_names)
+        time = motion.time.to(like)
+        state = kinematics.state(motion.joints.to(like))
+        frames = {name: frame.to(like) for name, frame in motion.frames.items()}
         if holds:
             state, frames = held_objects(state, time, frames, holds)
         with torch.no_grad():

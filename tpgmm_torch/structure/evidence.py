@@ -243,10 +243,4 @@ def log_predictive_density(step: Tensor, covariance: Tensor, degrees: float) -> 
 def _at_phase(demonstration: Demonstration, phase: Tensor) -> Demonstration:
     """The demonstration at some of its time steps, at equal ``phase`` from 0 to 1."""
     steps = ((len(demonstration) - 1) * phase).round().long()
-    return replace(
-        demonstration,
-        time=demonstration.time[steps],
-        joints=demonstration.joints[steps],
-        frames={n: f[steps] if f.batch_shape else f for n, f in demonstration.frames.items()},
-        events={},
-    )
+    return demonstration.at_steps(steps)

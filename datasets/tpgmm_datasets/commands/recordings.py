@@ -124,20 +124,8 @@ class Recordings(plugins.Recordings):
 
 def _between(demonstration: Demonstration, begin: float, end: float) -> Demonstration | None:
     """A segment of a demonstration; None where that has no motion."""
-    from tpgmm_torch.data.demonstrations import Demonstration
-
-    time = demonstration.time
-    inside = (time >= begin) & (time <= end)
-    if int(inside.sum()) < 2:
-        return None
-    frames = demonstration.frames.items()
-    return Demonstration(
-        time[inside],
-        demonstration.joints[inside],
-        {name: frame[inside] if frame.batch_shape else frame for name, frame in frames},
-        demonstration.joint_names,
-        {name: at for name, at in demonstration.events.items() if begin <= at <= end},
-    )
+    inside = (demonstration.time >= begin) & (demonstration.time <= end)
+    return demonstration.at_steps(inside) if int(inside.sum()) > 1 else None
 
 
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:

@@ -110,9 +110,7 @@ def trim(demonstration: Demonstration, speed: float, **where: Any) -> Demonstrat
     kept = slice(start, stop)
     first, last = float(time[start]), float(time[stop - 1])
     return replace(
-        demonstration,
+        demonstration.at_steps(kept),
         time=time[kept] - first,
-        joints=demonstration.joints[kept],
-        frames={n: f[kept] if f.batch_shape else f for n, f in demonstration.frames.items()},
         events={n: min(max(at, first), last) - first for n, at in demonstration.events.items()},
     )
