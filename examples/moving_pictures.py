@@ -1,8 +1,9 @@
-"""Moving pictures of a skill that runs while things go wrong, as WebP files.
+"""Moving pictures of a skill in new situations, and while things go wrong, as WebP files.
 
-The simulated robot shakes a bottle in episodes of the environment ``bottle_shaking`` in which
+The simulated robot shakes bottles that stand in three poses, side by side, beginning in three
+postures. Then it shakes one in episodes of the environment ``bottle_shaking`` in which
 it is stopped, is pushed back, or in which somebody moves the bottle; and it carries one that
-slides in its hands to a tray, in ``carry_and_put``. Beside it, over time: the controller's
+slides in its hands to a tray, in ``carry_and_put``; beside it, over time, the controller's
 progress in the skill, and how stiff the model wants the arms to be.
 
     python examples/moving_pictures.py docs/images
@@ -21,7 +22,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
 from lerobot_policy_tpgmm.environments.bottle.handling import BottleEnv
@@ -44,6 +45,8 @@ TASKS: dict[str, tuple[type[BottleEnv], type[BottleBenchmark] | type[CarryBenchm
     "carry": (CarryAndPutEnv, CarryBenchmark),
 }
 SEED = 10003
+#: Poses of the bottle, none of them demonstrated: near and left, far and low, right and high.
+SEEDS = 10020, 10043, 10046
 #: Pictures per second of the episode, and how fast they are shown.
 PICTURES, SPEED = 5, 2.0
 #: Of the picture of the robot, and of the curves beside it [pixels].
@@ -69,7 +72,11 @@ def told(
 
 
 def run(
-    model: TaskParameterizedGMM, task: str, condition: str, length: int | None = None
+    model: TaskParameterizedGMM,
+    task: str,
+    condition: str = "nominal",
+    length: int | None = None,
+    seed: int = SEED,
 ) -> Iterator[tuple[float, Command, NDArray[np.uint8]]]:
     """Time, command and picture, ``PICTURES`` times a second of an episode of some ticks."""
     made, bench = TASKS[task]
@@ -80,7 +87,7 @@ def run(
         render_width=WIDTH,
         render_height=HEIGHT,
     )
-    observation, _ = env.reset(seed=SEED)
+    observation, _ = env.reset(seed=seed)
     impedance = Impedance(model.kinematics_)
     controller = model.controller(*told(observation, bench.objects), impedance=impedance)
     over, step = False, 0
@@ -135,10 +142,29 @@ def write(
     """One episode as a file."""
     moments = list(run(model, task, condition, length))
     curves = Curves(title, moments[-1][0], float(model.time_[-1]))
-    pictures = [
-        Image.fromarray(np.hstack((picture, curves(time, command))))
-        for time, command, picture in moments
-    ]
+    save(path, [np.hstack((now, curves(time, command))) for time, command, now in moments])
+
+
+def write_poses(path: Path, model: TaskParameterizedGMM) -> None:
+    """Episodes that differ in the bottle's pose side by side as a file."""
+    episodes = []
+    for seed in SEEDS:
+        observation, _ = BottleShakingEnv().reset(seed=seed)
+        place = told(observation)[1]["bottle"]
+        w, _, _, z = place.orientation.tolist()  # turned about the vertical alone
+        x, y, height = (100 * place.position).tolist()
+        angle = np.degrees(2 * np.arctan2(z, w))
+        title = f"x {x:.0f} cm, y {y:.0f} cm, z {height:.0f} cm\nturned {angle:.0f} deg"
+        pictures = [Image.fromarray(picture) for *_, picture in run(model, "shake", seed=seed)]
+        for picture in pictures:
+            ImageDraw.Draw(picture).text((6, 4), title, fill="black")
+        episodes.append([np.asarray(picture) for picture in pictures])
+    save(path, [np.hstack(side_by_side) for side_by_side in zip(*episodes, strict=True)])
+
+
+def save(path: Path, moments: Sequence[NDArray[np.uint8]]) -> None:
+    """Pictures (height, width, 3) as a file that starts anew after the last."""
+    pictures = [Image.fromarray(moment) for moment in moments]
     shown = round(1000 / (PICTURES * SPEED))
     durations = [shown] * (len(pictures) - 1) + [1500]  # the last one stands
     pictures[0].save(
@@ -151,10 +177,13 @@ def write(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path, help="where the files go")
-    parser.add_argument("--only", choices=EPISODES, help="one of them")
+    parser.add_argument("--only", choices=("poses", *EPISODES), help="one of them")
     options = parser.parse_args()
     torch.set_num_threads(1)
     skills = {}
+    if options.only in (None, "poses"):
+        skills["shake"] = learned("shake")
+        write_poses(options.folder / "poses.webp", skills["shake"])
     for name, (task, *shown) in EPISODES.items():
         if options.only in (None, name):
             skills[task] = skills.get(task) or learned(task)

@@ -144,3 +144,16 @@ def test_code_and_commands_of_a_page_run_from_top_to_bottom(page, demo, tmp_path
                 run(command)
         else:
             assert language in ("text", "bibtex"), f"{page} has a block of {language}"
+
+
+def test_the_readme_is_short_and_begins_with_the_line_that_installs():
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(readme.split()) <= 1000
+    first, *_ = blocks(ROOT / "README.md")
+    assert first == ("bash", "pip install 'tpgmm-torch[cli]'\n")
+
+
+def test_pictures_that_are_kept_as_files_stay_small():
+    sizes = [path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()]
+    assert max(sizes) <= 300e3
+    assert sum(sizes) < 1e6
