@@ -37,6 +37,7 @@ extensions = [
     "picturebook",
     "report",
     "sitelinks",
+    "thumbnails",
     "ties",
     "typelinks",
 ]
@@ -78,11 +79,24 @@ sphinx_gallery_conf = {
     "backreferences_dir": "gallery/backreferences",
     "inspect_global_variables": False,
 }
+# of a row of plots, the one that says most, as shares: left, upper, right, lower
+gallery_thumbnails = {
+    "plot_01_planar_arm": (0.66, 0.1, 1, 1),
+    "plot_02_frames_without_a_robot": (0, 0, 0.345, 0.84),
+    "plot_03_orientation_sign": (0.66, 0, 1, 1),
+    "plot_06_choosing": (0, 0, 0.335, 1),
+    "plot_07_lerobot_dataset": (0, 0, 1, 0.4),
+    "plot_08_alignment": (0, 0, 0.5, 1),
+    "plot_09_covariance_along_the_path": (0, 0, 0.41, 1),
+    "plot_10_own_operator": (0, 0, 0.35, 0.9),
+    "plot_14_corrections": (0, 0, 0.525, 1),
+}
 
 # Site
 html_theme = "pydata_sphinx_theme"
 html_title = f"tpgmm-torch {release}"
 html_static_path = ["_static"]
+html_favicon = "_static/favicon.svg"
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
