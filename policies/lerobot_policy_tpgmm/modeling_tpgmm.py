@@ -35,12 +35,19 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import Controller, TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.hub import describe, model_card, upload
 from tpgmm_torch.operators.base import frame_names
 
 __all__ = ["TPGMMPolicy"]
 
 log = logging.getLogger(__name__)
 
+#: What :meth:`TPGMMPolicy.push_to_hub` is told for the card, and how that says to run it.
+FOR_THE_CARD = ("measured", "notes", "license")
+USE = """```bash
+pip install 'lerobot_policy_tpgmm[evaluation]'
+lerobot-rollout --policy.path={repo_id} --strategy.type=base
+```"""
 #: When an observation was made [s], of environments and robots that tell.
 TIMESTAMP = "observation.timestamp"
 
@@ -455,6 +462,38 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             self._learner.check_saveable()
         self.to_estimator()  # refuses what could not be loaded
         write_files(self.config, state_dict or self.state_dict(), Path(save_directory))
+
+    def push_to_hub(self, repo_id: str, **options: Any) -> str:
+        """Upload the policy to the Hugging Face hub, with a card made from it.
+
+        Parameters
+        ----------
+        repo_id : str
+            ``"owner/name"``; made if it does not exist.
+        **options
+            ``measured``, ``notes``, ``license``, ``private`` and ``token``, as of
+            :meth:`tpgmm_torch.TaskParameterizedGMM.push_to_hub`.
+
+        Returns
+        -------
+        str
+            Address of the commit.
+
+        Raises
+        ------
+        DataError
+            If that is no repository's id, or the policy cannot be saved.
+        """
+        told: dict[str, Any] = {"license": self.config.license}
+        told |= {name: options.pop(name) for name in FOR_THE_CARD if name in options}
+        card = model_card(self.to_estimator(), repo_id, use=USE, library="lerobot", **told)
+        return upload(repo_id, self.save_pretrained, card, **options)
+
+    def generate_model_card(self, *given: Any, **options: Any) -> Any:
+        """LeRobot's card, which ``lerobot-train`` uploads, and what the mixture says."""
+        card = super().generate_model_card(*given, **options)
+        card.content = f"{card.content.rstrip()}\n\n{describe(self.to_estimator())}\n"
+        return card
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:

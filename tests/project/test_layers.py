@@ -31,7 +31,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("training", "persistence", "metrics", "motion", "sensing", "novelty"),
         ("regression", "plausibility"),
         ("events", "structure"),
-        ("control",),
+        ("control", "hub"),
         ("estimator",),
         ("corrections", "model_selection", "plotting", "viewing"),
         ("cli",),
@@ -61,6 +61,7 @@ MOST_FILES_IN_A_ROOM = 11
 
 # Loaded inside the functions that need them, so that `import tpgmm_torch` needs none.
 LATE = {
+    "huggingface_hub",
     "lerobot",
     "matplotlib",
     "mujoco",

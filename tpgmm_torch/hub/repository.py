@@ -1,0 +1,117 @@
+"""Folders to and from repositories of the Hugging Face hub."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
+
+__all__ = ["download", "upload"]
+
+#: As the hub has them: an owner, and a name.
+REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
+
+
+def upload(
+    repo_id: str,
+    write: Callable[[Path], object],
+    card: str,
+    *,
+    private: bool | None = None,
+    token: str | None = None,
+    message: str = "Upload model",
+) -> str:
+    """Write a folder and a card, and upload both in one commit.
+
+    Parameters
+    ----------
+    repo_id : str
+        ``"owner/name"``; made if it does not exist.
+    write : callable
+        Called with a folder that does not exist yet: makes it.
+    card : str
+        Of the repository, its README.md.
+    private : bool, optional
+        Whether a repository that is made is private; by default as its owner has it.
+    token : str, optional
+        By default the one of ``hf auth login``.
+    message : str
+        Of the commit.
+
+    Returns
+    -------
+    str
+        Where it is.
+
+    Raises
+    ------
+    DataError, DependencyError
+        If that is no repository's id, or huggingface_hub is not installed.
+    """
+    if not REPOSITORY.fullmatch(repo_id):
+        raise DataError(f"a repository is written 'owner/name', got {repo_id!r}")
+    api = _hub().HfApi(token=token)
+    with TemporaryDirectory() as place:
+        folder = Path(place) / "model"
+        write(folder)
+        (folder / "README.md").write_text(card, encoding="utf-8")
+        api.create_repo(repo_id, private=private, exist_ok=True)
+        commit = api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message)
+    return str(commit.commit_url)
+
+
+def download(
+    repo_id_or_folder: str | Path,
+    files: Sequence[str],
+    *,
+    revision: str | None = None,
+    token: str | None = None,
+) -> Path:
+    """A folder with some files of a repository; one that is there already is only returned.
+
+    Parameters
+    ----------
+    repo_id_or_folder : str or Path
+        ``"owner/name"``, or a folder. One that is missing and cannot be an id is not looked up.
+    files : sequence of str
+        Their names; no other is fetched.
+    revision : str, optional
+        Branch, tag or commit.
+    token : str, optional
+        By default the one of ``hf auth login``.
+
+    Raises
+    ------
+    ModelFileError, DependencyError
+        If there is no such folder and no such repository, or huggingface_hub is not installed.
+    """
+    if Path(repo_id_or_folder).is_dir():
+        return Path(repo_id_or_folder)
+    if isinstance(repo_id_or_folder, Path) or not REPOSITORY.fullmatch(repo_id_or_folder):
+        raise ModelFileError(
+            f"there is no folder {str(repo_id_or_folder)!r}, and a repository is written "
+            "'owner/name'"
+        )
+    fetch = _hub().snapshot_download
+    options: dict[str, Any] = {"revision": revision, "token": token}
+    try:
+        return Path(fetch(repo_id_or_folder, allow_patterns=list(files), **options))
+    except (OSError, ValueError) as error:  # what is not there, not allowed, or not reached
+        raise ModelFileError(
+            f"there is no folder {repo_id_or_folder!r}, and the repository of that name cannot "
+            f"be fetched: {error}"
+        ) from error
+
+
+def _hub() -> Any:
+    try:
+        import huggingface_hub
+    except ImportError as error:
+        raise DependencyError(
+            "the hub needs huggingface_hub: pip install 'tpgmm-torch[hub]'"
+        ) from error
+    return huggingface_hub
