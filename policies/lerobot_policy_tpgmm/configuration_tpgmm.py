@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
-from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import (
     Hold,
     Kinematics,
@@ -39,6 +40,12 @@ HYPERPARAMETERS = (
     "prior_std", "negligible", "blend", "keep_limits", "robust", "plausibility", "random_state",
     "dtype",
 )  # fmt: skip
+
+#: Robots that come with the package: what describes each, and its hands.
+ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
+    "upper_body": (upper_body_urdf, HANDS),
+    "so101": (so101_urdf, ("gripper_frame_link",)),
+}
 
 CHOICES = {
     "feedback": ("reference", "observation"),
@@ -117,12 +124,12 @@ class TPGMMConfig(StatePolicyConfig):
         For how long before and after a via-point the skill is another [s].
     robot : dict or str, optional
         The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
-        the URDF in it; to begin with, the path of a URDF or ``"upper_body"``. None for
-        joints alone.
+        the URDF in it; to begin with, the path of a URDF or an MJCF, ``"upper_body"`` or
+        ``"so101"``. None for joints alone.
     links, joints, coordinates : list of str, optional
         For a robot given by its path, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links of
-        ``"upper_body"`` are its hands if none are named. Joints may be patterns, and one text
-        with commas: ``"left_*,waist_yaw"``.
+        ``"upper_body"`` and ``"so101"`` are their hands if none are named. Joints may be
+        patterns, and one text with commas: ``"left_*,waist_yaw"``.
     n_steps : int, default=0
         T, the length of the time grid that was learned; 0 before a fit.
     shown : dict, optional
@@ -333,12 +340,13 @@ class TPGMMConfig(StatePolicyConfig):
         if self.robot is None or isinstance(self.robot, dict):
             return None if self.robot is None else decode(self.robot)
         urdf, links = self.robot, self.links
-        if urdf == "upper_body":
-            urdf, links = upper_body_urdf(), links or list(HANDS)
+        if urdf in ROBOTS:
+            described, hands = ROBOTS[urdf]
+            urdf, links = described(), links or list(hands)
         joints = self.joints
         if isinstance(joints, str):
             joints = [name.strip() for name in joints.split(",")]
-        return Robot.from_urdf(urdf, links, joints=joints, coordinates=self.coordinates)
+        return Robot.from_file(urdf, links, joints=joints, coordinates=self.coordinates)
 
     def decoded_operators(self) -> list[Operator] | None:
         """The operators that ``operators`` describes; None if it says nothing.

@@ -99,9 +99,9 @@ AlignmentMethod = Annotated[
 RobotFile = Annotated[
     str | None,
     of_robot(
-        "The robot's URDF file; 'upper_body' is the one that comes with the package. "
+        "The robot's URDF or MJCF file; 'upper_body' and 'so101' come with the package. "
         "Without a robot, joints alone.",
-        metavar="URDF",
+        metavar="FILE",
     ),
 ]
 Links = Annotated[list[str] | None, of_robot("A link of interest (a hand), repeatable.")]
@@ -161,7 +161,7 @@ def read_robot(
     Parameters
     ----------
     robot : str or None
-        Path of a URDF, or the name of one that is registered in ``tpgmm.robots``.
+        Path of a URDF or an MJCF, or the name of one that is registered in ``tpgmm.robots``.
     links : sequence of str, optional
         Links of interest.
     joints : sequence of str, optional
@@ -186,13 +186,13 @@ def read_robot(
         return Poses(poses)
     if robot is None:
         if links or joints or coordinates:
-            raise DataError("--link, --robot-joint and --coordinate need --robot URDF")
+            raise DataError("--link, --robot-joint and --coordinate need --robot FILE")
         return None
     from tpgmm_torch.robots.robot import Robot
 
     if robot in (named := plugins.registered(plugins.ROBOTS)):
         robot = str(named[robot].load()())
-    return Robot.from_urdf(
+    return Robot.from_file(
         robot, links or (), joints=joints or None, coordinates=coordinates or ()
     )
 

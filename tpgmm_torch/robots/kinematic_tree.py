@@ -16,7 +16,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfJoint, UrdfModel
 
-__all__ = ["Attachment", "MovingFrame", "MovingTree", "reduce"]
+__all__ = ["Attachment", "MovingFrame", "MovingTree", "motion", "reduce"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,14 +143,14 @@ def _cross(
     if joint.type in MULTIPLE_TYPES:
         raise DataError(
             f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
-            "joints of several degrees of freedom are not supported; give a base beyond it, or "
-            "describe it by prismatic and revolute joints"
+            "joints of several degrees of freedom are not supported; give a base beyond it, "
+            f"base={joint.child!r} or below, or describe it by prismatic and revolute joints"
         )
     downwards = joint.parent == near
     before = place.pose @ joint.origin if downwards else place.pose
-    after = np.eye(4) if downwards else _inverse(joint.origin)
     if not joint.movable:
-        return Attachment(place.frame, before @ after)
+        return Attachment(place.frame, before if downwards else before @ _inverse(joint.origin))
+    after = np.eye(4) if downwards else _inverse(joint.origin)
     leader = model.leader(joint.name)
     axis = joint.axis if downwards else -joint.axis
     if leader.joint in joints:
@@ -162,11 +162,21 @@ def _cross(
         )
         return Attachment(len(frames) - 1, after)
     value = leader.multiplier * locked[leader.joint] + leader.offset
-    return Attachment(place.frame, before @ _motion(joint.type, axis, value) @ after)
+    return Attachment(place.frame, before @ motion(joint.type, axis, value) @ after)
 
 
-def _motion(kind: str, axis: Array, value: float) -> Array:
-    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation)."""
+def motion(kind: str, axis: Array, value: float) -> Array:
+    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation).
+
+    Parameters
+    ----------
+    kind : str
+        A type of URDF joints; "prismatic" slides, others turn.
+    axis : ndarray of shape (3,)
+        A unit vector.
+    value : float
+        Metres or radians.
+    """
     matrix = np.eye(4)
     if kind == "prismatic":
         matrix[:3, 3] = value * axis

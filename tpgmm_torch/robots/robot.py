@@ -1,4 +1,4 @@
-"""Robots described by a URDF."""
+"""Robots described by a URDF, or by what can be written as one."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
+from tpgmm_torch.robots.mjcf import mjcf_to_urdf, root_element
 from tpgmm_torch.robots.urdf import UrdfModel, read_urdf
+from tpgmm_torch.robots.urdf_writer import joined
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
 
@@ -30,7 +33,7 @@ MOST_JOINTS = 1000
 
 
 class Robot(Kinematics):
-    """A robot described by a URDF; made by :meth:`from_urdf`.
+    """A robot described by a URDF; made by :meth:`from_urdf`, or from what becomes one.
 
     Arms which share a waist share its columns in the stacked Jacobian. Two robots are equal if
     their descriptions and settings are; the device does not count.
@@ -42,7 +45,7 @@ class Robot(Kinematics):
         urdf: str | bytes | os.PathLike[str],
         links: Sequence[str],
         *,
-        joints: Sequence[str] | None = None,
+        joints: str | Sequence[str] | None = None,
         locked: Mapping[str, float] | None = None,
         coordinates: Sequence[str] = (),
         base: str | None = None,
@@ -58,13 +61,14 @@ class Robot(Kinematics):
             A file, or the text itself (bytes, or a string that begins with ``<``).
         links : sequence of str
             Names of the links (or ``tools``) whose poses are wanted.
-        joints : sequence of str, optional
+        joints : str or sequence of str, optional
             Names and order of the joint vector. A pattern, ``"left_*"``, stands for all that
             fit it (``fnmatch``) and are not named beside it, in document order. The default
             is every movable joint that is neither locked nor mimics another, in document
             order. The others stand still.
         locked : mapping of str to float, optional
-            Where joints stand that are not in the joint vector [rad or m], 0 by default.
+            Where joints stand that are not in the joint vector [rad or m], 0 by default. A
+            pattern stands for those that are neither named beside it nor in ``joints``.
         coordinates : sequence of str, default=()
             Members of the joint vector without kinematics, like a gripper's opening. They
             follow the joints unless ``joints`` names them.
@@ -96,24 +100,179 @@ class Robot(Kinematics):
         """
         model = read_urdf(urdf)
         extra = _names("coordinates", coordinates)
-        fixed = dict(locked or {})
+        chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
+        columns = _joints_named(model, chosen, extra)
+        fixed = _locked(model, locked or {}, columns)
         if joints is None:
-            joints = [name for name in model.actuated if name not in fixed]
-        columns = _joints_named(model, _names("joints", joints), extra)
+            columns = tuple(name for name in model.actuated if name not in fixed)
         columns += tuple(name for name in extra if name not in columns)
         _check_joints(model, columns, extra, fixed)
-        chosen = set(columns)
+        moving = set(columns)
         config = {
             "urdf": model.text,
             "links": list(_names("links", links)),
             "joints": list(columns),
-            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in chosen},
+            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in moving},
             "coordinates": list(extra),
             "base": model.root if base is None else base,
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
             "dtype": dtype_name(dtype),
         }
         return cls(model, config, device)
+
+    @classmethod
+    def from_mjcf(
+        cls, mjcf: str | os.PathLike[str], links: Sequence[str], **settings: Any
+    ) -> Self:
+        """Build the kinematics of some bodies and sites of an MJCF, MuJoCo's own format.
+
+        MuJoCo compiles it, with its includes, default classes and meshes; what comes out is
+        kept as a URDF (:func:`~tpgmm_torch.robots.mjcf.mjcf_to_urdf`), so that neither the
+        robot nor a model that is saved with it needs MuJoCo again.
+
+        Parameters
+        ----------
+        mjcf : path or str
+            A file, or the text itself (a string that begins with ``<``).
+        links : sequence of str
+            Names of the bodies, sites (or ``tools``) whose poses are wanted.
+        **settings
+            As for :meth:`from_urdf`. Everything is seen from ``world`` unless ``base`` is
+            given, which a robot that floats needs: the body that carries its free joint, or
+            one below.
+
+        Raises
+        ------
+        DependencyError
+            Without MuJoCo, of the extra ``simulation``.
+        DataError, UnknownNameError
+            If MuJoCo cannot compile it, or as for :meth:`from_urdf`.
+
+        Examples
+        --------
+        >>> mjcf = '''<mujoco><worldbody><body name="arm" pos="0 0 1"><geom size="0.1"/>
+        ... <joint name="lift" type="slide" axis="0 0 1" range="0 2" limited="true"/>
+        ... <site name="tip" pos="0.5 0 0"/></body></worldbody></mujoco>'''
+        >>> robot = Robot.from_mjcf(mjcf, links=["tip"])
+        >>> robot.state([0.3]).position("tip").tolist(), robot.upper.tolist()
+        ([0.5, 0.0, 1.3], [2.0])
+        """
+        return cls.from_urdf(mjcf_to_urdf(mjcf), links, **settings)
+
+    @classmethod
+    def from_chain(cls, chain: Any, links: Sequence[str], **settings: Any) -> Self:
+        """Build the kinematics of some frames of a ``pytorch_kinematics.Chain``.
+
+        That library reads SDF, too. It reads in single precision: its poses are 1e-8 to 1e-7 m
+        and rad away from those of the file, here as there, and what mimics another joint
+        moves freely. Of a URDF and an MJCF :meth:`from_urdf` and :meth:`from_mjcf` keep every
+        digit. A chain that was built in float64 keeps its digits here.
+
+        Parameters
+        ----------
+        chain : pytorch_kinematics.Chain
+            Or what is derived from it; it is not kept.
+        links : sequence of str
+            Names of the frames (or ``tools``) whose poses are wanted.
+        **settings
+            As for :meth:`from_urdf`. Everything is seen from where the chain begins,
+            ``world``, unless ``base`` is given.
+
+        Raises
+        ------
+        DataError, UnknownNameError
+            If it is no chain, or as for :meth:`from_urdf`.
+        """
+        return cls.from_urdf(chain_to_urdf(chain), links, **settings)
+
+    @classmethod
+    def from_file(
+        cls, description: str | os.PathLike[str], links: Sequence[str], **settings: Any
+    ) -> Self:
+        """The robot of a URDF or an MJCF, whichever the outermost element says it is.
+
+        Parameters
+        ----------
+        description : path or str
+            A file, or the text itself (a string that begins with ``<``).
+        links : sequence of str
+            Names of the links (or ``tools``) whose poses are wanted.
+        **settings
+            As for :meth:`from_urdf`.
+        """
+        is_mjcf = root_element(description) == "mujoco"
+        return (cls.from_mjcf if is_mjcf else cls.from_urdf)(description, links, **settings)
+
+    @classmethod
+    def combine(
+        cls,
+        poses: Mapping[str, Frame] | None = None,
+        *,
+        fixed: Mapping[str, Frame] | None = None,
+        base: str = "world",
+        **robots: Robot,
+    ) -> Self:
+        """Several robots side by side as one: two arms on a table are one bimanual robot.
+
+        Parameters
+        ----------
+        poses : mapping of str to Frame, optional
+            Where the base of each robot is in the common frame, ``world``; there by default.
+        fixed : mapping of str to Frame, optional
+            Links that stand still in the common frame, like a table between the robots.
+        base : str, default="world"
+            The link in whose frame everything is expressed: ``world``, one of ``fixed``, or
+            any other.
+        **robots : Robot
+            By name: ``left=arm`` puts ``left_`` before the names of the arm's joints, links,
+            coordinates and tools. Joint vectors and links follow one another. The dtype and
+            the device are those of the first.
+
+        Raises
+        ------
+        DataError
+            If there is no robot, one was not made by this class, its base is moved by its own
+            joints, or names collide.
+        UnknownNameError
+            If ``poses`` names no robot, or ``base`` no link.
+
+        Examples
+        --------
+        >>> urdf = '''<robot name="lift"><link name="base"/><link name="hand"/>
+        ... <joint name="lift" type="prismatic"><parent link="base"/><child link="hand"/>
+        ... <axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
+        ... </robot>'''
+        >>> arm = Robot.from_urdf(urdf, links=["hand"])
+        >>> both = Robot.combine(left=arm, right=arm, poses={"left": Frame([0.0, 0.5, 0.0])})
+        >>> both.joint_names, both.links
+        (('left_lift', 'right_lift'), ('left_hand', 'right_hand'))
+        >>> both.state([0.1, 0.2]).positions.tolist()
+        [[0.0, 0.5, 0.1], [0.0, 0.0, 0.2]]
+        """
+        if not robots or not all(isinstance(robot, Robot) for robot in robots.values()):
+            raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
+        for name in poses or ():
+            if name not in robots:
+                raise UnknownNameError("robot", name, "the robots to combine", robots)
+        parts: dict[str, tuple[UrdfModel, Array]] = {}
+        settings: dict[str, Any] = {"locked": {}, "tools": {}}
+        settings |= {"links": [], "joints": [], "coordinates": []}
+        for name, robot in robots.items():
+            config = robot.config()
+            model = read_urdf(config["urdf"])
+            place = np.eye(4) if poses is None or name not in poses else _matrix(poses[name])
+            parts[name] = model, place @ _root_in_base(name, model, config)
+            for key in ("links", "joints", "coordinates"):
+                settings[key] += [f"{name}_{member}" for member in config[key]]
+            settings["locked"] |= {f"{name}_{n}": v for n, v in config["locked"].items()}
+            settings["tools"] |= {
+                f"{name}_{tool}": (f"{name}_{parent}", *pose)
+                for tool, (parent, *pose) in config["tools"].items()
+            }
+        still = {link: _matrix(pose) for link, pose in dict(fixed or {}).items()}
+        first = next(iter(robots.values())).lower
+        options: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
+        return cls.from_urdf(joined(parts, "world", still), base=base, **settings, **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -240,6 +399,18 @@ def _joints_named(
     return tuple(listed)
 
 
+def _locked(
+    model: UrdfModel, locked: Mapping[str, float], columns: Sequence[str]
+) -> dict[str, float]:
+    """Where joints are locked, with what fits the patterns that is neither named nor moves."""
+    values = {name: value for name, value in locked.items() if name in model.joint}
+    for name in locked:
+        if name not in model.joint:
+            fits = _joints_named(model, [name], ())
+            values = {n: locked[name] for n in fits if n not in columns} | values
+    return values
+
+
 def _check_joints(
     model: UrdfModel,
     columns: Sequence[str],
@@ -298,15 +469,34 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
             raise DataError(f"tool {name!r} has the name of a link of the URDF")
         if parent not in model.links:
             raise UnknownNameError("link", parent, f"the URDF (tool {name!r})", model.links)
-        frame = Frame(position, orientation)
-        pose = np.eye(4)
-        pose[:3, :3] = quaternions.to_matrix(frame.orientation).numpy()
-        pose[:3, 3] = frame.position.numpy()
-        places[name] = parent, pose
+        places[name] = parent, _matrix(Frame(position, orientation))
     for link in config["links"]:
         if link not in places:
             raise UnknownNameError("link", link, "the URDF and the tools", places)
     return config["base"], [places[link] for link in config["links"]]
+
+
+def _matrix(pose: Frame) -> Array:
+    """A constant pose as a homogeneous matrix."""
+    if pose.batch_shape != ():
+        raise ShapeError(f"expected one constant pose, got {tuple(pose.batch_shape)} of them")
+    matrix = np.eye(4)
+    matrix[:3, :3] = quaternions.to_matrix(pose.orientation).cpu().numpy()
+    matrix[:3, 3] = pose.position.cpu().numpy()
+    return matrix
+
+
+def _root_in_base(name: str, model: UrdfModel, config: Mapping[str, Any]) -> Array:
+    """Where the root of a description is in the frame of its base, which it must hold."""
+    columns = {joint: i for i, joint in enumerate(config["joints"]) if joint in model.joint}
+    root = [(model.root, np.eye(4))]
+    [place] = reduce(model, config["base"], root, columns, config["locked"]).links
+    if place.frame >= 0:
+        raise DataError(
+            f"the base {config['base']!r} of the robot {name!r} is moved by its joints: give "
+            f"it a base that stands still to combine it, base={model.root!r}"
+        )
+    return place.pose
 
 
 def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:

@@ -20,11 +20,17 @@ from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["Mimic", "UrdfJoint", "UrdfModel", "placement", "read_urdf"]
+__all__ = ["Mimic", "UrdfJoint", "UrdfModel", "description_text", "placement", "read_urdf"]
 
 MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
 #: Joints of more than one degree of freedom: read, but no :class:`Robot` can be moved by them.
 MULTIPLE_TYPES = ("floating", "planar")
+XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
+#: What to do with a description that begins with another element.
+OTHER_FORMATS = {
+    "mujoco": ": that is an MJCF, Robot.from_mjcf reads it",
+    "sdf": ": that is an SDF; pytorch_kinematics reads it, Robot.from_chain takes its chain",
+}
 #: Lengths [m] and factors beyond this are mistakes, and their products would not be finite.
 LARGEST = 1e9
 
@@ -164,18 +170,18 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     DataError
         If the file is missing, is not XML, or does not describe one tree of links.
     """
-    text = _text(source)
+    text = description_text(source)
     try:
         parser = ElementTree.XMLParser(target=_PlainTree())
         root = ElementTree.fromstring(text, parser)
     except ElementTree.ParseError as error:
-        raise DataError(f"the URDF is not well-formed XML: {error}") from error
+        reason = XACRO if "<xacro:" in text else f"the URDF is not well-formed XML: {error}"
+        raise DataError(reason) from error
     if root.tag != "robot":
-        raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>")
+        other = OTHER_FORMATS.get(root.tag, "")
+        raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{other}")
     if any("xacro" in element.tag for element in root.iter()):
-        raise DataError(
-            "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
-        )
+        raise DataError(XACRO)
     links = tuple(_names(root, "link"))
     if not links:
         raise DataError("the URDF has no link")
@@ -184,20 +190,34 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     return UrdfModel(root.get("name", ""), text, _root_link(links, joints), links, joints)
 
 
-def _text(source: str | bytes | os.PathLike[str]) -> str:
+def description_text(source: str | bytes | os.PathLike[str]) -> str:
+    """The text of a robot's description, in the encoding that it declares.
+
+    Parameters
+    ----------
+    source : str, bytes or path
+        A path, or the text itself (bytes, or a string that begins with ``<``).
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or is no text in that encoding.
+    """
     if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
         return source.lstrip("\ufeff \t\r\n")
     if not isinstance(source, bytes):
         try:
             source = read_whole(Path(source))
         except (OSError, ValueError) as error:
-            raise DataError(f"the URDF file cannot be read: {error}") from error
+            raise DataError(f"the robot's description cannot be read: {error}") from error
     declared = re.match(rb"""\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)""", source)
     encoding = declared[1].decode() if declared else "utf-8-sig"
     try:
         return source.decode(encoding).lstrip()
     except (LookupError, UnicodeDecodeError) as error:
-        raise DataError(f"the URDF is not text in the encoding {encoding}: {error}") from error
+        raise DataError(
+            f"the robot's description is not text in the encoding {encoding}: {error}"
+        ) from error
 
 
 def _names(root: ElementTree.Element, tag: str) -> list[str]:
@@ -255,21 +275,22 @@ def _numbers(
     text = None if child is None else child.get(attribute)
     if text is None:
         return np.array(default)
-    try:
-        values = np.array([float(word) for word in text.split()])
+    try:  # lists, not arrays: a description has thousands of these
+        values = [float(word) for word in text.split()]
     except ValueError:
-        values = np.array([math.nan])
-    if values.shape != (len(default),) or not np.isfinite(values).all():
+        values = []
+    if len(values) != len(default) or not all(map(math.isfinite, values)):
+        hint = f". {XACRO}" if "${" in text or "$(" in text else ""
         raise DataError(
             f"joint {joint!r}: <{tag} {attribute}> needs {len(default)} finite number(s), "
-            f"got {_short(text)}"
+            f"got {_short(text)}{hint}"
         )
-    if tag in ("origin", "mimic") and np.abs(values).max() > LARGEST:
+    if tag in ("origin", "mimic") and max(map(abs, values)) > LARGEST:
         raise DataError(
             f"joint {joint!r}: <{tag} {attribute}> is {_short(text)}, and no robot's is beyond "
             f"{LARGEST:g}"
         )
-    return values
+    return np.array(values)
 
 
 def _short(text: str) -> str:
@@ -284,15 +305,17 @@ def placement(xyz: Array, rpy: Array) -> Array:
     xyz, rpy : ndarray of shape (3,)
         Metres, radians.
     """
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    matrix[:3, 3] = xyz
-    return matrix
+    (x, y, z), (roll, pitch, yaw) = xyz.tolist(), rpy.tolist()
+    cr, cp, cy = math.cos(roll), math.cos(pitch), math.cos(yaw)
+    sr, sp, sy = math.sin(roll), math.sin(pitch), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
+            [-sp, cp * sr, cp * cr, z],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def _limits(

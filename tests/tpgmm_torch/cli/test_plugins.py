@@ -8,6 +8,7 @@ from tests.support.command_line import refusal
 from tpgmm_datasets.commands.recordings import Recordings
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.cli import plugins
+from tpgmm_torch.cli.options import read_robot
 from tpgmm_torch.exceptions import DataError, DependencyError
 
 
@@ -33,6 +34,15 @@ def test_what_this_distribution_registers_is_there():
     assert {"dataset", "demo"} <= plugins.registered(plugins.COMMANDS).keys()
     assert plugins.required(plugins.READERS, "lerobot") is Recordings
     assert plugins.required(plugins.ROBOTS, "upper_body") is upper_body_urdf
+
+
+def test_robots_are_files_of_either_format(tmp_path):
+    body = '<body name="hand"><joint name="lift"/><geom size="0.1"/></body>'
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (tmp_path / "body.urdf").write_text(upper_body_urdf())
+    assert read_robot(str(tmp_path / "arm.xml"), ["hand"]).joint_names == ("lift",)
+    body = read_robot(str(tmp_path / "body.urdf"), ["l_hand"], ["l_*"], ["grip"])
+    assert body.joint_names[-2:] == ("l_wrist_roll", "grip")
 
 
 def test_an_installation_that_is_older_than_the_code_is_pointed_out(monkeypatch, tmp_path):

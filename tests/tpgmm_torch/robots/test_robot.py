@@ -34,7 +34,11 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots import robot as robot_module
+from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.tracked_poses import Poses
+from tpgmm_torch.robots.urdf import read_urdf
+from tpgmm_torch.viewing.visuals import link_shapes
 
 
 class TestOracles:
@@ -147,6 +151,21 @@ class TestSettings:
         assert first == (*left[:-1], left[-1])  # one that is named keeps its place
         with pytest.raises(UnknownNameError, match=r"joint 'm_\*' is not in the movable"):
             upper_body(joints=["m_*"])
+
+    def test_patterns_lock_what_does_not_move(self) -> None:
+        robot = upper_body(
+            joints="l_*", locked={"*_elbow*": 0.2, "waist_*": 0.1, "waist_yaw": 0.3}
+        )
+        locked = robot.config()["locked"]
+        assert {value for name, value in locked.items() if "elbow" in name} == {0.2}
+        assert (locked["waist_yaw"], locked["waist_roll"]) == (0.3, 0.1)
+        assert upper_body(locked={"?_*": 0.0}).joint_names == (
+            "waist_roll",
+            "waist_pitch",
+            "waist_yaw",
+        )
+        with pytest.raises(UnknownNameError, match=r"joint 'm_\*' is not in the movable"):
+            upper_body(locked={"m_*": 0.0})
 
     @pytest.mark.parametrize("kind", ["fixed", "revolute"])
     def test_a_description_of_thousands_of_links_is_read_at_once(self, kind: str) -> None:
@@ -370,6 +389,109 @@ class TestObject:
     ) -> None:
         with pytest.raises((DataError, UnknownNameError), match=message):
             Robot.from_config(robot.config() | change)
+
+
+def assert_moves_like(both: RobotState, arm: RobotState, pose: Frame, first: int) -> None:
+    """The links of one robot of two, from ``first`` on, are those of the robot alone."""
+    links = slice(first, first + len(arm.links))
+    turn = quaternions.to_matrix(pose.orientation)
+    exact: dict[str, Any] = {"rtol": 0, "atol": 1e-14}
+    positions = arm.positions @ turn.T + pose.position
+    torch.testing.assert_close(both.positions[:, links], positions, **exact)
+    rotations = turn @ quaternions.to_matrix(arm.orientations)
+    found = quaternions.to_matrix(both.orientations[:, links])
+    torch.testing.assert_close(found, rotations, **exact)
+    n, start = arm.joints.shape[-1], 0 if first == 0 else both.joints.shape[-1]
+    own = slice(0, n) if start == 0 else slice(start - n, start)
+    jacobians = both.jacobians[:, links].clone()
+    expected = torch.cat(
+        (turn @ arm.jacobians[..., :3, :], turn @ arm.jacobians[..., 3:, :]), -2
+    )
+    torch.testing.assert_close(jacobians[..., own], expected, **exact)
+    jacobians[..., own] = 0
+    assert (jacobians == 0).all()
+
+
+class TestCombining:
+    left = Frame(
+        [0.1, 0.3, 0.8], quaternions.normalize(torch.tensor([0.9, 0.1, -0.3, 0.2]).double())
+    )
+    right = Frame([0.1, -0.3, 0.8], [0.5, 0.5, -0.5, 0.5])
+
+    @pytest.mark.parametrize("base", ["ground", "column"])
+    def test_each_moves_as_it_does_alone(self, base: str) -> None:
+        cup = {"cup": ("flange", Frame([0.1, 0.0, 0.2]))}
+        column = {"joints": ["swivel", "elbow", "wag"], "locked": {"lift": 0.2}}
+        arm = zoo(
+            ("cup", "l_finger"), base=base, tools=cup, **(column if base == "column" else {})
+        )
+        other = upper_body()
+        poses = {"left": self.left, "body": self.right}
+        both = Robot.combine(poses, left=arm, body=other)
+        assert both.links == ("left_cup", "left_l_finger", "body_l_hand", "body_r_hand")
+        joints = random_joints(both, 50)
+        state, n = both.state(joints), arm.n_joints
+        assert_moves_like(state, arm.state(joints[:, :n]), self.left, 0)
+        assert_moves_like(state, other.state(joints[:, n:]), self.right, 2)
+
+    def test_limits_names_and_settings_come_along(self) -> None:
+        arm = zoo(("tip",), coordinates=["hand"], locked={"elbow": 0.4}, dtype=torch.float32)
+        both = Robot.combine(left=arm, right=arm)
+        names = [f"{side}_{name}" for side in ("left", "right") for name in arm.joint_names]
+        assert both.joint_names == tuple(names)
+        for limit in ("lower", "upper", "velocity"):
+            torch.testing.assert_close(getattr(both, limit), getattr(arm, limit).repeat(2))
+        assert both.lower.dtype == torch.float32
+        config = both.config()
+        assert config["coordinates"] == ["left_hand", "right_hand"]
+        assert config["locked"] == {"left_elbow": 0.4, "right_elbow": 0.4}
+
+    def test_everything_may_be_seen_from_a_table(self) -> None:
+        arm, table = zoo(("tip",)), self.left
+        poses = {"left": table.compose(self.right)}
+        both = Robot.combine(poses, left=arm, fixed={"table": table}, base="table")
+        joints = random_joints(arm, 5)
+        assert_moves_like(both.state(joints), arm.state(joints), self.right, 0)
+
+    def test_they_are_saved_and_combined_like_any_robot(self) -> None:
+        both = Robot.combine({"left": self.left}, left=zoo(("tip",)), right=upper_body())
+        again = Robot.from_config(json.loads(json.dumps(both.config())))
+        assert again == both
+        joints = random_joints(both, 3)
+        assert torch.equal(again.state(joints).jacobians, both.state(joints).jacobians)
+        four = Robot.combine(near=both, far=both, poses={"far": self.right})
+        assert four.joint_names[0] == "near_left_lift"
+        assert_moves_like(four.state(joints.repeat(1, 2)), both.state(joints), self.right, 3)
+
+    def test_looks_come_along(self) -> None:
+        painted = ZOO.replace(
+            '<link name="arm"/>',
+            '<material name="m"><color rgba="1 0 0 1"/></material><link name="arm"><visual>'
+            '<geometry><sphere radius="0.1"/></geometry><material name="m"/></visual></link>',
+        )
+        assert painted != ZOO
+        arm = Robot.from_urdf(painted, ["tip"])
+        text = Robot.combine(left=arm, right=zoo(("tip",))).config()["urdf"]
+        shapes = link_shapes(read_urdf(text))
+        assert [shape.color for shape in shapes["left_arm"]] == [(255, 0, 0)]
+        assert "right_arm" not in shapes
+
+    def test_what_does_not_go_together(self) -> None:
+        arm = zoo(("tip",))
+        with pytest.raises(DataError, match="robots by name"):
+            Robot.combine()
+        with pytest.raises(DataError, match="robots by name"):
+            Robot.combine(left=Poses(["hand"]))  # type: ignore[arg-type]
+        with pytest.raises(UnknownNameError, match=r"robot 'rihgt' .*\['left', 'right'\]"):
+            Robot.combine({"rihgt": self.right}, left=arm, right=arm)
+        with pytest.raises(
+            DataError, match=r"'column' of the robot 'left' is moved .*'ground'"
+        ):
+            Robot.combine(left=zoo(("tip",), base="column"))
+        with pytest.raises(DataError, match="two links named 'left_tip'"):
+            Robot.combine(left=arm, fixed={"left_tip": self.left})
+        with pytest.raises(ShapeError, match="one constant pose"):
+            Robot.combine({"left": Frame(np.zeros((2, 3)))}, left=arm)
 
 
 class TestErrors:

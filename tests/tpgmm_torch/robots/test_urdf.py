@@ -149,6 +149,8 @@ class TestRefusing:
                 '<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>',
                 "xacro macros",
             ),
+            ("<robot><xacro:arm/></robot>", r"expand them first \(xacro FILE > ROBOT"),
+            (one('<origin rpy="0 0 $(arg yaw)"/>'), "finite number.*xacro macros"),
         ],
     )
     def test_broken_descriptions(self, text: str, message: str) -> None:

@@ -10,9 +10,6 @@ from functools import cache
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
 from tpgmm_torch import (
     Canonical,
     Frame,
@@ -22,7 +19,8 @@ from tpgmm_torch import (
     Robot,
     Stack,
 )
-from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import DependencyError, UnknownNameError
+from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
 __all__ = [
     "ARM_JOINTS",
@@ -115,7 +113,7 @@ def aloha_robot(**options: Any) -> Robot:
 
 @cache
 def aloha_urdf() -> str:
-    """The arms up to their gripper links as URDF text.
+    """gym-aloha's scene as URDF text, with the arms' joints named as its actions name them.
 
     Links have the names of gym-aloha's bodies (``vx300s_left/gripper_link``), joints those
     that its actions have (``left_arm_waist``); the origin is the world's.
@@ -124,55 +122,19 @@ def aloha_urdf() -> str:
     ------
     DependencyError
         Without gym-aloha.
-    DataError
-        If its model is not what this description can express.
     """
     try:
-        import mujoco
         from gym_aloha.constants import ASSETS_DIR
     except ImportError as error:
         raise DependencyError(
             f"the robot of aloha_state needs gym-aloha: {HOW_TO_INSTALL}"
         ) from error
-    model = mujoco.MjModel.from_xml_path(str(ASSETS_DIR / "bimanual_viperx_transfer_cube.xml"))
-    robot = ElementTree.Element("robot", name="bimanual_viperx")
-    ElementTree.SubElement(robot, "link", name="world")
-    for side in SIDES:
-        body = model.body(f"vx300s_{side}/gripper_link").id
-        chain = []
-        while body:
-            chain.append(body)
-            body = model.body_parentid[body]
-        for body in reversed(chain):
-            _add_body(robot, model, model.body(body), side)
+    robot = ElementTree.fromstring(
+        mjcf_to_urdf(ASSETS_DIR / "bimanual_viperx_transfer_cube.xml")
+    )
+    for joint in robot.findall("joint"):
+        # the actions of gym-aloha call vx300s_left/waist left_arm_waist
+        name = joint.get("name", "")
+        if name.startswith("vx300s_") and not name.endswith("_mount"):
+            joint.set("name", name.removeprefix("vx300s_").replace("/", "_arm_"))
     return ElementTree.tostring(robot, encoding="unicode")
-
-
-def _add_body(robot: ElementTree.Element, model: Any, body: Any, side: str) -> None:
-    """Add a body as a link, and the joint that carries it."""
-    ElementTree.SubElement(robot, "link", name=body.name)
-    count = int(body.jntnum[0])
-    moving = model.joint(int(body.jntadr[0])) if count else None
-    if count > 1 or (moving is not None and (moving.type[0] != 3 or moving.pos.any())):
-        raise DataError(
-            f"body {body.name!r} of gym-aloha's model is not carried by one hinge in its origin"
-        )
-    name = f"{body.name}_mount"
-    if moving is not None:
-        name = f"{side}_arm_{moving.name.rpartition('/')[2]}"
-    kind = "fixed" if moving is None else "revolute"
-    joint = ElementTree.SubElement(robot, "joint", name=name, type=kind)
-    parent = model.body(int(body.parentid[0])).name
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=body.name)
-    turn = Rotation.from_quat(np.roll(body.quat, -1))  # scipy puts the real part last
-    roll_pitch_yaw = turn.as_euler("xyz")
-    ElementTree.SubElement(joint, "origin", xyz=_text(body.pos), rpy=_text(roll_pitch_yaw))
-    if moving is not None:
-        lower, upper = (repr(float(limit)) for limit in moving.range)
-        ElementTree.SubElement(joint, "axis", xyz=_text(moving.axis))
-        ElementTree.SubElement(joint, "limit", lower=lower, upper=upper)
-
-
-def _text(values: Any) -> str:
-    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,57 @@
+"""The descriptions that come with the package."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tpgmm_datasets.robots import so101_urdf
+from tpgmm_torch import Frame, Robot, quaternions
+
+ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+
+
+def arm(*joints: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position and rotation of the gripper at joints of those angles, the others at zero."""
+    robot = Robot.from_urdf(so101_urdf(), ["gripper_frame_link"], joints=ARM)
+    state = robot.state([*joints, *[0.0] * (5 - len(joints))])
+    rotation = quaternions.to_matrix(state.orientation("gripper_frame_link")).numpy()
+    return state.position("gripper_frame_link").numpy(), rotation
+
+
+def test_the_so101_reaches_forward_in_its_plane() -> None:
+    position, rotation = arm()
+    # lengths along x and z as published: base, shoulder, upper arm and lower arm, wrist, tip
+    x = 0.0388353 + 0.0303992 + 0.028 + 0.1349 + 0.0611 + 0.0981274
+    z = 0.0624 + 0.0542 + 0.11257 - 0.0052
+    assert position[0] == pytest.approx(x, abs=1e-9)
+    assert abs(position[1]) < 1e-3 > abs(position[2] - z) - 0.0079
+    assert rotation[:, 2] == pytest.approx([1, 0, 0], abs=1e-12)
+
+
+def test_its_joints_turn_as_they_are_called() -> None:
+    straight, _ = arm()
+    reach = straight[0] - 0.0388353
+    turned, _ = arm(0.3)  # the axis of the pan points down
+    assert turned[:2] == pytest.approx(
+        [0.0388353 + reach * math.cos(0.3), -reach * math.sin(0.3)], abs=1e-4
+    )
+    for joints in ([0, 0.2], [0, 0, 0.2], [0, 0, 0, 0.2]):  # positive bends down
+        lowered, rotation = arm(*joints)
+        assert lowered[2] < straight[2]
+        assert rotation[:, 2] == pytest.approx([math.cos(0.2), 0, -math.sin(0.2)], abs=1e-12)
+    rolled, rotation = arm(0, 0, 0, 0, 0.5)
+    assert rolled[0] == pytest.approx(straight[0])
+    assert rotation[:, 2] == pytest.approx([1, 0, 0], abs=1e-12)
+
+
+def test_two_of_them_are_one_robot() -> None:
+    one = Robot.from_urdf(so101_urdf(), ["gripper_frame_link"])
+    apart = {"left": Frame([0.0, 0.2, 0.0]), "right": Frame([0.0, -0.2, 0.0])}
+    both = Robot.combine(apart, left=one, right=one)
+    assert both.joint_names[:2] == ("left_shoulder_pan", "left_shoulder_lift")
+    joints = torch.full((6,), 0.2, dtype=torch.float64)
+    hands = both.state(torch.cat((joints, joints))).positions
+    between = hands[0] - hands[1]
+    torch.testing.assert_close(between, between.new_tensor([0, 0.4, 0]), rtol=0, atol=1e-14)
