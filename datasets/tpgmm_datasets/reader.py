@@ -20,6 +20,7 @@ from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError, summed_up
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
@@ -164,7 +165,7 @@ def open_recording(
         units = _calibrated(feature, calibration, joint_names, units)
     columns = JointColumns.choose(feature, joint_names, units, robot)
     sources = frame_sources(layout, frames)
-    stored = [key.removeprefix(EVENT) for key in layout.features if key.startswith(EVENT)]
+    stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
     assembly = Assembly(
         layout,
         columns,

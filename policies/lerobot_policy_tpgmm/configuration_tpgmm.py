@@ -158,8 +158,9 @@ class TPGMMConfig(StatePolicyConfig):
         to be told them like any frame, but for those at ``start``: they follow from the joints.
     events : dict of str to str, optional
         How training finds events, ``{"close": "closing:*gripper*"}``, as
-        :func:`tpgmm_torch.events.parse_event` takes it. ``close``, ``open`` and ``stop``
-        of a link at which a frame is are found by themselves.
+        :func:`tpgmm_torch.events.parse_event` takes it. Others are those of the columns
+        ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
+        frame is are found by themselves, where there is no such column.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
     follow_frames : bool, default=True

@@ -6,15 +6,15 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import torch
 
 from tpgmm_datasets.conversion.joints import JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
-from tpgmm_datasets.lerobot.columns import ENVIRONMENT, EVENT
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
+from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
 from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
@@ -161,12 +161,7 @@ class Assembly:
         sources = self.frames.values()
         keys = [source.feature for source in sources if isinstance(source, FramePose)]
         poses = map(self.layout.feature, dict.fromkeys(keys))
-        return [self.joints.feature, *poses, *self._flags]
-
-    @property
-    def _flags(self) -> list[Feature]:
-        features = self.layout.features.values()
-        return [f for f in features if f.key.startswith(EVENT) and f.dtype == "bool"]
+        return [self.joints.feature, *poses, *event_features(self.layout)]
 
     def demonstration(self, rows: EpisodeRows) -> Demonstration:
         """Convert, find frames and events, cut, resample, and bring into the robot's order."""
@@ -176,7 +171,7 @@ class Assembly:
             torch.from_numpy(joints),
             self._stored_frames(rows),
             self.joints.names,
-            self._flagged(rows),
+            flagged_events(rows),
         )
         demonstration = self._with_events(demonstration, rows)
         if self.trim is not None:
@@ -200,14 +195,6 @@ class Assembly:
             elif isinstance(source, Frame):
                 frames[name] = source
         return frames
-
-    def _flagged(self, rows: EpisodeRows) -> dict[str, float]:
-        events = {}
-        for feature in self._flags:
-            (steps,) = np.nonzero(rows.values[feature.key][:, 0])
-            if len(steps):
-                events[feature.key.removeprefix(EVENT)] = float(rows.time[steps[0]])
-        return events
 
     def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
         events = dict(demonstration.events)

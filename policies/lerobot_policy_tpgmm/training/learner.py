@@ -12,6 +12,7 @@ import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,8 @@ from lerobot_policy_tpgmm.training.losses import (
     regression,
 )
 from tpgmm_datasets.conversion.assembly import event_sources
+from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
@@ -86,6 +89,12 @@ class Learner:
         self._config, self._mixture = config, mixture
         self._kinematics, self._operators = kinematics, tuple(operators)
         self._joints, self._frames = joints, frames
+        self._dataset, flags = dataset_meta, dataset_meta.features
+        self._stored = [k.removeprefix(EVENT) for k in flags if k.startswith(EVENT)]
+        sources = event_sources(
+            config.events, config.link_poses(), self._stored, kinematics.joint_names
+        )
+        self._detectors = {n: s for n, s in sources.items() if isinstance(s, Detector)}
         self._fps = float(dataset_meta.fps)
         self._ranges = episode_ranges(dataset_meta)
         self._recorder: EpochRecorder | None = EpochRecorder(self._ranges, self._fps)
@@ -225,10 +234,13 @@ class Learner:
         self, shown: Mapping[int, Demonstration], kinematics: Kinematics
     ) -> list[Demonstration]:
         """Demonstrations with the events and the frames at links that are asked for."""
-        config, poses = self._config, self._config.link_poses()
-        sources = event_sources(config.events, poses, (), kinematics.joint_names)
-        detectors = {name: s for name, s in sources.items() if isinstance(s, Detector)}
+        config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
+        if self._stored and (poses or config.alignment == "events"):
+            # LeRobot's preprocessor hands no such columns on
+            log.info("reading events: %s", ", ".join(self._stored))
+            stored = stored_events(Path(self._dataset.root), shown)
+            found = [replace(one, events=stored[n]) for n, one in shown.items()]
         if detectors:
             log.info("finding events: %s", ", ".join(detectors))
             found = find_events(found, detectors, kinematics, plausibility=config.plausibility)

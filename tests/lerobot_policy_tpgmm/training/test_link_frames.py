@@ -1,5 +1,7 @@
 """Frames where a link is at an event: in training, and when the policy runs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -113,6 +115,32 @@ def test_episodes_without_the_event_are_named(tmp_path):
     with pytest.raises(DataError, match=r"'close', .* is not found in episodes \[1, 3\]"):
         for batch in [*epoch(data, 32), *epoch(data, 32)]:
             learner.forward(batch)
+
+
+@pytest.mark.parametrize("told", [{}, {"close": "closing:l_gripper"}])
+def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_path, told):
+    flags = [one + 0.5 for one in CLOSINGS]
+    episodes = [
+        replace(shown(seed, closing), events={"close": flag})
+        for seed, (closing, flag) in enumerate(zip(CLOSINGS, flags, strict=True))
+    ]
+    save_lerobot(episodes, tmp_path / "set", fps=FPS, task="grip", units={"l_gripper": "raw"})
+    data = dataset(tmp_path / "set", episodes=[1, 2, 3])
+    policy = trained(data, link_frames=AT_LINKS, events=told, operators=OPERATORS, **OPTIONS)
+    read = load_lerobot(
+        data.root,
+        episodes=[1, 2, 3],
+        robot=robot(),
+        frames=AT_LINKS,
+        events=told,
+        plausibility="ignore",
+    )
+    when = CLOSINGS if told else flags
+    assert [one.events["close"] for one in read] == pytest.approx(list(when[1:]), abs=0.11)
+    aligned = EventAlignment(robot=robot()).fit_transform(read)
+    operators = [parse_operator(OPERATORS[0]), Canonical()]
+    model = TaskParameterizedGMM(3, operators, robot(), random_state=0, plausibility="ignore")
+    same(policy.to_estimator(), model.fit(aligned), 1e-6)
 
 
 def test_texts_and_links_that_are_none_are_refused(grips):

@@ -1,0 +1,54 @@
+"""Events that a data set keeps: columns ``event.<name>``, true at the step of the event."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+
+from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.episodes import EpisodeRows, Relaxed, read_episodes
+from tpgmm_datasets.lerobot.layout import Feature, Layout, open_layout
+
+__all__ = ["event_features", "flagged_events", "stored_events"]
+
+
+def event_features(layout: Layout) -> list[Feature]:
+    """The columns of a data set that tell of events."""
+    features = layout.features.values()
+    return [f for f in features if f.key.startswith(EVENT) and f.dtype == "bool"]
+
+
+def flagged_events(rows: EpisodeRows) -> dict[str, float]:
+    """When each event of an episode is, from its start [s]; the first step that is true.
+
+    Parameters
+    ----------
+    rows : EpisodeRows
+        Read with :func:`event_features`.
+    """
+    events = {}
+    for key, values in rows.values.items():
+        if key.startswith(EVENT) and values.dtype == bool and values.any():
+            events[key.removeprefix(EVENT)] = float(rows.time[np.argmax(values[:, 0])])
+    return events
+
+
+def stored_events(root: Path, episodes: Collection[int]) -> dict[int, dict[str, float]]:
+    """The events of some episodes of the data set in a folder, by their index.
+
+    Parameters
+    ----------
+    root : Path
+    episodes : collection of int
+
+    Raises
+    ------
+    DatasetError
+        If their files cannot be read.
+    """
+    layout = open_layout(root)
+    wanted = [episode for episode in layout.episodes if episode.index in episodes]
+    rows = read_episodes(layout, wanted, event_features(layout), Relaxed(()))
+    return {one.episode.index: flagged_events(one) for one in rows}
