@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.distributions import MultivariateNormal
 
 from tpgmm_torch import TaskParameterizedGMM, gaussians
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
@@ -87,6 +88,20 @@ class MixtureParameters(nn.Module):
             scale = factor.diagonal(dim1=-2, dim2=-1).exp()
             triangles.append(scale[..., None] * unit)
         return triangles
+
+    def log_joint(self, points: Sequence[Tensor]) -> Tensor:
+        """Logarithms of weight times density of each component, (K, N), differentiable.
+
+        Parameters
+        ----------
+        points : sequence of Tensor of shape (N, 1 + D_j)
+            Time and local coordinates of each operator.
+        """
+        joint = torch.log_softmax(self.logits, 0)[:, None]
+        for mean, triangle, x in zip(self.means, self.triangles(), points, strict=True):
+            normal = MultivariateNormal(mean, scale_tril=triangle, validate_args=False)
+            joint = joint + normal.log_prob(x[:, None]).mT
+        return joint
 
     @torch.no_grad()
     def copy_from(self, model: TaskParameterizedGMM) -> None:

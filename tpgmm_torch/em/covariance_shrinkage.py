@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tpgmm_torch.em.parameters import Parameters
 
-__all__ = ["oracle_approximating_intensity", "shrink"]
+__all__ = ["oracle_approximating_intensity", "shrink", "shrinkage_intensity"]
 
 
 def oracle_approximating_intensity(covariance: Tensor, freedom: Tensor | float) -> Tensor:
@@ -43,6 +43,26 @@ def oracle_approximating_intensity(covariance: Tensor, freedom: Tensor | float) 
     return torch.where(denominator > 0, numerator / denominator, 1.0).clamp(0.0, 1.0)
 
 
+def shrinkage_intensity(
+    covariance: Tensor, intensity: float | str, n_samples: Tensor | float
+) -> Tensor:
+    """The share l by which covariances (..., D, D) go towards their diagonals, (...).
+
+    Parameters
+    ----------
+    covariance : Tensor of shape (..., D, D)
+        Positive definite.
+    intensity : float or "auto"
+        The share itself, or :func:`oracle_approximating_intensity`.
+    n_samples : float or Tensor of shape (...)
+        How many independent samples a covariance was learned from.
+    """
+    if not isinstance(intensity, str):
+        return covariance.new_full(covariance.shape[:-2], intensity)
+    freedom = torch.as_tensor(n_samples).to(covariance) - 1.0
+    return oracle_approximating_intensity(covariance, freedom.clamp(min=0))
+
+
 def shrink(
     parameters: Parameters,
     intensity: float | str,
@@ -61,14 +81,13 @@ def shrink(
     parameters : Parameters
         One mixture.
     intensity : float or "auto"
-        The share l, from 0 to 1; "auto" is :func:`oracle_approximating_intensity` for each
-        component and block.
+        The share l, from 0 to 1, for each component and block as in
+        :func:`shrinkage_intensity`.
     n_samples : float or Tensor of shape (K,)
         How many independent samples a component was learned from.
     given : int, default=0
         1, where each block begins with time: slopes over time are kept.
     """
-    n_samples = torch.as_tensor(n_samples).to(parameters.weights)
     factors = []
     for factor in parameters.factors:
         tail = factor[..., given:, given:]  # of the conditional covariance
@@ -76,11 +95,7 @@ def shrink(
             factors.append(factor)
             continue
         covariance = tail @ tail.mT
-        if isinstance(intensity, str):
-            freedom = (n_samples - 1.0).clamp(min=0)
-            share = oracle_approximating_intensity(covariance, freedom)[..., None, None]
-        else:
-            share = covariance.new_tensor(intensity)
+        share = shrinkage_intensity(covariance, intensity, n_samples)[..., None, None]
         diagonal = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
         shrunk = torch.linalg.cholesky((1 - share) * covariance + share * diagonal)
         # a share of 0 is the factor itself, to the last digit

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["EpochRecorder", "episode_ranges", "located"]
+__all__ = ["COLUMNS", "EpochRecorder", "episode_ranges", "located"]
 
 #: What is kept of a frame.
 COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)

@@ -24,7 +24,13 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.training.clocks import Clock, alignment
-from lerobot_policy_tpgmm.training.epoch_recorder import EpochRecorder, episode_ranges, located
+from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
+from lerobot_policy_tpgmm.training.epoch_recorder import (
+    COLUMNS,
+    EpochRecorder,
+    episode_ranges,
+    located,
+)
 from lerobot_policy_tpgmm.training.losses import (
     Samples,
     imitation_loss,
@@ -40,6 +46,7 @@ from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.events.detection import Detector, find_events
 from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
 
@@ -49,6 +56,8 @@ log = logging.getLogger(__name__)
 
 #: Of the loss: if it falls by less in an epoch, the log says that it is enough.
 LITTLE = 0.01
+#: Covariances of these types are shrunk after EM.
+SHRUNK = ("full", "tied")
 
 
 class Learner:
@@ -72,8 +81,9 @@ class Learner:
     ----------
     clock : Clock or None
         Of the episodes of the data set; None before they are collected.
-    regularization : list of Tensor of shape (1 + D_j,), or None
-        What EM adds to the diagonals of the covariances of the collected demonstrations.
+    prior : CovariancePrior or None
+        What EM's regularisation and shrinkage say of the covariances of the collected
+        demonstrations.
     """
 
     def __init__(
@@ -101,7 +111,8 @@ class Learner:
         self._learned: set[int] = set()
         self._first: dict[int, dict[str, Tensor]] = {}
         self.clock: Clock | None = None
-        self.regularization: list[Tensor] | None = None
+        self.prior: CovariancePrior | None = None
+        self._left_out: set[int] = set()
         self._steps = 0
         self._told = False
         self._losses: list[float] = []  # of the present epoch, while it is of interest
@@ -214,18 +225,43 @@ class Learner:
         self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
-        holds = list(map(Hold.parse, config.holds or ()))
-        rows = torch.cat(local_data(aligned, self._operators, kinematics, holds=holds))
-        self.regularization = self._regularization(rows, kinematics)
         self._learned, self._recorder = set(numbers), None
+        self._go_on_from(dict(zip(numbers, aligned, strict=True)), kinematics)
+
+    def _go_on_from(self, aligned: Mapping[int, Demonstration], kinematics: Kinematics) -> None:
+        """Find what the loss of later steps needs to know of the demonstrations."""
+        config, mixture, operators = self._config, self._mixture, self._operators
+        holds = list(map(Hold.parse, config.holds or ()))
+        shown = list(aligned.values())
+        if config.robust:  # as in fit, which says so
+            outlying = outlying_demonstrations(shown, operators, kinematics, holds)
+            self._left_out = {list(aligned)[one.episode] for one in outlying}
+            if self._left_out:
+                log.info("unlike the others, not learned from: %s", sorted(self._left_out))
+        kept = [one for number, one in aligned.items() if number not in self._left_out]
+        like = mixture.time
         with torch.no_grad():
-            widths = [mean.shape[1] for mean in mixture.means]
-            points = list(rows.to(mixture.time).split(widths, dim=1))
-            likelihood = likelihood_loss(mixture, points, self.regularization)
+            model = regression(
+                config, kinematics.to(like.dtype, like.device), operators, mixture
+            )
+
+            def expected(j: int, time: Tensor) -> Tensor:
+                return model.expected(j, time.to(like)).to(time)
+
+            rows = torch.cat(local_data(kept, operators, kinematics, expected, holds))
+            points = list(rows.to(like).split([mean.shape[1] for mean in mixture.means], 1))
+            self.prior = CovariancePrior.of(
+                mixture,
+                points,
+                self._regularization(rows, kinematics),
+                config.covariance_shrinkage if config.covariance_type in SHRUNK else 0.0,
+                len(kept),
+            )
+            likelihood = likelihood_loss(mixture, points, self.prior)
         unit = "imitation error [mrad^2]" if config.loss == "imitation" else "same"
         log.info(
-            "negative log-likelihood per frame: %.3f; further steps go on by gradient, and "
-            "their loss is the %s",
+            "negative log-likelihood per frame, with the prior: %.3f; further steps go on by "
+            "gradient, and their loss is the %s",
             likelihood.item(),
             unit,
         )
@@ -342,14 +378,20 @@ class Learner:
                 f"episodes {new} came after the first epoch was over: shuffle the frames of "
                 "all episodes, as lerobot-train does"
             )
+        if training and self._left_out:
+            rows = torch.tensor([n not in self._left_out for n in numbers.tolist()])
+            if not bool(rows.any()):
+                return torch.zeros((), requires_grad=True)
+            numbers, steps = numbers[rows], steps[rows]
+            batch = {key: batch[key][rows] for key in COLUMNS if key in batch}
         if self._kinematics.lower.device != mixture.time.device:
             self._kinematics = self._kinematics.to(device=mixture.time.device)
         samples = self._samples(batch, numbers, steps)
         model = regression(config, self._kinematics, self._operators, mixture)
         if config.loss == "likelihood":
             # held-out frames are scored, not learned
-            added = self.regularization if training else None
-            loss = likelihood_loss(mixture, local_points(model, samples), added)
+            prior = self.prior if training else None
+            loss = likelihood_loss(mixture, local_points(model, samples), prior)
         else:
             targets = self._joints.targets(batch[ACTION])
             loss = imitation_loss(model, samples, targets, self._joints.order)

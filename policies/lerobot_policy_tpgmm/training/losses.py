@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
+from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
 from tpgmm_torch import Frame, Kinematics, Operator, RobotState, quaternions
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.prior import prior_widths
@@ -97,35 +97,27 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
 def likelihood_loss(
     mixture: MixtureParameters,
     points: Sequence[Tensor],
-    regularization: Sequence[Tensor] | None = None,
+    prior: CovariancePrior | None = None,
 ) -> Tensor:
     """Negative mean log-likelihood per frame, over all local data sets.
 
     It is what EM maximises with ``responsibilities="point"``, and counts time once for each
-    operator, which :meth:`TaskParameterizedGMM.score` does not. The regularisation ``Lambda``
-    that EM adds to the covariances is kept by the penalty ``tr(Sigma_k^-1 Lambda) / 2`` for
-    each component k, in proportion to what it answers for: EM's solution is stationary, and
-    covariances do not shrink to nothing.
+    operator, which :meth:`TaskParameterizedGMM.score` does not. With a prior on covariances,
+    each component's counts in proportion to what it answers for: what EM regularises and
+    shrinks stays so, and covariances do not shrink to nothing.
 
     Parameters
     ----------
     points : sequence of Tensor of shape (B, 1 + D_j)
         From :func:`local_points`.
-    regularization : sequence of Tensor of shape (1 + D_j,), optional
-        The diagonals of ``Lambda``, in squared units of the coordinates; none by default.
+    prior : CovariancePrior, optional
     """
-    joint = torch.log_softmax(mixture.logits, 0)[:, None]  # (K, B)
-    penalty = torch.zeros_like(mixture.logits)
-    triangles = mixture.triangles()
-    for j, (mean, triangle, x) in enumerate(zip(mixture.means, triangles, points, strict=True)):
-        normal = MultivariateNormal(mean, scale_tril=triangle, validate_args=False)
-        joint = joint + normal.log_prob(x[:, None]).mT
-        if regularization is not None:
-            root = regularization[j].sqrt().diag().expand_as(triangle)
-            whitened = torch.linalg.solve_triangular(triangle, root, upper=False)
-            penalty = penalty + whitened.square().sum((1, 2)) / 2
+    joint = mixture.log_joint(points)
+    loss = -torch.logsumexp(joint, 0).mean()
+    if prior is None:
+        return loss
     shares = torch.softmax(joint.detach(), 0).mean(1)
-    return (shares * penalty).sum() - torch.logsumexp(joint, 0).mean()
+    return loss + (shares * prior.penalty(mixture.triangles())).sum()
 
 
 def imitation_loss(

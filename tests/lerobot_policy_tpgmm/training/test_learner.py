@@ -94,7 +94,9 @@ def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplo
     assert lines[1] == f"{frames} frames of 4 episodes collected"
     assert lines[2] == "EM: fitting 5 components"
     assert re.match(r"5 components fitted by \d+ steps of EM: the policy is trained", lines[3])
-    [printed] = re.findall(r"^negative log-likelihood per frame: (-?[\d.]+); ", lines[4])
+    [printed] = re.findall(
+        r"^negative log-likelihood per frame, with the prior: (-?[\d.]+); ", lines[4]
+    )
     # the same figure as the loss of all frames
     assert frames % 41 == 0 and np.mean(losses[3:]) == pytest.approx(float(printed), abs=2e-3)
 

@@ -1,21 +1,26 @@
 """Training by gradient from the EM solution: the losses, and what comes of them."""
 
+from dataclasses import replace
 from itertools import cycle, islice
 
 import pytest
 import torch
 
 from tests.support.policies import act
+from tests.support.skills import handlings as handlings_of
 from tests.support.skills import same
 from tests.support.training import (
+    FPS,
     HANDLINGS,
     WAVES,
+    dataset,
     epoch,
     fresh,
     resumed,
     trained,
 )
-from tpgmm_datasets import load_lerobot
+from tpgmm_datasets import load_lerobot, save_lerobot
+from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.training.local_data import local_data
 
@@ -43,7 +48,8 @@ def whole(data) -> dict:
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("fusion", ["information", "covariance"])
 def test_gradients_equal_finite_differences(handlings, loss, fusion):
-    policy = trained(handlings, loss=loss, fusion=fusion, activation="product", **HANDLINGS)
+    options = {**HANDLINGS, "covariance_shrinkage": 0.0}
+    policy = trained(handlings, loss=loss, fusion=fusion, activation="product", **options)
     batch = epoch(handlings, 16)[0]
     slopes = gradient(policy.train(), batch)
     generator = torch.Generator().manual_seed(0)
@@ -73,11 +79,82 @@ def test_the_solution_of_em_is_stationary(waves, monkeypatch):
     slopes = gradient(policy, whole(waves))
     assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
     # for the likelihood alone, regularised covariances are too large
-    monkeypatch.setattr(policy._learner, "regularization", None)
+    monkeypatch.setattr(policy._learner, "prior", None)
     slopes = gradient(policy, whole(waves))
     factors = slopes.pop("mixture.factors.0")
     assert max(slope.abs().max() for slope in slopes.values()) < 1e-9
     assert (factors.diagonal(dim1=-2, dim2=-1).sum(-1) > 1e-3).all()
+
+
+POINTS = {**HANDLINGS, "alignment": "none", "responsibilities": "point"}
+
+
+def test_shrunken_covariances_are_most_probable(handlings):
+    policy = trained(
+        handlings, **POINTS | {"n_components": 1, "covariance_shrinkage": 0.3}
+    ).train()
+    slopes = gradient(policy, whole(handlings))
+    assert max(slope.abs().max() for slope in slopes.values()) < 1e-8
+    for strength in policy._learner.prior.strengths:
+        assert strength.item() == pytest.approx(3 / 7)
+
+
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_a_run_that_goes_on_finds_the_same_prior(waves, tmp_path):
+    policy = trained(waves, alignment="linear", **WAVES).train()
+    policy.save_pretrained(tmp_path)
+    again = resumed(tmp_path, waves)
+    for batch in epoch(waves, 32) * 2:
+        again.forward(batch)
+    [one], [other] = (each._learner.prior.strengths for each in (again, policy))
+    assert 1 < one.min() < one.max() < 10
+    torch.testing.assert_close(one, other, rtol=1e-6, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_what_em_left_out_is_not_learned_by_gradient(tmp_path):
+    shown = handlings_of(6, length=31)
+    cup = shown[2].frames["cup"]
+    shown[2] = replace(shown[2], frames={"cup": Frame(cup.position + 0.3, cup.orientation)})
+    save_lerobot(shown, tmp_path / "set", fps=FPS, task="handle")
+    data = dataset(tmp_path / "set")
+    for policy in (trained(data, **POINTS), trained(data, robust=False, **POINTS)):
+        policy.train()
+        batch = whole(data)
+        wrong = batch["episode_index"].flatten() == 2
+        parts = [
+            {k: v[rows] if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
+            for rows in (wrong, ~wrong)
+        ]
+        losses = [value(policy, part) for part in parts]
+        if policy.config.robust:
+            assert losses[0] == 0 and value(policy, batch) == pytest.approx(losses[1])
+        else:
+            assert losses[0] != 0 and value(policy, batch) != pytest.approx(losses[1])
+
+
+def correlation(policy) -> float:
+    """Mean square of the correlations given time, of all components and operators."""
+    found = []
+    for triangle in policy.mixture.triangles():
+        tail = triangle.detach()[:, 1:, 1:]
+        tail = tail / torch.linalg.vector_norm(tail, dim=2, keepdim=True)
+        correlations = tail @ tail.mT
+        size = correlations.shape[-1]
+        found.append((correlations.square().sum((1, 2)) - size).mean() / (size * (size - 1)))
+    return float(torch.stack(found).mean())
+
+
+def test_more_steps_do_not_undo_the_shrinkage(handlings, monkeypatch):
+    """Without the prior the likelihood finds the correlations of four demonstrations again."""
+    policies = [trained(handlings, optimizer_lr=1e-3, **POINTS) for _ in range(2)]
+    begun, prior = correlation(policies[0]), policies[1]._learner.prior
+    weak = replace(prior, strengths=[0 * strength for strength in prior.strengths])
+    monkeypatch.setattr(policies[1]._learner, "prior", weak)
+    for policy in policies:
+        train(policy, [whole(handlings)], 100)
+    with_prior, without = map(correlation, policies)
+    assert with_prior < begun + 1e-5 and without > begun + 1e-4
 
 
 def test_the_loss_is_the_log_density_that_em_raises(handlings):
