@@ -58,7 +58,12 @@ from tpgmm_torch.plausibility.check import (
     summarized,
 )
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Finding, Report
-from tpgmm_torch.plausibility.outlying_demonstrations import left_out, outlying_demonstrations
+from tpgmm_torch.plausibility.outlying_demonstrations import (
+    Outlying,
+    left_out,
+    outlying_demonstrations,
+    outlying_rows,
+)
 from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
@@ -177,8 +182,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     robust : bool, default=True
         Whether to leave out demonstrations that are unlike the others where these agree, up
         to a third of five or more, with a warning that names them
-        (``outlying_demonstrations``). Demonstrations in
-        batches or in several processes are not looked at together, and all are learned from.
+        (``outlying_demonstrations``). Of demonstrations in batches, the local data of all
+        are in memory for that, thinned out to four instants per second if they are many.
     plausibility : {"warn", "error", "ignore"}, default="warn"
         What is done about recordings and situations that are unlikely to be what they are
         taken for (units, order, clock, places far from those shown): one
@@ -226,8 +231,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Of the local data of all operators side by side.
     demonstration_weights_ : Tensor of shape (M,) or None
         1 for each demonstration that was learned from, 0 for each that was left out; the
-        mixing coefficients are ``weights_``. None for demonstrations in batches or in several
-        processes, and for a model that was loaded or made from parameters.
+        mixing coefficients are ``weights_``. Counted process by process, where there are
+        several. None for a model that was loaded or made from parameters.
     via_points_ : tuple of ViaPoint
         Those that the skill passes through, see :meth:`with_via_points`.
     via_fade_ : float
@@ -473,16 +478,23 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators = processes.gather(based)[0]
         seen = DemonstratedPeaks(kinematics.joint_names)
         episodes: list[EpisodeSummary] = []
+        outlying: list[Outlying] = []
+
+        def leave_out(data: Tensor, time: Tensor) -> set[int]:
+            outlying.extend(outlying_rows(data, time, operators, kinematics))
+            return {one.episode for one in outlying}
+
         with RowFile() as file:
             gathered = gather_rows(
                 summarized(seen.watch(chain([head], walk)), kinematics, episodes),
                 operators, kinematics, file, processes,
                 responsibilities=self.responsibilities, holds=holds,
+                leave_out=leave_out if self.robust else None,
             )  # fmt: skip
             everyone = list(chain.from_iterable(processes.gather(episodes)))
-            shown = self._examine(everyone, operators, kinematics, processes.rank)
+            examined = self._examine(everyone, outlying, operators, kinematics, processes.rank)
             self._learn(gathered, operators, kinematics, checkpoint, holds)
-            self.shown_ = shown
+            self.shown_, self.demonstration_weights_ = examined
         return self._set_peaks(*seen.result(processes))
 
     def partial_fit(
@@ -1619,17 +1631,23 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def _examine(
         self,
         episodes: Sequence[EpisodeSummary],
+        outlying: Sequence[Outlying],
         operators: Sequence[Operator],
         kinematics: Kinematics,
         rank: int,
-    ) -> Shown:
-        """Act on what is implausible about demonstrations in batches; what they showed."""
+    ) -> tuple[Shown, Tensor]:
+        """The same of demonstrations in batches: what they showed, and their weights (M,)."""
         report = learning_report(
             episodes, operators, kinematics, self.covariance_type, self.covariance_shrinkage
         )
+        weights = torch.ones(len(episodes), dtype=torch.float64)
+        if outlying:
+            report = report.and_also(left_out(outlying, len(episodes)))
+            weights[[one.episode for one in outlying]] = 0.0
         if rank == 0 or report.errors() or self.plausibility == "error":
             report.act(self.plausibility, stacklevel=3)
-        return Shown.of(episodes, kinematics)
+        kept = [each for each, weight in zip(episodes, weights, strict=True) if weight > 0]
+        return Shown.of(kept, kinematics), weights
 
     def _examine_tick(self, now: Tensor, joints: Any, frames: Mapping[str, Frame]) -> None:
         """Act on what is implausible about a control tick, on behalf of who asks for it."""

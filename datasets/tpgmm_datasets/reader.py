@@ -20,8 +20,8 @@ from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError, summed_up
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.columns import EVENT
-from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
+from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range

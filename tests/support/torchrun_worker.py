@@ -61,6 +61,14 @@ def uneven(n: int = 5) -> list[Demonstration]:
     return [replace(d, time=d.time * (1 + 0.03 * i)) for i, d in enumerate(handlings(n))]
 
 
+def misplaced(n: int = 5, wrong: int = 3) -> list[Demonstration]:
+    """One of them with its cup in a wrong place."""
+    shown = handlings(n)
+    cup = Frame(shown[wrong].frames["cup"].position + 0.5)
+    shown[wrong] = replace(shown[wrong], frames={"cup": cup})
+    return shown
+
+
 def mixture(**settings) -> BlockGaussianMixture:
     defaults = {"n_components": 4, "blocks": BLOCKS, "tol": 0.0, "max_iter": 10}
     return BlockGaussianMixture(**{**defaults, "random_state": 0, **settings})
@@ -78,6 +86,7 @@ SKILLS = {
     "instants": (handlings, {}),
     "uneven": (uneven, {}),
     "points": (handlings, {"responsibilities": "point", "init_params": "kmeans"}),
+    "misplaced": (misplaced, {}),
 }
 
 
@@ -92,6 +101,11 @@ def learned(model) -> dict[str, torch.Tensor]:
     for j, (mean, covariance) in enumerate(zip(model.means_, model.covariances_, strict=True)):
         tensors |= {f"means.{j}": mean, f"covariances.{j}": covariance}
     return tensors
+
+
+def described(model: TaskParameterizedGMM) -> dict[str, torch.Tensor]:
+    """The same of a skill, with its time and what it was learned from."""
+    return learned(model) | {"grid": model.time_, "from": model.demonstration_weights_}
 
 
 def share(processes: Processes, X):
@@ -109,7 +123,7 @@ def equal(processes: Processes, folder: Path) -> None:
         found[name] = learned(mixture(**settings).fit(source, processes=processes))
     for name, (demonstrations, settings) in SKILLS.items():
         model = skill(**settings).fit(share(processes, demonstrations(5)), processes=processes)
-        found[name] = learned(model) | {"grid": model.time_}
+        found[name] = described(model)
     checkpoint = Checkpoint(folder / "em", every=2)
     mixture(max_iter=4).fit(
         share(processes, rows()), processes=processes, checkpoint=checkpoint
@@ -139,6 +153,7 @@ def refused(processes: Processes, folder: Path) -> None:
         "frames": lambda: skill().fit(
             handlings(3) if processes.rank == 0 else bare, processes=processes
         ),
+        "left": lambda: skill().fit(share(processes, misplaced(wrong=0)), processes=processes),
         "share": lambda: processes.share([1]),
     }
     for name, attempt in attempts.items():

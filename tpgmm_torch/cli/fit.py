@@ -133,8 +133,7 @@ def fit(
     robust: Annotated[
         bool,
         learning(
-            "Leave out episodes that are unlike the others where these agree, with a warning; "
-            "not with --batch-episodes."
+            "Leave out episodes that are unlike the others where these agree, with a warning."
         ),
     ] = True,
     keep_demonstrations: Annotated[

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -48,6 +48,31 @@ class RowFile(Rows):
     def make_constant(self, columns: NDArray[np.bool_], values: Batch) -> None:
         """From now on read ``values`` (n_features,) in the columns where the mask is set."""
         self._constant, self._values = columns, values
+
+    def keep(self, spans: Sequence[tuple[float, int, int]]) -> list[tuple[float, int, int]]:
+        """Forget all rows but those of some demonstrations, and what was made constant.
+
+        Parameters
+        ----------
+        spans : sequence of (float, int, int)
+            Anything, first row and end of each, in their order.
+
+        Returns
+        -------
+        list of (float, int, int)
+            Where they are now.
+        """
+        row_bytes, end, moved = self._width * self._dtype.itemsize, 0, []
+        for length, start, stop in spans:
+            self._file.seek(start * row_bytes)
+            content = self._file.read((stop - start) * row_bytes)
+            self._file.seek(end * row_bytes)
+            self._file.write(content)
+            moved.append((length, end, end + stop - start))
+            end += stop - start
+        self._file.truncate(end * row_bytes)
+        self.n_rows, self._constant = end, np.zeros(0, dtype=bool)
+        return moved
 
     def batches(self) -> Iterator[Batch]:
         """One pass over the file."""

@@ -21,9 +21,9 @@ from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.outliers import CONSISTENT
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import local_data
-from tpgmm_torch.training.training_rows import typical_time
+from tpgmm_torch.training.training_rows import at_phases, typical_time
 
-__all__ = ["Outlying", "left_out", "outlying_demonstrations"]
+__all__ = ["Outlying", "left_out", "outlying_demonstrations", "outlying_rows"]
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
@@ -94,8 +94,26 @@ def outlying_demonstrations(
         return ()
     time = typical_time(demonstrations)
     rows = local_data(demonstrations, operators, kinematics, holds=holds)
-    phase = torch.linspace(0, 1, len(time))
-    data = torch.stack([row[((len(row) - 1) * phase).round().long()] for row in rows])
+    data = torch.stack([at_phases(row, len(time)) for row in rows])
+    return outlying_rows(data, time, operators, kinematics)
+
+
+def outlying_rows(
+    data: Tensor, time: Tensor, operators: Sequence[Operator], kinematics: Kinematics
+) -> tuple[Outlying, ...]:
+    """The same of local data that are at hand.
+
+    Parameters
+    ----------
+    data : Tensor of shape (M, T, sum_j (1 + D_j))
+        Of M demonstrations, at equal phase.
+    time : Tensor of shape (T,)
+        Of a typical one.
+    operators : sequence of Operator
+    kinematics : Kinematics
+    """
+    if len(data) < FEWEST:
+        return ()
     step = float(time[-1] - time[0]) / max(len(time) - 1, 1)
     count = min(max(round(LONG / step), 1), len(time)) if step > 0 else 1
     found: dict[int, Outlying] = {}
@@ -107,7 +125,7 @@ def outlying_demonstrations(
             ratio, instant = float(ratios[episode, -1]), int(instants[episode, -1])
             if episode not in found or ratio > found[episode].ratio:
                 found[episode] = Outlying(episode, operator, float(time[instant]), ratio)
-    if len(found) > len(demonstrations) // 3:
+    if len(found) > len(data) // 3:
         return ()
     return tuple(found[episode] for episode in sorted(found))
 

@@ -6,12 +6,15 @@ file, or, where one responsibility is for an instant, a few points per instant.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.alignment.base import retime, steps_at
@@ -30,6 +33,8 @@ from tpgmm_torch.training.local_data import at_equal_phase, constant_columns, lo
 
 __all__ = [
     "LearningRows",
+    "LeaveOut",
+    "at_phases",
     "check_shares",
     "checked_batches",
     "gather_rows",
@@ -39,6 +44,16 @@ __all__ = [
     "split_batches",
     "typical_time",
 ]
+
+#: Duration [s], first row and end of a demonstration in a file.
+Span = tuple[float, int, int]
+#: Which demonstrations are not to be learned from, counted over all processes: of their local
+#: data (M, T, sum_j (1 + D_j)) at equal phase, and the time (T,) of a typical one.
+LeaveOut = Callable[[Tensor, Tensor], Collection[int]]
+#: Numbers that all demonstrations are compared by, those of all processes together,
+LARGEST_TABLE = 2**26
+#: but not at fewer instants than one in so many seconds.
+COARSEST = 0.25
 
 
 @dataclass(frozen=True)
@@ -259,6 +274,7 @@ def gather_rows(
     *,
     responsibilities: str = "auto",
     holds: Sequence[Hold] = (),
+    leave_out: LeaveOut | None = None,
 ) -> LearningRows:
     """Read all demonstrations once, and keep what a mixture learns from.
 
@@ -274,14 +290,17 @@ def gather_rows(
     responsibilities : {"auto", "instant", "point"}
     holds : sequence of Hold, default=()
         Objects that the robot held, the same in all processes.
+    leave_out : callable, optional
+        What is not to be learned from, see :data:`LeaveOut`; nothing is left out by default.
 
     Raises
     ------
     DataError
-        If ``responsibilities="instant"`` and the demonstrations have different time grids.
+        If a process has nothing left to learn from, or if ``responsibilities="instant"`` and
+        the demonstrations have different time grids.
     """
-    reference, expected = torch.empty(0), None
-    spans: list[tuple[float, int, int]] = []  # duration, first and last row of each
+    expected = None
+    spans: list[Span] = []
     aligned = True
     for batch in batches:
         if expected is None:
@@ -296,30 +315,84 @@ def gather_rows(
         ):
             spans.append((demonstration.duration, file.n_rows, file.n_rows + len(rows)))
             file.append(rows.cpu().numpy())
-            reference = reference if len(reference) else rows
     aligned = all(processes.gather(aligned))
-    reference = processes.gather(reference.cpu())[0].to(reference)
-    widths = [1 + operator.dimension(kinematics) for operator in operators]
-    moments = column_moments(file, processes)
-    constant = constant_columns(
-        torch.from_numpy(moments.smallest).to(reference),
-        torch.from_numpy(moments.largest).to(reference),
-        widths,
-        [bool(operator.rotation_vector_starts(kinematics)) for operator in operators],
-    )
-    file.make_constant(constant.cpu().numpy(), reference[0].cpu().numpy())
-    time = _typical_time(file, spans, processes).to(reference)
     if responsibilities == "instant":
         _check_aligned(aligned)
+    widths = [1 + operator.dimension(kinematics) for operator in operators]
+    turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
+    reference = _make_constant(file, spans, widths, turns, processes)
+    time = _typical_time(file, spans, processes)
+    if leave_out is not None:
+        kept = _kept(file, spans, time, processes, leave_out)
+        if sum(processes.gather(len(kept))) < sum(processes.gather(len(spans))):
+            spans = file.keep(kept)
+            reference = _make_constant(file, spans, widths, turns, processes)
+            time = _typical_time(file, spans, processes)
+    time = time.to(kinematics.lower)
     n_demonstrations = sum(processes.gather(len(spans)))
     if responsibilities == "point" or not aligned:
         return LearningRows(file, 1, time, n_demonstrations, processes)
-    instants = Instants(torch.where(constant, reference[0], reference).cpu().numpy(), widths)
+    instants = Instants(reference, widths)
     instants.add(file)
     points, size = instants.points(processes)
     own = processes.share(range(len(points) // size))
     share = StoredRows(points[own[0] * size : (own[-1] + 1) * size])
     return LearningRows(share, size, time, n_demonstrations, processes)
+
+
+def _make_constant(
+    file: RowFile,
+    spans: Sequence[Span],
+    widths: Sequence[int],
+    turns: Sequence[bool],
+    processes: Processes,
+) -> NDArray[np.float64]:
+    """Make constant what varies by rounding alone; the first demonstration of all (T, ...)."""
+    moments = column_moments(file, processes)
+    first = processes.gather(file.read(*spans[0][1:]))[0]
+    low, high = (
+        torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
+    )
+    constant = constant_columns(low, high, widths, turns).numpy()
+    file.make_constant(constant, first[0])
+    together: NDArray[np.float64] = np.where(constant, first[0], first)
+    return together
+
+
+def at_phases(rows: Tensor, count: int) -> Tensor:
+    """As many rows (count, ...) of one demonstration, at equal distances from first to last.
+
+    Parameters
+    ----------
+    rows : Tensor of shape (T, ...)
+    count : int
+    """
+    return rows[((len(rows) - 1) * torch.linspace(0, 1, count)).round().long()]
+
+
+def _kept(
+    file: RowFile,
+    spans: Sequence[Span],
+    time: Tensor,
+    processes: Processes,
+    leave_out: LeaveOut,
+) -> list[Span]:
+    """Those of the demonstrations of this process that are to be learned from."""
+    counts = processes.gather(len(spans))
+    width = file.read(0, 1).shape[1]
+    fewest = math.ceil(float(time[-1] - time[0]) / COARSEST) + 1
+    count = min(len(time), max(LARGEST_TABLE // (sum(counts) * width), fewest))
+    table = [at_phases(torch.from_numpy(file.read(*span)), count) for _, *span in spans]
+    everyone = processes.concatenate(torch.stack(table).double())
+    left = set(leave_out(everyone, at_phases(time, count)))
+    before = sum(counts[: processes.rank])
+    kept = [span for m, span in enumerate(spans, before) if m not in left]
+    if without := [rank for rank, n in enumerate(processes.gather(len(kept))) if n == 0]:
+        raise DataError(
+            f"all demonstrations of process(es) {without} are unlike the others and left out: "
+            "start fewer processes, or learn from all, robust=False"
+        )
+    return kept
 
 
 def _check_aligned(aligned: bool) -> None:
@@ -331,9 +404,7 @@ def _check_aligned(aligned: bool) -> None:
         )
 
 
-def _typical_time(
-    file: RowFile, spans: Sequence[tuple[float, int, int]], processes: Processes
-) -> Tensor:
+def _typical_time(file: RowFile, spans: Sequence[Span], processes: Processes) -> Tensor:
     """The time grid of the demonstration of median duration, of those of all processes."""
     everyone = [
         (duration, rank, start, stop)

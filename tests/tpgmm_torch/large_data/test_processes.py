@@ -43,7 +43,7 @@ def alone(name: str) -> dict[str, torch.Tensor]:
         if name in worker.SKILLS:
             demonstrations, settings = worker.SKILLS[name]
             model = worker.skill(**settings).fit(demonstrations(5))
-            return worker.learned(model) | {"grid": model.time_}
+            return worker.described(model)
         settings = worker.MIXTURES.get(name, {})
         return worker.learned(worker.mixture(**settings).fit(worker.rows()))
 
@@ -57,6 +57,10 @@ def test_two_processes_learn_what_one_learns(found, name):
     torch.testing.assert_close(found[0][name], alone(name), rtol=tolerance, atol=tolerance)
 
 
+def test_processes_leave_out_what_one_does(found):
+    assert found[0]["misplaced"]["from"].tolist() == [1, 1, 1, 0, 1]
+
+
 def test_bad_shares_are_refused_by_all_processes(tmp_path):
     done = torchrun(worker.__file__, "refused", tmp_path)
     assert done.returncode == 0, done.stderr
@@ -66,6 +70,7 @@ def test_bad_shares_are_refused_by_all_processes(tmp_path):
         "few": "n_components=9, but the data hold only 3 distinct",
         "none": "no demonstrations in process(es) [1] of 2",
         "frames": "process 1 has demonstrations with",
+        "left": "all demonstrations of process(es) [0] are unlike the others",
         "share": "1 episodes or batches cannot be shared among 2",
     }
     for name, message in expected.items():

@@ -50,3 +50,15 @@ def test_the_file_goes_with_the_block():
         file.append(ROWS)
     with pytest.raises(ValueError, match="closed"):
         file.read(0, 1)
+
+
+def test_rows_that_are_kept_move_up_and_are_as_written():
+    written = np.arange(24.0).reshape(8, 3)
+    with RowFile() as rows:
+        rows.append(written)
+        rows.make_constant(np.array([True, False, False]), np.full(3, 7.0))
+        assert rows.keep([(0.5, 1, 3), (1.5, 6, 8)]) == [(0.5, 0, 2), (1.5, 2, 4)]
+        assert rows.n_rows == 4
+        np.testing.assert_array_equal(next(rows.batches()), written[[1, 2, 6, 7]])
+        rows.append(written[:1])
+        np.testing.assert_array_equal(next(rows.batches()), written[[1, 2, 6, 7, 0]])

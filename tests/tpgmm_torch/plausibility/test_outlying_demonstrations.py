@@ -13,6 +13,7 @@ from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 from tpgmm_torch.model_selection import fit_folds
 from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.training import training_rows
 
 
 def misplaced(demonstration, shift=0.3):
@@ -117,11 +118,40 @@ def test_all_are_learned_from_if_asked():
         hands_model(plausibility="error").fit(shown)
 
 
-def test_batches_are_all_learned_from(tmp_path):
-    shown = handlings(6)
-    model = hands_model().fit([shown[:3], shown[3:]])
-    assert model.demonstration_weights_ is None
-    hands_model().fit(shown).save(tmp_path / "model")
+@pytest.mark.parametrize("wrong", [[5], [0, 6]])
+@pytest.mark.parametrize("longer", [0, 3])
+def test_batches_are_looked_at_together(wrong, longer):
+    shown = some_misplaced(8, wrong)
+    if longer:  # not on one grid: by points
+        time = torch.cat((shown[7].time, shown[7].time[-1] + shown[7].time[1 : 1 + longer]))
+        joints = torch.cat((shown[7].joints, shown[7].joints[-longer:]))
+        shown[7] = replace(shown[7], time=time, joints=joints)
+    told = [
+        rf"{len(wrong)} of 8 are unlike the others",
+        *(f"demonstration {i} " for i in wrong),
+    ]
+    with pytest.warns(PlausibilityWarning) as caught:
+        model = hands_model().fit([shown[:3], shown[3:4], shown[4:]])
+    said = str(caught.pop(PlausibilityWarning).message)
+    assert all(each in said for each in told)
+    weights = [float(i not in wrong) for i in range(8)]
+    assert model.demonstration_weights_.tolist() == weights
+    good = [one for one, weight in zip(shown, weights, strict=True) if weight]
+    rest = hands_model(robust=False, plausibility="ignore").fit([good[:4], good[4:]])
+    same(model, rest, 1e-9)
+    assert model.shown_ == rest.shown_
+
+
+def test_many_demonstrations_are_thinned_out(monkeypatch):
+    monkeypatch.setattr(training_rows, "LARGEST_TABLE", 1)
+    shown = some_misplaced(15, [3, 4, 11])
+    model = hands_model(plausibility="ignore").fit([shown[:7], shown[7:]])
+    assert (model.demonstration_weights_ == 0).nonzero()[:, 0].tolist() == [3, 4, 11]
+
+
+def test_weights_are_not_saved_with_a_model(tmp_path):
+    model = hands_model().fit(handlings(6))
+    model.save(tmp_path / "model")
     assert type(model).load(tmp_path / "model").demonstration_weights_ is None
 
 
