@@ -16,7 +16,7 @@ app = typer.Typer()
 
 serving = options.in_panel("Live")
 EXAMPLE = (
-    "Example: tpgmm view out/demo"
+    "Example: tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
     "\n\n"
     "Example: tpgmm view out/model --dataset out/demo/dataset --episodes 0:5 --live"
 )
@@ -48,8 +48,21 @@ def view(
         ),
     ] = None,
     situation: Annotated[
-        int, typer.Option(min=0, help="Which of the situations is shown, counted from 0.")
-    ] = 0,
+        list[int],
+        typer.Option(
+            min=0,
+            help="Which of the situations is shown, counted from 0; several side by side.",
+        ),
+    ] = [0],  # noqa: B006
+    shapes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--object",
+            metavar="FRAME=SHAPE",
+            help="What an object looks like: box:X,Y,Z, cylinder:RADIUS,LENGTH or "
+            "sphere:RADIUS in metres, at the origin of its frame; else a small box.",
+        ),
+    ] = None,
     frame: options.Frames = None,
     event: options.Events = None,
     episodes: options.Episodes = None,
@@ -79,9 +92,9 @@ def view(
 ) -> None:
     """Look at a motion in three dimensions.
 
-    Writes one HTML file that needs nothing else: the robot from its URDF, frames, demonstrated
+    Writes one HTML file that needs nothing else: the robot from its URDF, objects, demonstrated
     and reproduced paths, ellipsoids of two standard deviations along the path, a time line,
-    curves of stiffness and of each operator's share.
+    curves of stiffness, of each operator's share and of what is held.
     """
     import torch
 
@@ -89,7 +102,7 @@ def view(
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.viewing import LiveView, write_motion
+    from tpgmm_torch.viewing import LiveView, parse_shape, write_motion
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
@@ -110,24 +123,43 @@ def view(
         wanted = read_situations(situations, fitted.kinematics_.joint_names)
     else:
         wanted = [Situation.of(demonstration) for demonstration in demonstrations]
-    if situation >= len(wanted):
+    if (last := max(situation)) >= len(wanted):
         raise DataError(
-            f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
+            f"there are {len(wanted)} situations, counted from 0; got --situation {last}"
         )
+    objects = {}
+    for text in shapes or ():
+        name, _, shape = text.partition("=")
+        objects[name] = parse_shape(shape)
     if live:
         at: dict[str, Any] = {"host": host, "port": port}
         with (
             LiveView(
-                fitted, wanted, demonstrations, first=situation, meshes=meshes, fps=fps, **at
+                fitted,
+                wanted,
+                demonstrations,
+                objects=objects,
+                first=situation[0],
+                meshes=meshes,
+                fps=fps,
+                **at,
             ) as shown,
             suppress(KeyboardInterrupt),
         ):
             typer.echo(f"open {shown.url} in a browser; stop with Ctrl-C")
             shown.run()
         return
-    title = f"{model.resolve().name}, situation {situation}"
+    numbers = ", ".join(map(str, situation))
+    title = f"{model.resolve().name}, situation {numbers}"
     trajectory = write_motion(
-        place, fitted, wanted[situation], demonstrations, meshes=meshes, fps=fps, title=title
+        place,
+        fitted,
+        [wanted[number] for number in situation],
+        demonstrations,
+        objects=objects,
+        meshes=meshes,
+        fps=fps,
+        title=title,
     )
     seconds = float(trajectory.time[-1] - trajectory.time[0])
     typer.echo(f"{seconds:.1f} s of motion, {place.stat().st_size / 1e6:.1f} MB, in {place}")

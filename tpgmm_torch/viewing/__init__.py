@@ -7,6 +7,14 @@ anywhere; :class:`LiveView` serves the same scene, in which objects can be moved
 from tpgmm_torch.viewing.live import LiveView
 from tpgmm_torch.viewing.recording import write_motion
 from tpgmm_torch.viewing.scene import MotionScene, ellipsoids
-from tpgmm_torch.viewing.visuals import Shape, link_shapes
+from tpgmm_torch.viewing.visuals import Shape, link_shapes, parse_shape
 
-__all__ = ["LiveView", "MotionScene", "Shape", "ellipsoids", "link_shapes", "write_motion"]
+__all__ = [
+    "LiveView",
+    "MotionScene",
+    "Shape",
+    "ellipsoids",
+    "link_shapes",
+    "parse_shape",
+    "write_motion",
+]

@@ -98,7 +98,7 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     list of Panel
         The stiffness that ``Impedance(robot)`` gives the joints that turn, their mean; left
         out where none does, as of tracked poses. The :attr:`Candidate.share` of each operator,
-        the mean of all joints.
+        the mean of all joints. Whether an object is held, where any is.
     """
     time = as_array(trajectory.time - trajectory.time[0])
     panels = []
@@ -114,6 +114,17 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
         for (operator, candidate), color in zip(decided, cycle(OPERATORS), strict=False)
     ]
     panels.append(Panel("share of each operator, mean of the joints [%]", time, shares, 100.0))
+    if model.holds_:
+        skill = as_array(trajectory.time)
+        held = [
+            Curve(
+                f"{hold.frame} by {hold.link}",
+                color,
+                ((hold.begin <= skill) & (skill <= hold.end)).astype(float),
+            )
+            for hold, color in zip(model.holds_, cycle(OPERATORS), strict=False)
+        ]
+        panels.append(Panel("held", time, held, 1.0))
     return panels
 
 

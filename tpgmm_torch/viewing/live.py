@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +21,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.viewing.curves import Panel, motion_panels
 from tpgmm_torch.viewing.recording import viser_server
 from tpgmm_torch.viewing.scene import MotionScene
+from tpgmm_torch.viewing.visuals import Shape
 
 __all__ = ["LiveView"]
 
@@ -41,7 +42,7 @@ class LiveView:
     ----------
     model, situations : TaskParameterizedGMM, sequence of Situation
         What to reproduce, and for what; fitted, with a robot or with tracked poses.
-    demonstrations, meshes : sequence of Demonstration, Path
+    demonstrations, objects, meshes : sequence of Demonstration, mapping, Path
         As for :class:`MotionScene`.
     first : int, default=0
         Which of the situations is shown first.
@@ -80,6 +81,7 @@ class LiveView:
         situations: Sequence[Situation],
         demonstrations: Sequence[Demonstration] = (),
         *,
+        objects: Mapping[str, Shape] | None = None,
         meshes: Path | None = None,
         first: int = 0,
         fps: float = 25.0,
@@ -96,7 +98,7 @@ class LiveView:
         with ExitStack() as stack:
             server = stack.enter_context(viser_server(host, port))
             self.scene = MotionScene(
-                server, model, demonstrations, meshes, fps, on_drag=self.move_frame
+                server, model, demonstrations, meshes, fps, self.move_frame, objects=objects
             )
             self.url = f"http://{host}:{server.get_port()}"
             self._add_controls(server.gui, first)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,14 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.viewing.curves import as_html, motion_panels
 from tpgmm_torch.viewing.scene import COLORS, STANDARD_DEVIATIONS, MotionScene
+from tpgmm_torch.viewing.visuals import Shape
 
 __all__ = ["viser_server", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
+#: Distance of situations that are shown side by side, in a scene of size 1.
+APART = 0.9
 #: The page is light in any browser. On a narrow one the curves go above the legend.
 STYLE = """
 #legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
@@ -43,9 +46,10 @@ border-bottom:1px solid currentColor}
 def write_motion(
     path: str | Path,
     model: TaskParameterizedGMM,
-    situation: Situation,
+    situation: Situation | Sequence[Situation],
     demonstrations: Sequence[Demonstration] = (),
     *,
+    objects: Mapping[str, Shape] | None = None,
     meshes: Path | None = None,
     fps: float = 25.0,
     title: str = "tpgmm",
@@ -58,9 +62,12 @@ def write_motion(
     ----------
     path : str or Path
         The file; replaced if it exists.
-    model, situation : TaskParameterizedGMM, Situation
-        What to reproduce, and for what; fitted, with a robot or with tracked poses.
-    demonstrations, meshes, fps : sequence of Demonstration, Path, float
+    model : TaskParameterizedGMM
+        Fitted, with a robot or with tracked poses.
+    situation : Situation or sequence of Situation
+        For what to reproduce the skill; several are shown side by side, and the curves are of
+        the first.
+    demonstrations, objects, meshes, fps : sequence of Demonstration, mapping, Path, float
         As for :class:`MotionScene`.
     title : str, default="tpgmm"
         Of the page.
@@ -68,7 +75,7 @@ def write_motion(
     Returns
     -------
     Trajectory
-        What the file shows.
+        What the file shows, of the first situation.
 
     Raises
     ------
@@ -76,11 +83,26 @@ def write_motion(
         If viser is not installed, or the model has no links that can be drawn.
     """
     with viser_server("127.0.0.1", 0) as server:
-        scene = MotionScene(server, model, demonstrations, meshes, fps)
-        trajectory = scene.show(situation)
+        situations = [situation] if isinstance(situation, Situation) else list(situation)
+        first = MotionScene(server, model, demonstrations, meshes, fps, objects=objects)
+        trajectory, scenes = first.show(situations[0]), [first]
+        for number, other in enumerate(situations[1:], start=1):
+            aside = (0.0, number * APART * first.size, 0.0)
+            scene = MotionScene(
+                server, model, demonstrations, meshes, fps, objects=objects,
+                root=f"/{number}", origin=aside,
+            )  # fmt: skip
+            scene.show(other)
+            scenes.append(scene)
+        for number, scene in enumerate(scenes if len(scenes) > 1 else ()):
+            server.scene.add_label(f"{scene.root}/number", f"{number + 1} of {len(scenes)}")
+        _look_at_all(server.initial_camera, len(scenes), APART * first.size)
         recording = server.get_scene_serializer()
-        for picture, pause in enumerate([*np.diff(scene.time), PAUSE]):
-            scene.move_to(picture)
+        clock = max((scene.time - scene.time[0] for scene in scenes), key=lambda t: t[-1])
+        for now, pause in zip(clock, [*np.diff(clock), PAUSE], strict=True):
+            for scene in scenes:
+                picture = np.searchsorted(scene.time - scene.time[0], now - 1e-9)
+                scene.move_to(min(int(picture), len(scene.time) - 1))
             recording.insert_sleep(float(pause))
         page = recording.as_html()
     curves = as_html(motion_panels(model, trajectory))
@@ -88,6 +110,14 @@ def write_motion(
     with replacing(path) as new:
         new.write_text(_entitled(page, title, legend), encoding="utf-8")
     return trajectory
+
+
+def _look_at_all(camera: Any, n_scenes: int, distance: float) -> None:
+    """Move a camera that sees one of scenes that stand beside one another along y."""
+    away = np.asarray(camera.position) - np.asarray(camera.look_at)
+    aside = np.array([0.0, (n_scenes - 1) * distance / 2, 0.0])
+    camera.look_at = np.asarray(camera.look_at) + aside
+    camera.position = np.asarray(camera.look_at) + away * (1 + 0.5 * (n_scenes - 1))
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import RobotState
-from tpgmm_torch.viewing.visuals import Shape, whole_body
+from tpgmm_torch.viewing.visuals import OBJECT_COLOR, OBJECT_OPACITY, Shape, whole_body
 
 __all__ = ["COLORS", "STANDARD_DEVIATIONS", "MotionScene", "ellipsoids"]
 
@@ -31,8 +33,10 @@ COLORS = {
 }
 #: Half axes of the ellipsoids, in standard deviations.
 STANDARD_DEVIATIONS = 2.0
-#: Ellipsoids along a path, and pieces of a demonstrated path.
-ELLIPSOIDS, PIECES = 40, 150
+#: Ellipsoids along a path, and points of a path, of reproductions and demonstrations.
+ELLIPSOIDS, POINTS, DEMONSTRATED_POINTS = 40, 400, 200
+#: Edge of the box that stands for an object of no other shape, in a scene of size 1.
+EDGE = 0.06
 #: Half axes of ellipsoids that would be too thin to be drawn [m].
 THINNEST = 5e-4
 
@@ -55,6 +59,12 @@ class MotionScene:
     on_drag : callable, optional
         Makes frames that stand still movable by hand: called with the name of one and its new
         pose, a :class:`Frame`, when it is let go.
+    objects : mapping of str to Shape, optional
+        What the objects look like, by the name of their frame; a small box stands for others.
+    root : str, optional
+        Begins the path of all that is drawn, where several scenes share a server: "/second".
+    origin : sequence of float, optional
+        Where it is drawn, x, y, z [m].
 
     Attributes
     ----------
@@ -63,6 +73,9 @@ class MotionScene:
     frames : dict of str to viser.SceneNodeHandle
         The objects that are shown.
     server : viser.ViserServer
+    root : str
+    size : float
+        Diagonal of what is drawn [m]; 0 before :meth:`show`.
 
     Raises
     ------
@@ -78,6 +91,10 @@ class MotionScene:
         meshes: Path | None = None,
         fps: float = 25.0,
         on_drag: Callable[[str, Frame], None] | None = None,
+        *,
+        objects: Mapping[str, Shape] | None = None,
+        root: str = "",
+        origin: Sequence[float] = (0.0, 0.0, 0.0),
     ) -> None:
         kinematics = model.kinematics_
         if not kinematics.links:
@@ -86,7 +103,15 @@ class MotionScene:
                 "motion, fit it with a robot and links (tpgmm fit --robot URDF --link NAME)"
             )
         self.server, self._scene, self._model = server, server.scene, model
-        self._fps, self._on_drag = fps, on_drag
+        self._fps, self._on_drag, self.root, self.size = fps, on_drag, root, 0.0
+        self._objects = dict(objects or {})
+        if missing := self._objects.keys() - set(model.frame_names_):
+            raise DataError(
+                f"there are shapes for {sorted(missing)}, but the model's frames are "
+                f"{list(model.frame_names_)}"
+            )
+        if root:
+            self._scene.add_frame(root, show_axes=False, position=tuple(origin))
         self._of_interest = kinematics.links
         self._body, self._shapes = whole_body(kinematics, meshes)
         self._demonstrations = [one.reordered(kinematics.joint_names) for one in demonstrations]
@@ -104,13 +129,20 @@ class MotionScene:
         self.time = as_array(trajectory.time)[steps]
         self._link_poses = _poses(state.positions, state.orientations)  # (F, L, 7)
         frames = situation.frames_at(trajectory.time.cpu())
+        self._still = {name for name, frame in frames.items() if not frame.batch_shape}
         self._frame_poses = {name: _poses_at(f, steps) for name, f in frames.items()}
+        for hold in self._model.holds_:
+            if hold.frame in self._still:
+                carried = _carried(hold, frames[hold.frame], state, self.time)
+                self._frame_poses[hold.frame] = carried
         if not self._links:
             self._set_up()
+        every = self._body.state(trajectory.joints.cpu())
         few = np.linspace(0, len(steps) - 1, min(ELLIPSOIDS, len(steps))).astype(int)
         for link in self._of_interest:
             path = as_array(state.position(link))
-            self._draw_paths("reproduction", link, [path], thickness=3.5)
+            smooth = _smooth(trajectory.time, as_array(every.position(link)), POINTS)
+            self._draw_paths("reproduction", link, [smooth], thickness=3.5)
             half_axes, turns = ellipsoids(state[few], covariance[few], link)
             self._draw_ellipsoids(link, path[few], as_array(half_axes), as_array(turns))
         self._replace_frames()
@@ -148,10 +180,17 @@ class MotionScene:
         action += [poses[..., :3] for poses in self._frame_poses.values()]
         low, high = _bounds(action)
         ground, top = _bounds([self._link_poses[..., :3], low, high])
-        self._size = size = max(float(np.linalg.norm(top - ground)), 0.1)
+        self.size = size = max(float(np.linalg.norm(top - ground)), 0.1)
         # mostly at the action, a little at the robot
         middle = 0.6 * (low + high) / 2 + 0.4 * (ground + top) / 2
         distance = max(2.1 * float(np.linalg.norm(high - low)), 1.1 * size)
+        if not self.root:
+            self._set_view(middle, distance, size, float(ground[2]))
+        self._draw_robot()
+        self._draw_demonstrations()
+
+    def _set_view(self, middle: Array, distance: float, size: float, ground: float) -> None:
+        """Camera, lights and floor."""
         camera = self.server.initial_camera
         camera.look_at = middle
         camera.position = middle + distance * np.array([0.8, 0.5, 0.35])
@@ -165,14 +204,14 @@ class MotionScene:
             section_size=10 * cell,
             cell_color=(225, 225, 225),
             section_color=(190, 190, 190),
-            position=(*np.round(middle[:2] / cell) * cell, ground[2] - 0.02 * size),
+            position=(*np.round(middle[:2] / cell) * cell, ground - 0.02 * size),
         )
-        self._draw_robot()
-        self._draw_demonstrations()
 
     def _draw_robot(self) -> None:
         for link in self._body.links:
-            handle = self._axes(f"/robot/{_node(link)}", 0.04, link in self._of_interest)
+            handle = self._axes(
+                f"{self.root}/robot/{_node(link)}", 0.04, link in self._of_interest
+            )
             self._links.append(handle)
             for number, shape in enumerate(self._shapes.get(link, ())):
                 _add_solid(self._scene, f"{handle.name}/{number}", shape)
@@ -180,17 +219,20 @@ class MotionScene:
     def _draw_demonstrations(self) -> None:
         """Paths, and where objects stood, small: why paths differ."""
         for index, link in enumerate(self._of_interest if self._demonstrated else ()):
-            paths = [path[_spread(len(path), PIECES), index] for path in self._demonstrated]
+            paths = [
+                _smooth(one.time, path[:, index], DEMONSTRATED_POINTS)
+                for one, path in zip(self._demonstrations, self._demonstrated, strict=True)
+            ]
             self._draw_paths("demonstrations", link, paths, thickness=1.2)
         for name in self._demonstrations[0].frames if self._demonstrations else ():
             frames = [one.frames[name] for one in self._demonstrations]
             poses = np.stack([_poses_at(frame, torch.tensor([0]))[0] for frame in frames])
             self._scene.add_batched_axes(
-                f"/demonstrations/{_node(name)}",
+                f"{self.root}/demonstrations/{_node(name)}",
                 batched_wxyzs=poses[:, 3:],
                 batched_positions=poses[:, :3],
-                axes_length=0.025 * self._size,
-                axes_radius=0.0012 * self._size,
+                axes_length=0.025 * self.size,
+                axes_radius=0.0012 * self.size,
             )
 
     def _draw_paths(
@@ -198,7 +240,7 @@ class MotionScene:
     ) -> None:
         pieces = [np.stack((path[:-1], path[1:]), axis=1) for path in paths]
         self._scene.add_line_segments(
-            f"/{kind}/{_node(link)}",
+            f"{self.root}/{kind}/{_node(link)}",
             points=np.concatenate(pieces),
             colors=COLORS[kind],
             thickness=thickness,
@@ -210,7 +252,7 @@ class MotionScene:
     ) -> None:
         vertices, faces = _unit_sphere()
         self._scene.add_batched_meshes_simple(
-            f"/covariance/{_node(link)}",
+            f"{self.root}/covariance/{_node(link)}",
             vertices,
             faces,
             batched_positions=centres,
@@ -229,25 +271,28 @@ class MotionScene:
             self.frames.pop(name).remove()
         for name, poses in self._frame_poses.items():
             if name not in self.frames:
-                self.frames[name] = self._add_frame(name, moves=len(poses) > 1)
+                self.frames[name] = self._add_frame(name, moves=name not in self._still)
             _place(self.frames[name], poses[0])
 
     def _add_frame(self, name: str, moves: bool) -> Any:
-        path, drag = f"/frames/{_node(name)}", self._on_drag
+        path, drag = f"{self.root}/frames/{_node(name)}", self._on_drag
         if drag is None or moves:
             handle = self._axes(path, 0.09)
         else:
             handle = self._scene.add_transform_controls(
-                path, scale=0.12 * self._size, disable_sliders=True
+                path, scale=0.12 * self.size, disable_sliders=True
             )
             self._axes(f"{path}/axes", 0.09)
             handle.on_update(partial(_let_go, drag, name))
         self._scene.add_label(f"{path}/label", name)
+        edges = (EDGE * self.size,) * 3
+        unknown = Shape("box", edges, np.eye(4), OBJECT_COLOR, OBJECT_OPACITY)
+        _add_solid(self._scene, f"{path}/shape", self._objects.get(name, unknown))
         return handle
 
     def _axes(self, path: str, length: float, show: bool = True) -> Any:
         """Axes of a length, and of the radius that goes with it, for a scene of size 1."""
-        length *= self._size
+        length *= self.size
         return self._scene.add_frame(
             path, show, axes_length=length, axes_radius=0.03 * length, origin_radius=0.0
         )
@@ -271,8 +316,26 @@ def _bounds(points: Sequence[Array]) -> tuple[Array, Array]:
     return rows.min(axis=0), rows.max(axis=0)
 
 
-def _spread(length: int, most: int) -> NDArray[np.int64]:
-    return np.linspace(0, length - 1, min(length, most + 1)).astype(np.int64)
+def _smooth(time: Tensor, path: Array, points: int) -> Array:
+    """A path (T, 3) at so many evenly spaced instants, by a cubic spline through all of it."""
+    if len(path) < 2:
+        return path[[0, 0]]
+    instants = as_array(time)
+    spline = CubicSpline(instants, path)
+    return np.asarray(spline(np.linspace(instants[0], instants[-1], points)))
+
+
+def _carried(hold: Hold, frame: Frame, state: RobotState, time: Array) -> Array:
+    """Poses (F, 7) of an object that stands at a frame until a link takes it along."""
+    link = Frame(state.position(hold.link), state.orientation(hold.link))
+    poses = np.tile(_poses_at(frame, torch.zeros(0)), (len(time), 1))
+    [held] = np.nonzero((time >= hold.begin) & (time <= hold.end))
+    if len(held):
+        in_link = frame.seen_from(link[int(held[0])])
+        moved = link[torch.from_numpy(held)].compose(in_link.expand((len(held),)))
+        poses[held] = _poses(moved.position, moved.orientation)
+        poses[held[-1] :] = poses[held[-1]]
+    return poses
 
 
 def _poses(positions: Tensor, orientations: Tensor) -> Array:

@@ -23,7 +23,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfModel, placement, read_urdf
 
-__all__ = ["Color", "Shape", "link_shapes", "whole_body"]
+__all__ = ["Color", "Shape", "link_shapes", "parse_shape", "whole_body"]
 
 Color = tuple[int, int, int]
 
@@ -57,6 +57,44 @@ class Shape:
     color: Color = DEFAULT_COLOR
     opacity: float = 1.0
     file: Path | None = None
+
+
+#: Of objects, and how many numbers say how large a solid is.
+OBJECT_COLOR: Color = (230, 159, 0)
+OBJECT_OPACITY = 0.6
+SIZES: Mapping[str, int] = {"box": 3, "cylinder": 2, "sphere": 1}
+
+
+def parse_shape(text: str) -> Shape:
+    """An object's shape from text, about the origin of its frame.
+
+    Parameters
+    ----------
+    text : str
+        ``"box:0.1,0.1,0.2"``, edges; ``"cylinder:0.04,0.2"``, radius and length along z;
+        ``"sphere:0.05"``, radius [m].
+
+    Raises
+    ------
+    DataError
+        If it is none of these.
+
+    Examples
+    --------
+    >>> parse_shape("cylinder:0.04,0.2").size
+    (0.04, 0.2)
+    """
+    kind, _, numbers = text.partition(":")
+    try:
+        size = tuple(float(number) for number in numbers.split(","))
+    except ValueError:
+        size = ()
+    if len(size) != SIZES.get(kind) or not all(0 < edge < math.inf for edge in size):
+        raise DataError(
+            "a shape is box:X,Y,Z, cylinder:RADIUS,LENGTH or sphere:RADIUS in metres, got "
+            f"{text!r}"
+        )
+    return Shape(kind, size, np.eye(4), OBJECT_COLOR, OBJECT_OPACITY)  # type: ignore[arg-type]
 
 
 def link_shapes(model: UrdfModel, meshes: Path | None = None) -> dict[str, list[Shape]]:

@@ -38,6 +38,16 @@ def test_view_shows_what_the_demo_wrote(demo):
     )
 
 
+def test_view_shows_situations_side_by_side_and_objects(demo, tmp_path):
+    out = tmp_path / "m.html"
+    arguments = "--situation", 0, "--situation", 1, "--object", "bottle=sphere:0.07"
+    output("view", demo, "--fps", 1, *arguments, "--out", out)
+    recording = Recording(out)
+    assert "situation 0, 1" in recording.page
+    for root in ("", "/1"):
+        assert recording.props(f"{root}/frames/bottle/shape")["radius"] == 0.07
+
+
 def test_view_takes_situations_from_a_file(demo, tmp_path):
     joints = skills.few_bottles()[0].joints[0].tolist()
     frames = {"bottle": {"position": [0.3, 0, 0.15]}}
@@ -50,6 +60,8 @@ def test_view_takes_situations_from_a_file(demo, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
+        ((".", "--object", "bottle"), "a shape is box:X,Y,Z"),
+        ((".", "--object", "mug=sphere:0.1"), "there are shapes for ['mug']"),
         (("model",), "give --dataset DATASET or --situations FILE.json"),
         ((".", "--situation", 2), "there are 2 situations, counted from 0; got --situation 2"),
         ((".", "--out", "motion.mp4"), "--out ends in .html, got 'motion.mp4'"),

@@ -1,5 +1,6 @@
 """Curves beside the scene: the numbers in the page are those of the model."""
 
+import copy
 import re
 from dataclasses import replace
 
@@ -7,7 +8,7 @@ import numpy as np
 import torch
 
 from tests.support import skills
-from tpgmm_torch import Impedance, Robot, Situation
+from tpgmm_torch import Hold, Impedance, Robot, Situation
 from tpgmm_torch.viewing.curves import motion_panels
 
 #: The joints of :func:`skills.waves`, of which the first slides.
@@ -47,6 +48,19 @@ def test_the_page_draws_the_stiffness_that_is_asked_for_and_the_operators_shares
     np.testing.assert_allclose(sum(shares)[:, 1], 100, rtol=1e-4)
     for text in ("[N m/rad]", "position:l_hand@bottle + ", "> canonical<"):
         assert recording.page.count(text) == 1
+
+
+def test_a_panel_says_when_an_object_is_held(bottle):
+    _, trajectory, _ = bottle
+    model = copy.copy(skills.small_bottle())
+    assert "held" not in [panel.title for panel in motion_panels(model, trajectory)]
+    model.holds_ = (Hold("bottle", "l_hand", 5.0, 9.0),)
+    held = motion_panels(model, trajectory)[-1]
+    [curve] = held.curves
+    assert curve.label == "bottle by l_hand"
+    within = (trajectory.time >= 5) & (trajectory.time <= 9)
+    np.testing.assert_array_equal(curve.values, within)
+    assert 0 < curve.values.sum() < len(curve.values)
 
 
 def test_drawings_show_all_of_each_curve(bottle):

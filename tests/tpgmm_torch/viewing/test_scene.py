@@ -1,5 +1,6 @@
 """What is drawn is where the data and the kinematics put it."""
 
+import copy
 import re
 
 import numpy as np
@@ -10,10 +11,10 @@ from scipy.stats import chi2
 from tests.support import skills
 from tests.support.recordings import FPS, Recording
 from tests.support.worlds import upper_body
-from tpgmm_torch import Robot, Situation, quaternions
+from tpgmm_torch import Frame, Hold, Robot, Situation, quaternions
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import read_urdf
-from tpgmm_torch.viewing import ellipsoids, write_motion
+from tpgmm_torch.viewing import ellipsoids, parse_shape, write_motion
 
 
 def steps(trajectory):
@@ -43,11 +44,18 @@ def test_every_link_of_the_robot_is_where_its_joints_put_it(bottle):
 
 def test_paths_and_frames_are_those_of_the_data(bottle):
     recording, trajectory, _ = bottle
-    chosen, _ = steps(trajectory)
-    path = upper_body().state(trajectory.joints[chosen]).position("r_hand")
+    path = upper_body().state(trajectory.joints).position("r_hand")
     drawn = recording.props("/reproduction/r_hand")["points"].reshape(-1, 2, 3)
-    np.testing.assert_allclose(drawn[:, 0], path[:-1], atol=1e-6)
-    np.testing.assert_allclose(drawn[:, 1], path[1:], atol=1e-6)
+    assert len(drawn) >= 200
+    np.testing.assert_array_equal(drawn[1:, 0], drawn[:-1, 1])
+    np.testing.assert_allclose(drawn[[0, -1], [0, 1]], path[[0, -1]], atol=1e-6)
+    # it goes through every time step, and around corners
+    gaps = torch.cdist(path, torch.tensor(drawn[:, 0]).double()).min(dim=1).values
+    steps_of_path = path.diff(dim=0).norm(dim=-1)
+    assert float(gaps.max()) < 0.1 * float(steps_of_path.max())
+    turns = np.diff(drawn[:, 1] - drawn[:, 0], axis=0)
+    chords = np.diff(path, n=2, axis=0)
+    assert np.linalg.norm(turns, axis=1).max() < 0.1 * np.linalg.norm(chords, axis=1).max()
     demonstrations = skills.few_bottles()
     shown = recording.props("/demonstrations/l_hand")["points"].reshape(-1, 2, 3)
     expected = [upper_body().state(one.joints).position("l_hand") for one in demonstrations]
@@ -104,6 +112,65 @@ def test_tracked_poses_and_moving_frames_are_shown_too(tmp_path):
         np.testing.assert_allclose(recording.pose("/frames/cup", at)[:3], position, atol=2e-5)
     assert "demonstrations" not in recording.page.rpartition("<b>tpgmm</b>")[2]
     assert not any(node.startswith("/demonstrations") for node in recording.nodes)
+
+
+def test_objects_have_the_shapes_that_were_given_and_go_with_their_frame(tmp_path):
+    model = skills.hands_model().fit(skills.handlings(moves=True))
+    situation, _ = skills.new_handling(moves=True)
+    shape = parse_shape("cylinder:0.03,0.2")
+    write_motion(tmp_path / "m.html", model, situation, objects={"cup": shape}, fps=5)
+    recording = Recording(tmp_path / "m.html")
+    drawn = recording.props("/frames/cup/shape")  # below the frame's node: it moves with it
+    assert (drawn["radius"], drawn["height"]) == (0.03, 0.2)
+    write_motion(tmp_path / "m.html", model, situation, fps=5)
+    edges = Recording(tmp_path / "m.html").props("/frames/cup/shape")["dimensions"]
+    assert len(set(edges)) == 1
+    with pytest.raises(DataError, match=r"shapes for \['mug'\].*\['cup'\]"):
+        write_motion(tmp_path / "m.html", model, situation, objects={"mug": shape})
+
+
+def test_what_is_held_goes_with_the_hand_and_stays_where_it_is_put(tmp_path):
+    model = copy.copy(skills.small_bottle())
+    model.holds_ = (Hold("bottle", "l_hand", 5.0, 9.0),)
+    one = skills.few_bottles()[1]
+    situation = Situation(one.joints[0], one.frames)
+    trajectory = write_motion(tmp_path / "m.html", model, situation, fps=5)
+    recording = Recording(tmp_path / "m.html")
+    state = upper_body().state(trajectory.joints)
+    hand = Frame(state.position("l_hand"), state.orientation("l_hand"))
+    seen = {}
+    for at in (0.0, 3.0, 6.0, 8.0, 10.0, 12.0):
+        pose = recording.pose("/frames/bottle", at)
+        seen[at] = Frame(pose[:3], pose[3:])
+    start = one.frames["bottle"]
+    for at in (0.0, 3.0):
+        np.testing.assert_allclose(seen[at].position, start.position, atol=1e-5)
+    assert float((seen[8.0].position - start.position).norm()) > 0.02
+    np.testing.assert_allclose(seen[12.0].position, seen[10.0].position, atol=1e-5)
+    in_hand = {}
+    for at in (6.0, 8.0):
+        shown = int((trajectory.time - trajectory.time[0] < at - 1e-6).sum())
+        in_hand[at] = seen[at].seen_from(hand[shown])
+    np.testing.assert_allclose(in_hand[6.0].position, in_hand[8.0].position, atol=1e-3)
+
+
+def test_situations_stand_side_by_side_and_move_at_once(tmp_path):
+    model, shown = skills.small_bottle(), skills.few_bottles()[:2]
+    situations = [Situation(one.joints[0], one.frames) for one in shown]
+    write_motion(tmp_path / "m.html", model, situations, fps=2)
+    recording = Recording(tmp_path / "m.html")
+    np.testing.assert_allclose(recording.pose("/1", 0.0)[[0, 2]], 0)
+    assert recording.pose("/1", 0.0)[1] > 0.5
+    for root, one in zip(("", "/1"), shown, strict=True):
+        position = one.frames["bottle"].position
+        np.testing.assert_allclose(
+            recording.pose(f"{root}/frames/bottle", 0.0)[:3], position, atol=1e-6
+        )
+    [alone] = model.predict([situations[1]])
+    hand = upper_body().state(alone.joints[-1]).position("l_hand")
+    np.testing.assert_allclose(
+        recording.pose("/1/robot/l_hand", recording.duration)[:3], hand, atol=2e-5
+    )
 
 
 def test_joints_alone_have_nothing_to_show(tmp_path):

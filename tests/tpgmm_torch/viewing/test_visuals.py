@@ -9,7 +9,7 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Poses, Robot
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.urdf import read_urdf
-from tpgmm_torch.viewing import link_shapes
+from tpgmm_torch.viewing import link_shapes, parse_shape
 from tpgmm_torch.viewing.visuals import whole_body
 
 TRIANGLE = """solid one
@@ -147,3 +147,20 @@ def test_of_tracked_poses_only_the_poses_are_seen():
     hands = Poses(("left", "right"), dtype=torch.float32)
     body, drawn = whole_body(hands)
     assert (body.links, body.lower.dtype, drawn) == (hands.links, torch.float64, {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "box", "box:1,2", "sphere:1,2", "cone:1,2", "sphere:-1", "sphere:nan", "box:a,b,c"],
+)
+def test_a_shape_that_is_none_is_refused(text):
+    with pytest.raises(DataError, match="a shape is box:X,Y,Z"):
+        parse_shape(text)
+
+
+def test_a_shape_is_read_from_text():
+    assert (parse_shape("box:0.1,0.2,3").kind, parse_shape("box:0.1,0.2,3").size) == (
+        "box",
+        (0.1, 0.2, 3.0),
+    )
+    assert parse_shape("sphere:0.05").size == (0.05,)
