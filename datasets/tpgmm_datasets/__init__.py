@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tpgmm_datasets.description import DatasetInfo, describe_lerobot
     from tpgmm_datasets.episode_batches import EpisodeBatches
     from tpgmm_datasets.errors import CHECKS, DatasetError, DatasetWarning
+    from tpgmm_datasets.motors import MotorMap, estimate_motor_map
     from tpgmm_datasets.reader import iter_lerobot, load_lerobot
     from tpgmm_datasets.units import Scale
     from tpgmm_datasets.writer import save_lerobot
@@ -26,8 +27,10 @@ __all__ = [
     "EpisodeBatches",
     "FramePose",
     "LinkPose",
+    "MotorMap",
     "Scale",
     "describe_lerobot",
+    "estimate_motor_map",
     "iter_lerobot",
     "load_lerobot",
     "resample",
@@ -41,6 +44,7 @@ _HOMES = {
     "description": ("DatasetInfo", "describe_lerobot"),
     "episode_batches": ("EpisodeBatches",),
     "errors": ("CHECKS", "DatasetError", "DatasetWarning"),
+    "motors": ("MotorMap", "estimate_motor_map"),
     "reader": ("iter_lerobot", "load_lerobot"),
     "units": ("Scale",),
     "writer": ("save_lerobot",),

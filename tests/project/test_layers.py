@@ -40,7 +40,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("errors",),
         ("names",),
         ("units", "robots"),
-        ("lerobot",),
+        ("lerobot", "motors"),
         ("conversion",),
         ("description", "reader", "writer"),
         ("episode_batches", "signals"),
