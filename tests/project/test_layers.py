@@ -67,6 +67,7 @@ LATE = {
     "mujoco",
     "pandas",
     "pyarrow",
+    "rerun",
     "tpgmm_datasets",
     "trimesh",
     "viser",

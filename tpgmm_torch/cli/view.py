@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -14,6 +14,7 @@ __all__ = ["app"]
 
 app = typer.Typer()
 
+SUFFIXES = {"html": ".html", "rerun": ".rrd"}
 serving = options.in_panel("Live")
 EXAMPLE = (
     "Example: tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
@@ -34,8 +35,12 @@ def view(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.html", help="Where the page goes; default DIR.html."),
+        typer.Option(metavar="FILE", help="Where it goes; default DIR.html or DIR.rrd."),
     ] = None,
+    form: Annotated[
+        Literal["html", "rerun"],
+        typer.Option("--format", help="A page, or a Rerun recording (.rrd) of the same."),
+    ] = "html",
     dataset: Annotated[
         str | None,
         typer.Option(help="A LeRobot data set: demonstrated paths, and their situations."),
@@ -94,7 +99,8 @@ def view(
 
     Writes one HTML file that needs nothing else: the robot from its URDF, objects, demonstrated
     and reproduced paths, ellipsoids of two standard deviations along the path, a time line,
-    curves of stiffness, of each operator's share and of what is held.
+    curves of stiffness, of each operator's share and of what is held. With --format rerun,
+    the same as a recording for Rerun's viewer.
     """
     import torch
 
@@ -102,13 +108,16 @@ def view(
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.viewing import LiveView, parse_shape, write_motion
+    from tpgmm_torch.viewing import LiveView, parse_shape, write_motion, write_rerun
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    where, place = model, out or Path(f"{model}.html")
-    if place.suffix != ".html":
-        raise DataError(f"--out ends in .html, got {str(place)!r}")
+    suffix = SUFFIXES[form]
+    where, place = model, out or Path(f"{model}{suffix}")
+    if place.suffix != suffix:
+        raise DataError(f"--out ends in {suffix}, got {str(place)!r}")
+    if form == "rerun" and (live or len(situation) > 1):
+        raise DataError("--format rerun records one situation, and nothing is served")
     if (model / "model").is_dir() and (model / "dataset").is_dir():
         where, dataset = model / "model", dataset or str(model / "dataset")
     if situations is None and dataset is None:
@@ -150,16 +159,12 @@ def view(
             shown.run()
         return
     numbers = ", ".join(map(str, situation))
-    title = f"{model.resolve().name}, situation {numbers}"
-    trajectory = write_motion(
-        place,
-        fitted,
-        [wanted[number] for number in situation],
-        demonstrations,
-        objects=objects,
-        meshes=meshes,
-        fps=fps,
-        title=title,
-    )
+    chosen = [wanted[number] for number in situation]
+    how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
+    how["title"] = f"{model.resolve().name}, situation {numbers}"
+    if form == "rerun":
+        trajectory = write_rerun(place, fitted, chosen[0], demonstrations, **how)
+    else:
+        trajectory = write_motion(place, fitted, chosen, demonstrations, **how)
     seconds = float(trajectory.time[-1] - trajectory.time[0])
     typer.echo(f"{seconds:.1f} s of motion, {place.stat().st_size / 1e6:.1f} MB, in {place}")

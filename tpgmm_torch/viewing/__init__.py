@@ -1,11 +1,13 @@
 """Looking at a motion in three dimensions: the robot, the paths, and how sure the model is.
 
 Needs the extra ``view`` (viser). :func:`write_motion` makes one HTML file that opens
-anywhere; :class:`LiveView` serves the same scene, in which objects can be moved by hand.
+anywhere, :func:`write_rerun` (extra ``rerun``) a recording; :class:`LiveView` serves the same
+scene, in which objects can be moved by hand.
 """
 
 from tpgmm_torch.viewing.live import LiveView
 from tpgmm_torch.viewing.recording import write_motion
+from tpgmm_torch.viewing.rerun_recording import write_rerun
 from tpgmm_torch.viewing.scene import MotionScene, ellipsoids
 from tpgmm_torch.viewing.visuals import Shape, link_shapes, parse_shape
 
@@ -17,4 +19,5 @@ __all__ = [
     "link_shapes",
     "parse_shape",
     "write_motion",
+    "write_rerun",
 ]
