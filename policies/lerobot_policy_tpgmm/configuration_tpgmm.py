@@ -25,6 +25,7 @@ from tpgmm_torch import (
     ViaPoint,
     parse_clock,
 )
+from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
@@ -49,7 +50,7 @@ ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
 
 CHOICES = {
     "feedback": ("reference", "observation"),
-    "alignment": ("dtw", "barycenter", "linear", "events", "none"),
+    "alignment": METHODS,
     "learn_from": ("measured", "commanded"),
     "loss": ("likelihood", "imitation"),
 }
@@ -190,10 +191,11 @@ class TPGMMConfig(StatePolicyConfig):
         or the unit is wrong then, or the robot does not stand where the skill begins.
     chunk_size : int, default=50
         Number of steps of ``predict_action_chunk``.
-    alignment : {"dtw", "barycenter", "linear", "events", "none"}, default="dtw"
-        How training brings episodes onto one clock; ``"events"`` anchors them at all events.
+    alignment : {"dtw", "barycenter", "linear", "events", "events+dtw", "none"}, default="dtw"
+        How training brings episodes onto one clock; ``"events"`` anchors them at all events,
+        ``"events+dtw"`` warps them in between, too.
     alignment_features : list of str, optional
-        What ``"dtw"`` and ``"barycenter"`` compare, as for
+        What time warping compares, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
         of the links and the joints.
     learn_from : {"measured", "commanded"}, default="measured"

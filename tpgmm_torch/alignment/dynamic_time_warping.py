@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -25,7 +25,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
-__all__ = ["DynamicTimeWarping"]
+__all__ = ["DynamicTimeWarping", "warn_of_linear_time"]
 
 #: Warping runs on at most this many steps; its memory and time grow with their square.
 LARGEST_GRID = 2000
@@ -210,7 +210,9 @@ class DynamicTimeWarping(Alignment):
         for i in self.fallback_:
             warps[i] = self._linear(demonstrations[i])
         if self.fallback_:
-            _warn("; ".join(f"demonstration {i}: {why}" for i, why in self.fallback_.items()))
+            warn_of_linear_time(
+                f"demonstration {i}: {why}" for i, why in self.fallback_.items()
+            )
         self.paths_ = [self._on_grid(d, w) for d, w in zip(demonstrations, warps, strict=True)]
         self.distortions_ = np.array(
             [
@@ -331,15 +333,22 @@ class DynamicTimeWarping(Alignment):
         warp = self._warp(demonstration, self._features(demonstration))
         if reason := self._doubt(demonstration, warp):
             warp = self._linear(demonstration)
-            _warn(f"of transform: {reason}")
+            warn_of_linear_time([f"of transform: {reason}"])
         return self._on_grid(demonstration, warp)
 
 
-def _warn(found: str) -> None:
+def warn_of_linear_time(found: Iterable[str]) -> None:
+    """Warn that demonstrations were left on linear time, on behalf of who fits or transforms.
+
+    Parameters
+    ----------
+    found : iterable of str
+        Which, and why.
+    """
     warnings.warn(
         "left on linear time, for warping does not bring nearer what it did not use. "
-        f"{found}. Is it one skill, from its beginning to its end? Choose other features, or "
-        "set fallback=False",
+        f"{'; '.join(found)}. Is it one skill, from its beginning to its end? Choose other "
+        "features, or set fallback=False",
         PlausibilityWarning,
         stacklevel=3,
     )

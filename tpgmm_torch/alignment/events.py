@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from itertools import pairwise
 from numbers import Integral, Real
@@ -9,15 +10,21 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from sklearn.base import clone
 from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
-from tpgmm_torch.alignment.base import Alignment, seconds, steps_at
+from tpgmm_torch.alignment.base import Alignment, retime, seconds, steps_at
+from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping, warn_of_linear_time
+from tpgmm_torch.alignment.features import quaternion_columns
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 __all__ = ["EventAlignment"]
+
+#: Shorter parts are not warped.
+FEWEST_STEPS = 5
 
 
 class EventAlignment(Alignment):
@@ -25,7 +32,7 @@ class EventAlignment(Alignment):
 
     Time is piecewise linear: the beginning, each event and the end are anchors, and every
     part between two of them lasts as long as it does on average. What happens within a part
-    is not looked at.
+    is not looked at, unless ``within`` warps it.
 
     Parameters
     ----------
@@ -35,6 +42,10 @@ class EventAlignment(Alignment):
     duration : {"mean", "median"} or float, default="mean"
         Which average of the lengths of each part; or the sum of their means is scaled to
         this [s], and 1.0 makes time the phase.
+    within : DynamicTimeWarping, optional
+        How each part is warped in itself, with its own reference and features; anchors stay.
+        Its slopes are relative to the evenly stretched part. Parts without motion, or of fewer
+        than five steps, stay evenly stretched.
     n_steps : int, optional
         Time steps of the result; the default is the demonstrations' median.
     interpolation : {"linear", "cubic"}, default="linear"
@@ -50,6 +61,10 @@ class EventAlignment(Alignment):
         The anchors in their order.
     instants_ : dict of str to float
         When each of them is on the common clock [s].
+    parts_ : list of DynamicTimeWarping or None
+        How each part is warped; None for those that are stretched evenly.
+    fallback_ : dict of (int, int) to str
+        Which demonstrations were left on linear time in which part, and why.
     paths_, joint_names_ : list of Tensor of shape (n_steps,), tuple of str or None
         As in :class:`Alignment`.
 
@@ -66,6 +81,7 @@ class EventAlignment(Alignment):
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012
         "events": ["array-like", tuple, None],
         "duration": [StrOptions({"mean", "median"}), Interval(Real, 0, None, closed="neither")],
+        "within": [DynamicTimeWarping, None],
         "n_steps": [Interval(Integral, 2, None, closed="left"), None],
         "interpolation": [StrOptions({"linear", "cubic"})],
         "robot": "no_validation",
@@ -76,12 +92,14 @@ class EventAlignment(Alignment):
         events: Sequence[str] | None = None,
         *,
         duration: str | float = "mean",
+        within: DynamicTimeWarping | None = None,
         n_steps: int | None = None,
         interpolation: str = "linear",
         robot: Any = None,
     ) -> None:
         self.events = events
         self.duration = duration
+        self.within = within
         self.n_steps = n_steps
         self.interpolation = interpolation
         self.robot = robot
@@ -93,7 +111,12 @@ class EventAlignment(Alignment):
         ------
         DataError
             If there are no events, or one is missing in a demonstration, comes in another
-            order than in others, or at the instant of another.
+            order than in others, or at the instant of another; or ``within`` has an open end.
+
+        Warns
+        -----
+        PlausibilityWarning
+            Once, if demonstrations are left on linear time in parts.
         """
         demonstrations = self._start(X)
         self.events_ = self._order(demonstrations)
@@ -105,7 +128,12 @@ class EventAlignment(Alignment):
         self.instants_ = dict(zip(self.events_, self._instants[1:-1].tolist(), strict=True))
         n_steps = self.n_steps or round(float(np.median([len(d) for d in demonstrations])))
         self.time_ = torch.linspace(0, self._instants[-1], n_steps, dtype=torch.float64)
-        self.paths_ = [self._path(one) for one in demonstrations]
+        self._fit_parts(demonstrations)
+        paths = [
+            [None if part is None else part.paths_[i] for part in self.parts_]
+            for i in range(len(demonstrations))
+        ]
+        self.paths_ = list(map(self._joined, demonstrations, paths))
         return self
 
     def _order(self, demonstrations: Sequence[Demonstration]) -> tuple[str, ...]:
@@ -155,6 +183,64 @@ class EventAlignment(Alignment):
                 )
         return np.array(instants)
 
+    def _fit_parts(self, demonstrations: Sequence[Demonstration]) -> None:
+        """Learn how each part is warped in itself."""
+        self.parts_: list[DynamicTimeWarping | None] = [None] * (len(self._instants) - 1)
+        self.fallback_: dict[tuple[int, int], str] = {}
+        if self.within is None:
+            return
+        if self.within.open_end:
+            raise DataError("parts end at events: give within=DynamicTimeWarping() no open end")
+        names = ("start", *self.events_, "end")
+        for number in range(len(self.parts_)):
+            parts = [self._part(one, number) for one in demonstrations]
+            shown = [one for one in parts if one is not None]
+            if not any(bool(one.joints.diff(dim=0).any()) for one in shown):
+                continue
+            part = clone(self.within)
+            if part.robot is None:
+                part.set_params(robot=self.robot)
+            with warnings.catch_warnings():  # one warning tells of all parts
+                warnings.simplefilter("ignore", PlausibilityWarning)
+                part.fit(shown)
+            self.parts_[number] = part
+            self.fallback_ |= {(i, number): why for i, why in part.fallback_.items()}
+        if self.fallback_:
+            warn_of_linear_time(
+                f"demonstration {i} from {names[number]!r} to {names[number + 1]!r}: {why}"
+                for (i, number), why in self.fallback_.items()
+            )
+
+    def _part(self, demonstration: Demonstration, number: int) -> Demonstration | None:
+        """The part behind anchor ``number``, evenly stretched; None if it is too short."""
+        begin, end = self._instants[number : number + 2]
+        step = float(self._instants[-1]) / (len(self.time_) - 1)
+        n_steps = round((end - begin) / step) + 1
+        if n_steps < FEWEST_STEPS:
+            return None
+        first, last = self._anchors(demonstration)[number : number + 2]
+        path = steps_at(demonstration, np.linspace(first, last, n_steps))
+        time = torch.linspace(begin, end, n_steps, dtype=torch.float64)
+        return retime(demonstration, path, time, quaternion_columns(demonstration, self.robot))
+
     def _path(self, demonstration: Demonstration) -> Tensor:
-        instants = np.interp(self.time_.numpy(), self._instants, self._anchors(demonstration))
+        paths: list[Tensor | None] = []
+        for number, part in enumerate(self.parts_):
+            shown = self._part(demonstration, number)
+            paths.append(None if part is None or shown is None else part._path(shown))
+        return self._joined(demonstration, paths)
+
+    def _joined(self, demonstration: Demonstration, paths: Sequence[Tensor | None]) -> Tensor:
+        """Fractional time steps: warped in parts by ``paths``, stretched between anchors."""
+        grid = self.time_.numpy()
+        evenly = grid.copy()
+        for number, path in enumerate(paths):
+            if path is None:
+                continue
+            begin, end = self._instants[number : number + 2]
+            inside = (grid >= begin) & (grid <= end)
+            clock = np.linspace(begin, end, len(path))
+            steps = np.interp(grid[inside], clock, path.numpy())
+            evenly[inside] = np.interp(steps, (0, float(path[-1])), (begin, end))
+        instants = np.interp(evenly, self._instants, self._anchors(demonstration))
         return steps_at(demonstration, instants)

@@ -11,11 +11,10 @@ import typer
 from tpgmm_torch.cli import plugins
 
 if TYPE_CHECKING:
-    from tpgmm_torch.alignment.base import Alignment
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["align", "aligner", "in_panel", "read_robot", "recordings"]
+__all__ = ["align", "in_panel", "read_robot", "recordings"]
 
 
 def in_panel(panel: str) -> Callable[..., Any]:
@@ -90,10 +89,11 @@ Plausibility = Annotated[
     ),
 ]
 AlignmentMethod = Annotated[
-    Literal["dtw", "barycenter", "linear", "events", "none"],
+    Literal["dtw", "barycenter", "linear", "events", "events+dtw", "none"],
     of_data(
         "Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, by stretching it between events, or not at all."
+        "their average, by stretching time, by stretching it between events, by warping it "
+        "between events, or not at all."
     ),
 ]
 RobotFile = Annotated[
@@ -226,26 +226,11 @@ def count_or_auto(text: str | int) -> int | str:
     raise typer.BadParameter(f"{text!r} is neither a positive integer nor 'auto'")
 
 
-def aligner(method: str, robot: Kinematics | None) -> Alignment | None:
-    """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
-    from tpgmm_torch.alignment import (
-        DynamicTimeWarping,
-        EventAlignment,
-        LinearTimeNormalization,
-    )
-
-    if method == "none":
-        return None
-    if method == "linear":
-        return LinearTimeNormalization(robot=robot)
-    if method == "events":
-        return EventAlignment(robot=robot)
-    return DynamicTimeWarping("medoid" if method == "dtw" else method, robot=robot)
-
-
 def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
-    """Bring ``demonstrations`` onto one clock, as :func:`aligner` does by ``method, robot``."""
-    chosen = aligner(method, robot)
+    """Bring ``demonstrations`` of ``robot`` onto one clock, as ``--alignment method`` says."""
+    from tpgmm_torch.alignment.text import parse_alignment
+
+    chosen = parse_alignment(method, robot)
     return demonstrations if chosen is None else chosen.fit_transform(demonstrations)

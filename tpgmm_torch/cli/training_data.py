@@ -102,12 +102,14 @@ def read_training_data(
     recordings, robot, alignment, batch_episodes, processes
         What the options say, and those that learn together.
     """
+    from tpgmm_torch.alignment.text import parse_alignment
+
     if batch_episodes is None:
         read = recordings.demonstrations()
         aligned = options.align(read, alignment, robot)
         return TrainingData(processes.share(aligned), tuple(read[0].frames), read, aligned)
     first = next(iter(recordings.batches(batch_episodes)))
-    chosen = options.aligner(alignment, robot)
+    chosen = parse_alignment(alignment, robot)
     fitted = None if chosen is None else chosen.fit(first)
     batches = recordings.batches(batch_episodes, processes)
     return TrainingData(AlignedBatches(batches, fitted), tuple(first[0].frames), (), ())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,35 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch import Kinematics
-from tpgmm_torch.alignment import (
-    DynamicTimeWarping,
-    EventAlignment,
-    LinearTimeNormalization,
-)
-from tpgmm_torch.alignment.base import Alignment
-
-__all__ = ["Clock", "alignment"]
-
-
-def alignment(
-    method: str, kinematics: Kinematics, features: Sequence[str] | None = None
-) -> Alignment | None:
-    """The transformer that brings episodes onto one clock; None leaves each on its own.
-
-    Parameters
-    ----------
-    method, features
-        ``alignment`` and ``alignment_features`` of :class:`TPGMMConfig`.
-    """
-    if method == "none":
-        return None
-    if method == "linear":
-        return LinearTimeNormalization(robot=kinematics)
-    if method == "events":
-        return EventAlignment(robot=kinematics)
-    reference = "medoid" if method == "dtw" else method
-    return DynamicTimeWarping(reference, features=features, robot=kinematics)
+__all__ = ["Clock"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from torch import Tensor, distributed
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
-from lerobot_policy_tpgmm.training.clocks import Clock, alignment
+from lerobot_policy_tpgmm.training.clocks import Clock
 from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
 from lerobot_policy_tpgmm.training.epoch_recorder import (
     COLUMNS,
@@ -43,6 +43,7 @@ from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
+from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.events.detection import Detector, find_events
 from tpgmm_torch.exceptions import DataError, NotFittedError
@@ -205,7 +206,7 @@ class Learner:
         demonstrations = self._linked(
             {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
         )
-        aligner = alignment(config.alignment, kinematics, config.alignment_features)
+        aligner = parse_alignment(config.alignment, kinematics, config.alignment_features)
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(numbers))
         if aligner is not None:
@@ -272,7 +273,7 @@ class Learner:
         """Demonstrations with the events and the frames at links that are asked for."""
         config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
-        if self._stored and (poses or config.alignment == "events"):
+        if self._stored and (poses or config.alignment.startswith("events")):
             # LeRobot's preprocessor hands no such columns on
             log.info("reading events: %s", ", ".join(self._stored))
             stored = stored_events(Path(self._dataset.root), shown)

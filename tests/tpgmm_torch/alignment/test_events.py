@@ -5,9 +5,13 @@ import pytest
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
-from tpgmm_torch.alignment import EventAlignment, LinearTimeNormalization
+from tpgmm_torch.alignment import (
+    DynamicTimeWarping,
+    EventAlignment,
+    LinearTimeNormalization,
+)
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 
 
 def shown(begin=0.0, end=10.0, n=501, **events):
@@ -102,3 +106,84 @@ def test_events_that_are_missing_or_out_of_order_are_refused(family, events, tol
 def test_what_is_transformed_needs_the_events_too():
     with pytest.raises(DataError, match=r"has no event 'open'; it has \['close'\]"):
         EventAlignment().fit(FAMILY).transform([shown(close=2.0)])
+
+
+# Warped between the anchors
+
+
+def paced(close, pace, seed=0):
+    """A way whose speed differs between the anchors; the joints say where on it."""
+    time = np.linspace(0, 6, 301)
+    phase = np.interp(time, [0, close, 6], [0, 1, 2])
+    part, fraction = np.divmod(phase, 1)
+    warped = part + fraction**pace  # 0, 1 and 2 at the anchors
+    joints = np.stack([np.sin(3 * warped), np.cos(5 * warped), warped], 1)
+    joints += 1e-4 * np.random.default_rng(seed).standard_normal(joints.shape)
+    return Demonstration(time, joints, events={"close": close})
+
+
+PACES = [paced(2.0, 1.0, 1), paced(3.5, 1.5, 2), paced(2.8, 0.7, 3)]
+
+
+def spread(aligned):
+    """Mean deviation of where on the way demonstrations are at one time."""
+    return float(np.std([one.joints[:, 2] for one in aligned], axis=0).mean())
+
+
+@pytest.mark.parametrize("reference", ["medoid", "barycenter", 1])
+def test_parts_are_warped_and_events_stay_where_they_are(reference):
+    evenly = EventAlignment().fit_transform(PACES)
+    within = DynamicTimeWarping(reference, smoothing=0.05)
+    transformer = EventAlignment(within=within)
+    aligned = transformer.fit_transform(PACES)
+    for one, other in zip(aligned, evenly, strict=True):
+        np.testing.assert_allclose(one.time, other.time)
+        assert one.events["close"] == pytest.approx(other.events["close"], abs=0.011)
+    at = int((aligned[0].time - transformer.instants_["close"]).abs().argmin())
+    places = [float(one.joints[at, 2]) for one in aligned]
+    assert places == pytest.approx([1.0] * 3, abs=0.01)
+    assert spread(aligned) < 0.7 * spread(evenly)
+    assert within.robot is None and not hasattr(within, "time_")  # parts are clones
+    assert transformer.fallback_ == {} and len(transformer.parts_) == 2
+    for path, one in zip(transformer.paths_, PACES, strict=True):
+        assert path[0] == 0 and path[-1] == len(one) - 1 and bool((path.diff() > 0).all())
+
+
+def test_others_are_warped_as_those_of_the_fit():
+    transformer = EventAlignment(within=DynamicTimeWarping()).fit(PACES)
+    for one, path in zip(PACES, transformer.paths_, strict=True):
+        np.testing.assert_allclose(transformer._path(one), path, atol=1e-9)
+    [one] = transformer.transform([paced(4.0, 1.2, 4)])
+    at = int((one.time - transformer.instants_["close"]).abs().argmin())
+    assert float(one.joints[at, 2]) == pytest.approx(1.0, abs=0.01)
+
+
+def test_parts_that_are_short_or_still_stay_even_and_what_does_not_pay_is_told():
+    time = np.linspace(0, 4, 201)
+    still = [
+        Demonstration(
+            time,
+            np.interp(time, [0, 2, 2.04, 4], [0, 1, 1, 1])[:, None] ** [[pace, 1]],
+            events={"close": 2.0, "open": 2.04},
+        )
+        for pace in (1.0, 1.5)
+    ]
+    transformer = EventAlignment(within=DynamicTimeWarping(fallback=False)).fit(still)
+    assert [part is None for part in transformer.parts_] == [False, True, True]
+    # joints that do not agree on a warp: what helps one spoils the other
+    rng = np.random.default_rng(0)
+    wild = [
+        Demonstration(time, rng.standard_normal((201, 4)).cumsum(0), events={"close": 2.0})
+        for _ in range(3)
+    ]
+    transformer = EventAlignment(within=DynamicTimeWarping(features=["speed"]))
+    with pytest.warns(PlausibilityWarning) as caught:
+        transformer.fit(wild)
+    [told] = caught
+    assert "from 'start' to 'close': its difference" in str(told.message)
+    assert transformer.fallback_.keys() <= {(i, part) for i in range(3) for part in range(2)}
+
+
+def test_open_ends_within_parts_are_refused():
+    with pytest.raises(DataError, match="no open end"):
+        EventAlignment(within=DynamicTimeWarping(open_end=True)).fit(PACES)
