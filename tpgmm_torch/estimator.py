@@ -600,27 +600,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     def _learn_again(self, kept: KeptRows) -> None:
         """EM from where it was, on rows that were kept."""
-        operators, kinematics, before = self.operators_, self.kinematics_, self.mixture_
+        operators, kinematics = self.operators_, self.kinematics_
         widths = block_widths(operators, kinematics)
         turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
         table, members, group_size = kept.table(widths, turns, self.time_)
         moments = column_moments(StoredRows(table[members]))
         shares = members.sum() / (kept.n_instants or len(members) / len(kept.rows))
-        mixture = BlockGaussianMixture(
-            **self._shared_settings(operators, kinematics, self.n_components_)
-            | {
-                "reg_covar": regularization(
-                    moments,
-                    operators,
-                    kinematics,
-                    reg_covar=self.reg_covar,
-                    covariance_type=self.covariance_type,
-                ),
-                "n_demonstrations": float(shares),
-                "weights_init": before.weights_,
-                "means_init": before.means_,
-                "covariances_init": before.unshrunk_covariances,
-            }
+        mixture = self.unfitted_mixture(
+            moments, 1, operators, kinematics, float(shares), self.n_components_, go_on=True
         )
         fit_subsets([mixture], table, members[None], group_size, [moments])
         self.set_mixture(mixture, operators, kinematics, self.time_, self.holds_)
@@ -1137,8 +1124,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         group_size: int,
         operators: Sequence[Operator],
         kinematics: Kinematics,
-        n_demonstrations: int,
+        n_demonstrations: float,
         n_components: int | None = None,
+        *,
+        go_on: bool = False,
     ) -> BlockGaussianMixture:
         """The mixture that :meth:`fit` learns from rows of local data.
 
@@ -1151,10 +1140,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators : sequence of Operator
         kinematics : Kinematics
             What they act on.
-        n_demonstrations : int
-            That the rows are of.
+        n_demonstrations : float
+            That the rows are of; segments are shares of one.
         n_components : int, optional
             By default that of the model.
+        go_on : bool, default=False
+            Whether EM is to begin where it ended, as it does with ``warm_start``.
         """
         settings = self._shared_settings(operators, kinematics, n_components)
         settings |= {"group_size": group_size, "n_demonstrations": n_demonstrations}
@@ -1165,8 +1156,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             reg_covar=self.reg_covar,
             covariance_type=self.covariance_type,
         )
-        if self.warm_start and hasattr(self, "mixture_"):
-            return self.mixture_.set_params(**settings)
+        if (go_on or self.warm_start) and hasattr(self, "mixture_"):
+            before = self.mixture_
+            settings["weights_init"], settings["means_init"] = before.weights_, before.means_
+            settings["covariances_init"] = before.unshrunk_covariances
         return BlockGaussianMixture(**settings)
 
     def set_mixture(

@@ -21,6 +21,7 @@ __all__ = [
     "condition",
     "from_information",
     "information",
+    "log_density",
     "moment_match",
     "product",
     "pseudo_inverse",
@@ -274,6 +275,45 @@ def moment_match(weights: Tensor, means: Tensor, covariances: Tensor) -> tuple[T
     within = (weights.unsqueeze(-2) @ covariances.flatten(-2)).squeeze(-2)
     between = (weights.unsqueeze(-1) * residual).mT @ residual
     return mean, within.view(*within.shape[:-1], *covariances.shape[-2:]) + between
+
+
+def log_density(
+    residuals: Tensor, covariance: Tensor, name: str, degrees: float | None = None
+) -> Tensor:
+    """Logarithm of the density of deviations from a mean, (..., r), in nats.
+
+    Parameters
+    ----------
+    residuals : Tensor of shape (..., D, r)
+        Deviations, as columns.
+    covariance : Tensor of shape (..., D, D)
+    name : str
+        How the error message calls the covariance.
+    degrees : float, optional
+        Of freedom nu: Student's t, of which the covariance is the scale matrix. A covariance
+        that is itself an estimate leaves wider tails. None is the normal law, its limit.
+
+    Raises
+    ------
+    DataError
+        If a covariance is not positive definite.
+
+    Examples
+    --------
+    >>> far, variance = torch.tensor([[5.0]]), torch.tensor([[1.0]])
+    >>> round(float(log_density(far, variance, "the variance")), 1)
+    -13.4
+    >>> round(float(log_density(far, variance, "the variance", degrees=2.0)), 1)
+    -4.9
+    """
+    factor, size = cholesky(covariance, name), covariance.shape[-1]
+    squares = torch.linalg.solve_triangular(factor, residuals, upper=False).square().sum(-2)
+    log_root = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    if degrees is None:
+        return -0.5 * (size * math.log(2 * math.pi) + squares) - log_root
+    constant = math.lgamma((degrees + size) / 2) - math.lgamma(degrees / 2)
+    constant -= size / 2 * math.log(degrees * math.pi)
+    return constant - log_root - (degrees + size) / 2 * torch.log1p(squares / degrees)
 
 
 def pseudo_inverse(matrix: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import multivariate_t
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
@@ -382,3 +383,22 @@ def test_the_pseudo_inverse_of_nothing_has_its_shape(shape):
 def test_the_pseudo_inverse_has_gradients():
     matrix = torch.randn(2, 3, 5, dtype=torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(gaussians.pseudo_inverse, matrix)
+
+
+@given(seeds, sizes, st.sampled_from([None, 1.0, 4.0, 1e9]))
+def test_densities_are_those_of_torch_and_scipy(seed, size, degrees):
+    """Columns are deviations; with many degrees of freedom Student's t is the normal law."""
+    rng = np.random.default_rng(seed)
+    covariance, residuals = spd(rng, 2, size), 3 * normal(rng, 2, size, 4)
+    found = gaussians.log_density(residuals, covariance, "a covariance", degrees)
+    for columns, one, row in zip(residuals, covariance, found, strict=True):
+        if degrees is None or degrees > 1e6:
+            expected = MultivariateNormal(torch.zeros(size).double(), one).log_prob(columns.mT)
+        else:
+            expected = multivariate_t(shape=one.numpy(), df=degrees).logpdf(columns.mT.numpy())
+        assert_close(row, np.atleast_1d(expected), 1e-6)
+
+
+def test_no_density_has_a_singular_covariance():
+    with pytest.raises(DataError, match="the covariance of chance is not positive definite"):
+        gaussians.log_density(torch.ones(2, 1), torch.zeros(2, 2), "the covariance of chance")

@@ -87,7 +87,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         How far the full or tied covariances that EM found go towards their diagonals, from 0
         to 1. "auto" follows from the number of samples and of columns, component by component
         (:func:`~tpgmm_torch.em.covariance_shrinkage.oracle_approximating_intensity`).
-    n_demonstrations : int, optional
+    n_demonstrations : float, optional
         How many samples there are for "auto", where the rows are those of so many
         demonstrations that each visit every component; None counts each row.
     timed_blocks : bool, default=False
@@ -168,7 +168,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
         "regularization": [StrOptions({"relative", "absolute"})],
         "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
-        "n_demonstrations": [Interval(Integral, 1, None, closed="left"), None],
+        "n_demonstrations": [Interval(Real, 0, None, closed="neither"), None],
         "timed_blocks": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
@@ -195,7 +195,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
         regularization: str = "relative",
         covariance_shrinkage: float | str = 0.0,
-        n_demonstrations: int | None = None,
+        n_demonstrations: float | None = None,
         timed_blocks: bool = False,
         max_iter: int = 100,
         n_init: int = 1,

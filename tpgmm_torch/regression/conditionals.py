@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -155,20 +154,10 @@ class Conditionals(_OfComponents):
         .. [1] A. Gelman et al.: Bayesian Data Analysis, 3rd ed., section 3.2: the posterior
            predictive of a normal law of unknown mean and variance.
         """
-        residual = (local.unsqueeze(-2) - self.at(time)).movedim(-2, 0)
-        white = gaussians.whiten(self.covariance, residual.mT, "the covariance of a component")
-        logdet = gaussians.cholesky(self.covariance, "the covariance of a component")
-        logdet = 2 * logdet.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        size, squares = local.shape[-1], white.square().sum(-2)
-        if n_samples is None:
-            constant = size * math.log(2 * math.pi) + logdet
-            return -0.5 * (squares + constant.unsqueeze(-1)).mT
-        freedom = max(n_samples - 1.0, 1.0)  # one sample leaves the widest law
-        scale = (n_samples + 1) / freedom
-        constant = (
-            math.lgamma((freedom + size) / 2)
-            - math.lgamma(freedom / 2)
-            - 0.5 * (size * math.log(freedom * math.pi * scale) + logdet)
-        )
-        tail = 0.5 * (freedom + size) * torch.log1p(squares / (freedom * scale))
-        return (constant.unsqueeze(-1) - tail).mT
+        residuals = (local.unsqueeze(-2) - self.at(time)).movedim(-2, 0).mT
+        covariance, degrees = self.covariance, None
+        if n_samples is not None:
+            degrees = max(n_samples - 1.0, 1.0)  # one sample leaves the widest law
+            covariance = (n_samples + 1) / degrees * covariance
+        name = "the covariance of a component"
+        return gaussians.log_density(residuals, covariance, name, degrees).mT

@@ -13,6 +13,7 @@ from sklearn.base import BaseEstimator
 from sklearn.utils._param_validation import Interval
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.em.column_moments import ColumnMoments
@@ -22,7 +23,6 @@ from tpgmm_torch.operators import Canonical
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.structure.evidence import log_predictive_density
 from tpgmm_torch.training.training_rows import LearningRows
 
 __all__ = ["ComponentSelection"]
@@ -230,11 +230,10 @@ class ComponentSelection(BaseEstimator):  # type: ignore[misc]
             state, frames = held_objects(state, time, frames, holds)
         with torch.no_grad():
             estimate = regression.step(time, state, frames)
-            step = estimate.joints - state.joints
-            floor = _floor(self.tolerance, kinematics)
-            density = log_predictive_density(
-                step, estimate.covariance + floor, max(n_learned - 1.0, 1.0)
-            )
+            step = (estimate.joints - state.joints)[..., None]
+            covariance = estimate.covariance + _floor(self.tolerance, kinematics)
+            name, degrees = "the covariance of what is expected", max(n_learned - 1.0, 1.0)
+            density = gaussians.log_density(step, covariance, name, degrees)
         return float(density.mean())
 
 

@@ -10,13 +10,13 @@ operators are compared by one number in the units of the joints, whatever their 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
@@ -25,7 +25,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.training_rows import typical_time
 
-__all__ = ["Evidence", "Fused", "gather_evidence", "log_predictive_density"]
+__all__ = ["Evidence", "Fused", "gather_evidence"]
 
 #: No sensor agrees with itself to less [m or rad]: what never varies stays finite.
 RESOLUTION = 1e-3
@@ -97,8 +97,9 @@ class Evidence:
     def log_likelihood(self, fused: Fused) -> Tensor:
         """Of the demonstrations left out, given the ``fused`` product, in nats, (M, T)."""
         covariance = torch.linalg.inv(fused.precision)
-        step = (covariance @ fused.vector[..., None])[..., 0]
-        return log_predictive_density(step, covariance + self.floor.diag(), self.degrees)
+        step = covariance @ fused.vector[..., None]
+        floored, name = covariance + self.floor.diag(), "the covariance of what is expected"
+        return gaussians.log_density(step, floored, name, self.degrees)[..., 0]
 
     def errors(self, operator: int, fused: Fused) -> tuple[Tensor, Tensor]:
         """How far demonstrations left out are from what is expected, root mean square.
@@ -214,30 +215,6 @@ def gather_evidence(
         floor=floor,
         degrees=max(number - 2.0, 1.0),
     )
-
-
-def log_predictive_density(step: Tensor, covariance: Tensor, degrees: float) -> Tensor:
-    """How likely a deviation from what is expected is, in nats, (...).
-
-    Multivariate Student's t: variances of few demonstrations are themselves uncertain, and what
-    they exclude may happen.
-
-    Parameters
-    ----------
-    step : Tensor of shape (..., n)
-        The deviation.
-    covariance : Tensor of shape (..., n, n)
-    degrees : float
-        Of freedom of the covariance.
-    """
-    n = step.shape[-1]
-    factor = torch.linalg.cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, step[..., None], upper=False)
-    squared = white.square().sum((-2, -1))
-    half_log_determinant = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    constant = math.lgamma((degrees + n) / 2) - math.lgamma(degrees / 2)
-    constant -= n / 2 * math.log(degrees * math.pi)
-    return constant - half_log_determinant - (degrees + n) / 2 * torch.log1p(squared / degrees)
 
 
 def _at_phase(demonstration: Demonstration, phase: Tensor) -> Demonstration:
