@@ -67,7 +67,7 @@ from tpgmm_torch.plausibility.outlying_demonstrations import (
 from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
-from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
@@ -78,6 +78,7 @@ from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.structure.component_selection import ComponentSelection
 from tpgmm_torch.structure.operator_selection import OperatorSelection
+from tpgmm_torch.structure.operator_weights import held_out_weights, weighted
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.kept_rows import KeptRows
 from tpgmm_torch.training.local_data import local_data
@@ -126,6 +127,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     robot : Kinematics, optional
         A :class:`Robot`, :class:`Poses` for recorded poses without a robot, or your own;
         not needed by ``Canonical()`` alone.
+    priorities : sequence of int, optional
+        One per operator. Those of a higher number are fulfilled as if those of lower ones were
+        not there, which act in what is left of the joints (the null space), damped; those of
+        one number compromise as their covariances say, as all do by default.
+    operator_weights : {"equal", "held-out"}, default="equal"
+        How much the Gaussians of operators count in the product (2): all alike, as in the
+        paper, or by weights from 0 to 1 for each component, with which demonstrations that are
+        left out, of at least three, are most likely
+        (:func:`~tpgmm_torch.structure.operator_weights.held_out_weights`). Frames that do not
+        matter do little harm then. ``covariances_`` given time are divided by the weights.
     covariance_type : {"full", "diag", "tied", "spherical"}, default="full"
         Shape of the local covariances.
     reg_covar : float, default=1e-5
@@ -211,6 +222,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     operators_ : tuple of Operator
     operator_selection_ : OperatorSelection or None
         Which were found, and why; None where they were given, and for a model that was loaded.
+    operator_weights_ : Tensor of shape (K, J) or None
+        How much each operator counts; None where all are equal. :meth:`partial_fit` keeps
+        them.
     kinematics_ : Kinematics
     holds_ : tuple of Hold
         In the time of the skill.
@@ -268,6 +282,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ],
         "operators": [StrOptions({"auto"}), OperatorSelection, "array-like", tuple, None],
         "robot": [Kinematics, None],
+        "priorities": ["array-like", None],
+        "operator_weights": [StrOptions({"equal", "held-out"})],
         "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
         "reg_covar": [Interval(Real, 0, None, closed="left")],
         "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
@@ -302,6 +318,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     shown_: Shown | None
     demonstration_weights_: Tensor | None
     operator_selection_: OperatorSelection | None
+    operator_weights_: Tensor | None
     component_selection_: ComponentSelection | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
@@ -320,6 +337,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators: Sequence[Operator] | str | OperatorSelection | None = None,
         robot: Kinematics | None = None,
         *,
+        priorities: Sequence[int] | None = None,
+        operator_weights: str = "equal",
         covariance_type: str = "full",
         reg_covar: float = 1e-5,
         covariance_shrinkage: float | str = "auto",
@@ -347,6 +366,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_components = n_components
         self.operators = operators
         self.robot = robot
+        self.priorities = priorities
+        self.operator_weights = operator_weights
         self.covariance_type = covariance_type
         self.reg_covar = reg_covar
         self.covariance_shrinkage = covariance_shrinkage
@@ -373,8 +394,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     @property
     def selects(self) -> bool:
-        """Whether :meth:`fit` finds operators or the number of components itself."""
+        """Whether :meth:`fit` finds operators, weights or the number of components itself."""
         found = isinstance(self.operators, str | OperatorSelection)
+        found = found or self.operator_weights != "equal"
         return found or not isinstance(self.n_components, Integral)
 
     def check_parameters(self) -> None:
@@ -433,7 +455,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             known = check_demonstrations(demonstrations)
             selection = self._selection(known)
             chosen = self.operators if selection is None else selection.operators_
-            operators = check_operators(chosen)
+            given = operators = check_operators(chosen)
             kinematics = self._kinematics_for(known, operators)
             # which of them are unlike the others is seen about their mean, too
             based = with_mean_orientations(operators, known, kinematics)
@@ -453,6 +475,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             components = self._components(known, gathered, operators, kinematics, holds)
             number = None if components is None else components.n_components_
             self._learn(gathered, operators, kinematics, checkpoint, holds, number)
+            if self.operator_weights == "held-out":
+                time, variance = self.means_[0][:, 0], self.covariances_[0][:, 0, 0]
+                marginals = TimeMarginals.of(self.weights_.log(), time, variance)
+                self._weigh(held_out_weights(known, given, kinematics, marginals, holds))
             self.shown_, self.demonstration_weights_ = shown, weights
             self.operator_selection_, self.component_selection_ = selection, components
             self._kept = KeptRows.of(
@@ -462,9 +488,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             return self._set_peaks(*peaks)
         if self.selects:
             raise DataError(
-                'operators="auto" and n_components="auto" compare all demonstrations with each '
-                "other, which those in batches or in several processes are not: fit a model to "
-                "some of them, and give its operators_ and n_components_"
+                'operator_weights="held-out", operators="auto" and n_components="auto" compare '
+                "all demonstrations with each other, which those in batches or in several "
+                "processes are not: fit a model to some of them, and give its operators_ and "
+                "n_components_"
             )
         operators = check_operators(self.operators)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -551,7 +578,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if self.acceleration_ is not None and self.jerk_ is not None:
             peaks = self.acceleration_, self.jerk_
         seen, via, weights = self.shown_, (self.via_points_, self.via_fade_), weights.clone()
-        begun = len(weights)
+        begun, counted = len(weights), self.operator_weights_
         if added:
             for operator in operators:
                 operator.check(kinematics, added[0].frames)
@@ -578,6 +605,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         weights[forgotten] = 0.0
         kept = kept.without(forgotten)
         self._learn_again(kept)
+        if counted is not None:
+            self._weigh(counted)
         self.shown_, self.demonstration_weights_, self._kept = seen, weights, kept
         self.via_points_, self.via_fade_ = via
         operators = (*operators, *(point.operator for point in self.via_points_))
@@ -1090,6 +1119,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             self.activation,
             self.epsilon,
             self.negligible,
+            repr(self.priorities),
             self.prior_std if isinstance(self.prior_std, Real) else repr(self.prior_std),
         )
         backend = self._backend
@@ -1114,6 +1144,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                     self.prior_std, self.kinematics_, self.operators_, *mixture
                 ),
                 negligible=self.negligible,
+                priorities=self._checked_priorities(self.operators_),
             )
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]
@@ -1192,7 +1223,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ------
         DataError
             If operators refer to objects that may be carried, and ``fusion="covariance"``; if
-            they are in tangent space, and ``activation="product"``.
+            they are in tangent space, and ``activation="product"``; if ``priorities`` are not
+            one per operator, or there is another fusion or activation than the default's.
         """
         carried = carried_objects(operators, kinematics)
         if carried and self.fusion == "covariance":
@@ -1207,6 +1239,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 f"activation='product' asks how operators move with time, and the base of "
                 f"{tangent} moves along: use activation='time' or geometry='quaternion'"
             )
+        self._checked_priorities(operators)
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_, self.time_ = frame_names(operators, kinematics), time
         self.acceleration_ = self.jerk_ = None
@@ -1219,7 +1252,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
         self.n_components_ = len(self.weights_)
         self.shown_ = self.demonstration_weights_ = self._kept = None
-        self.operator_selection_ = self.component_selection_ = None
+        self.operator_selection_ = self.component_selection_ = self.operator_weights_ = None
         self.via_points_, self.via_fade_ = (), 1.0
         self._untried = True
         return self
@@ -1321,6 +1354,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
             "shown": None if self.shown_ is None else self.shown_.config(),
         }
+        if self.operator_weights_ is not None:
+            config["operator_weights"] = self.operator_weights_.tolist()
         if self.via_points_:
             config["via_points"] = [
                 [one.time, encode(one.operator), one.value, one.tolerance]
@@ -1406,6 +1441,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             if "peaks" in config:
                 acceleration, jerk = (as_tensor(x, "peaks") for x in config["peaks"])
                 model._set_peaks(acceleration, jerk)
+            if config.get("operator_weights") is not None:
+                counted = as_tensor(config["operator_weights"], "operator_weights")
+                model.operator_weights_ = counted.to(model.weights_)
             if config.get("shown") is not None:
                 model.shown_ = Shown.from_config(config["shown"])
             if kept is not None:
@@ -1558,6 +1596,30 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             processes=learning.processes,
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
+
+    def _checked_priorities(self, operators: Sequence[Operator]) -> list[int] | None:
+        """One per operator; they ask for the default fusion and activation."""
+        if self.priorities is None:
+            return None
+        given = list(self.priorities)
+        if len(given) != len(operators) or not all(isinstance(p, Integral) for p in given):
+            raise DataError(
+                f"priorities are whole numbers, one for each of the {len(operators)} operators "
+                f"{list(operators)}; got {given}"
+            )
+        if self.fusion != "information" or self.activation != "time":
+            raise DataError(
+                "priorities need fusion='information' and activation='time', which have no "
+                f"regulariser that they would drown in; got {self.fusion!r}, "
+                f"{self.activation!r}"
+            )
+        return list(map(int, given))
+
+    def _weigh(self, weights: Tensor) -> None:
+        """Let operators count for weights (K, J) only."""
+        pairs = zip(self.covariances_, weights.to(self.weights_).unbind(-1), strict=True)
+        self.covariances_ = [weighted(covariances, one) for covariances, one in pairs]
+        self.mixture_.covariances_, self.operator_weights_ = self.covariances_, weights
 
     def _components(
         self,

@@ -36,10 +36,10 @@ __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
 #: Parameters of the estimator that go into the configuration under their own names.
 HYPERPARAMETERS = (
-    "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
-    "n_init", "init_params", "responsibilities", "fusion", "activation", "epsilon",
-    "prior_std", "negligible", "blend", "keep_limits", "robust", "plausibility", "random_state",
-    "dtype",
+    "n_components", "priorities", "operator_weights", "covariance_type", "reg_covar",
+    "covariance_shrinkage", "tol", "max_iter", "n_init", "init_params", "responsibilities",
+    "fusion", "activation", "epsilon", "prior_std", "negligible", "blend", "keep_limits",
+    "robust", "plausibility", "random_state", "dtype",
 )  # fmt: skip
 
 #: Robots that come with the package: what describes each, and its hands.
@@ -106,9 +106,9 @@ class TPGMMConfig(StatePolicyConfig):
 
     Parameters
     ----------
-    n_components, covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, \
-    init_params, responsibilities, fusion, activation, epsilon, prior_std, negligible, blend, \
-    keep_limits, robust, random_state, dtype
+    n_components, priorities, operator_weights, covariance_type, reg_covar, \
+    covariance_shrinkage, tol, max_iter, n_init, init_params, responsibilities, fusion, \
+    activation, epsilon, prior_std, negligible, blend, keep_limits, robust, random_state, dtype
         As for :class:`tpgmm_torch.TaskParameterizedGMM`.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
@@ -215,6 +215,8 @@ class TPGMMConfig(StatePolicyConfig):
     """
 
     n_components: int = 10
+    priorities: list[int] | None = None
+    operator_weights: str = "equal"
     covariance_type: str = "full"
     reg_covar: float = 1e-5
     covariance_shrinkage: float | str = "auto"

@@ -88,6 +88,13 @@ def fit(
             "frames were recorded over time."
         ),
     ] = None,
+    operator_weights: Annotated[
+        Literal["equal", "held-out"],
+        learning(
+            "How much operators count: all alike, or as much as makes episodes that are left "
+            "out most likely."
+        ),
+    ] = "equal",
     n_components: Annotated[
         Any,
         learning(
@@ -213,6 +220,7 @@ def fit(
             operators or default_operators(links, list(data.frames)),
             kinematics,
             holds=given if hold else "auto",
+            operator_weights=operator_weights,
             covariance_type=covariance_type,
             reg_covar=reg_covar,
             covariance_shrinkage=options.number_or_auto(covariance_shrinkage),

@@ -35,6 +35,9 @@ __all__ = ["Components", "Estimate", "Regression"]
 #: operations, and that this memory is not given back and asked for again each time.
 PART = 256
 
+#: The covariance of an operator, as a share of what it would be one priority below.
+STRICT = 1e-4
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -116,6 +119,9 @@ class Regression:
         Components with less than that share of the largest weight are left out: the mean moves
         by at most the weight left out times the distance of the components' means. 0 keeps
         all.
+    priorities : sequence of int, optional
+        One per operator: those of a higher number are fulfilled as if the others were not
+        there, and these in what is left of the joints, see :attr:`ranked`.
     """
 
     kinematics: Kinematics
@@ -127,6 +133,7 @@ class Regression:
     epsilon: float = 1e-4
     prior_std: float | Tensor = PRIOR_STD
     negligible: float = 1e-9
+    priorities: Sequence[int] | None = None
 
     def step(
         self,
@@ -298,6 +305,22 @@ class Regression:
         return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
+    def ranked(self) -> tuple[Conditionals, ...]:
+        """The conditionals as they are fused: covariances of what has priority are scaled down.
+
+        As that scale goes to zero, the product (2) becomes a strict hierarchy: the mean is the
+        one of the higher operators, and in the null space of their Jacobians that of the
+        lower. A scale above zero is its damping.
+        """
+        if self.priorities is None:
+            return tuple(self.conditionals)
+        levels = sorted(set(self.priorities))
+        return tuple(
+            replace(one, covariance=one.covariance * STRICT ** levels.index(priority))
+            for one, priority in zip(self.conditionals, self.priorities, strict=True)
+        )
+
+    @cached_property
     def _update(self) -> KalmanUpdate | None:
         """The update of a prior over the joints, where that is what is asked for."""
         usual = self.fusion == "information" and self.activation == "time"
@@ -305,7 +328,7 @@ class Regression:
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return KalmanUpdate(self.kinematics, self.operators, self.conditionals)
+            return KalmanUpdate(self.kinematics, self.operators, self.ranked)
 
     @cached_property
     def _frame_names(self) -> tuple[str, ...]:
@@ -320,7 +343,7 @@ class Regression:
     @cached_property
     def _components(self) -> Components:
         """All of them."""
-        conditionals = tuple(self.conditionals)
+        conditionals = self.ranked
         if self._update is not None:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)

@@ -83,7 +83,8 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     its likelihood is that of the joints given where the frames are, so that operators of
     every kind compare. From the joints' operators, the candidate that gains most is added
     until none gains ``threshold``; then what gains less, given all others, is dropped. Several
-    that say the same leave one.
+    that say the same leave one; an operator of all joints stays, as it decides what the others
+    leave free.
 
     Parameters
     ----------
@@ -225,7 +226,8 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
             holds=holds,
         )
         joints = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
-        chosen = self._select(evidence, joints)
+        free = [j for j, one in enumerate(operators) if not one.determines_joints]
+        chosen = self._select(evidence, joints, free)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
         self.operators_ = _arranged([operators[j] for j in chosen])
@@ -251,7 +253,9 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
             ("", "operator", "gain", "alone", "at", "left out is off by", "others by", "why")
         ]
         for one in order:
-            if one.kept:
+            if one.kept and one.gain < self.threshold:
+                why = "decides what the others leave free"
+            elif one.kept:
                 why = "decides there"
             elif one.alone >= self.threshold:
                 why = "says what those kept say"
@@ -277,8 +281,10 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
             for line in lines
         )
 
-    def _select(self, evidence: Evidence, joints: Sequence[int]) -> list[int]:
-        """Add what gains most, then drop what gains too little, until nothing changes."""
+    def _select(
+        self, evidence: Evidence, joints: Sequence[int], free: Sequence[int]
+    ) -> list[int]:
+        """Add what gains most, then drop of those ``free`` to go what gains too little."""
         chosen = list(joints)
         everyone = range(len(evidence.jacobians))
         fused = evidence.of(chosen)
@@ -293,16 +299,16 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
                 break
             chosen.append(rest[best])
             fused, likely = evidence.added(fused, rest[best]), likely + gains[best]
-        while len(chosen) > 1:
+        while len(chosen) > 1 and (spare := [j for j in chosen if j in free]):
             losses = [
                 float(likely - evidence.log_likelihood(evidence.of(_without(chosen, j))).mean())
-                for j in chosen
+                for j in spare
             ]
             least = int(np.argmin(losses))
             if losses[least] > self.threshold:
                 break
             likely = likely - losses[least]
-            chosen = _without(chosen, chosen[least])
+            chosen = _without(chosen, spare[least])
         return sorted(chosen)
 
     def _judge(

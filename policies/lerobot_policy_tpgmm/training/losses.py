@@ -71,6 +71,7 @@ def regression(
             config.prior_std, kinematics, operators, weights, list(mixture.means), covariances
         ),
         config.negligible,
+        config.priorities,
     )
 
 

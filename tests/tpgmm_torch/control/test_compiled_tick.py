@@ -174,3 +174,13 @@ def test_a_direction_without_variance_is_an_error_and_no_number():
     model.regression()._selected.clear()
     with pytest.raises(DataError, match="covariance of the tasks is not positive definite"):
         model.step(0.5, [0.2, 0.5], cup())
+
+
+def test_priorities_are_part_of_the_graph():
+    soft, plain, compiled = fitted(), fitted(), fitted()
+    for model in (plain, compiled):
+        model.priorities = [1, 0]
+    compiled.compile("aot_eager")
+    at = 0.4, [0.2, 0.5], cup()
+    assert_same(compiled.step(*at), plain.step(*at))
+    assert float((plain.step(*at).joints - soft.step(*at).joints).abs().max()) > 1e-4
