@@ -41,7 +41,15 @@ extensions = [
     "ties",
     "typelinks",
 ]
-exclude_patterns = ["_build", "_ext", "pictures", "comparison", "images", "gallery/*.py"]
+exclude_patterns = [
+    "_build",
+    "_ext",
+    "pictures",
+    "comparison",
+    "images",
+    "paper/*",
+    "gallery/*.py",
+]
 nitpicky = True
 
 # Pages

@@ -1,0 +1,47 @@
+"""Files for those who come to the repository: well formed, and true where that can be told."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PAPER = ROOT / "docs" / "paper"
+
+
+def test_every_citation_of_the_paper_has_its_entry_and_every_entry_is_cited():
+    text = (PAPER / "paper.md").read_text(encoding="utf-8")
+    entries = re.findall(
+        r"^@\w+\{([\w-]+),", (PAPER / "paper.bib").read_text("utf-8"), re.MULTILINE
+    )
+    assert set(re.findall(r"@([a-z][\w-]*)", text)) == set(entries)
+    assert len(entries) == len(set(entries))
+
+
+def test_the_paper_has_what_joss_asks_for():
+    text = (PAPER / "paper.md").read_text(encoding="utf-8")
+    head = yaml.safe_load(text.split("---")[1])
+    assert {"title", "tags", "authors", "affiliations", "date", "bibliography"} <= head.keys()
+    assert (PAPER / head["bibliography"]).is_file()
+    for heading in ("Summary", "Statement of need", "State of the field", "References"):
+        assert f"\n# {heading}\n" in text
+    for picture in re.findall(r"\]\(([^)]+\.png)\)", text):
+        assert (PAPER / picture).is_file()
+    assert 250 <= len(text.split()) <= 1750
+
+
+@pytest.mark.parametrize("name", ["bug", "wish"])
+def test_issue_templates_ask_in_a_form_that_can_be_shown(name):
+    form = yaml.safe_load((ROOT / ".github" / "ISSUE_TEMPLATE" / f"{name}.yml").read_text())
+    assert {"name", "description", "body"} <= form.keys()
+    for field in form["body"]:
+        assert field["type"] in ("textarea", "input", "dropdown", "checkboxes", "markdown")
+        assert field["id"] and field["attributes"]["label"]
+
+
+def test_commands_that_are_named_exist():
+    targets = re.findall(r"^([a-z]+):.*##", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    for name in ("SECURITY.md", "CODE_OF_CONDUCT.md"):
+        asked = re.findall(r"`make (\w+)`", (ROOT / name).read_text(encoding="utf-8"))
+        assert set(asked) <= set(targets)
