@@ -64,6 +64,7 @@ LATE = {
     "huggingface_hub",
     "lerobot",
     "matplotlib",
+    "mink",
     "mujoco",
     "pandas",
     "pyarrow",

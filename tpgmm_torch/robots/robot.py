@@ -292,6 +292,8 @@ class Robot(Kinematics):
                 f"between its base and links; more than {MOST_JOINTS} are not supported: "
                 "choose some, joints=[...], or lock some, locked={...}"
             )
+        #: What moves the links with respect to the base.
+        self.tree = tree
         options: dict[str, Any] = {"dtype": dtype_named(config["dtype"]), "device": device}
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device

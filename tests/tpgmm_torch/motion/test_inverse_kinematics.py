@@ -1,0 +1,109 @@
+"""Inverse kinematics by mink: poses are reached and followed within the limits."""
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.robot_zoo import HANDS, random_joints, upper_body, zoo
+from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_torch import Frame, quaternions
+from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.motion.inverse_kinematics import follow_poses, reach
+from tpgmm_torch.robots.robot import Robot
+
+
+def poses_at(robot: Robot, joints: Any) -> dict[str, Frame]:
+    state = robot.state(joints)
+    return {link: state.pose(link) for link in robot.links}
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [
+        upper_body(joints="l_*", locked={"waist_*": 0.1}),
+        upper_body(base="torso", tools={"cup": ("l_hand", Frame([0.0, 0.02, -0.1]))}),
+        zoo(("l_finger", "turret"), base="column", coordinates=["light"]),
+    ],
+    ids=["arm", "both hands", "slides"],
+)
+def test_poses_of_a_posture_nearby_are_reached(robot: Robot) -> None:
+    start = 0.5 * random_joints(robot, seed=1).nan_to_num()
+    wanted = start + 0.1 * torch.linspace(-1, 1, robot.n_joints, dtype=torch.float64)
+    wanted = wanted.clamp(robot.lower, robot.upper)
+    start = start.clamp(robot.lower, robot.upper)
+    poses = poses_at(robot, wanted)
+    joints = reach(robot, poses, start, tolerance=1e-5)
+    for link, pose in poses.items():
+        state = robot.state(joints)
+        torch.testing.assert_close(state.position(link), pose.position, rtol=0, atol=1e-5)
+        turn = quaternions.product(
+            pose.orientation, quaternions.conjugate(state.orientation(link))
+        )
+        assert quaternions.log(turn).norm() < 1e-5
+    assert ((joints >= robot.lower - 1e-9) & (joints <= robot.upper + 1e-9)).all()
+    if "light" in robot.joint_names:
+        assert joints[-1] == start[-1]  # it has no kinematics
+
+
+def test_positions_alone_leave_the_turn_free() -> None:
+    robot = upper_body(joints="l_*")
+    start = torch.tensor([0.5, 0.5, -0.3, -1.5, 0, 0, 0], dtype=torch.float64)
+    here = robot.state(start).pose("l_hand")
+    upside_down = Frame(here.position + torch.tensor([0.02, 0.0, 0.02]), [0.0, 1.0, 0.0, 0.0])
+    joints = reach(robot, {"l_hand": upside_down}, start, orientations=False)
+    found = robot.state(joints).position("l_hand")
+    torch.testing.assert_close(found, upside_down.position, rtol=0, atol=1e-4)
+
+
+def test_a_way_is_followed_as_well_as_the_generator_of_the_skill_follows_it() -> None:
+    skill = BottleShaking(rate=25)
+    [demonstration] = skill.demonstrations(1, seed=0)
+    steps = int(demonstration.events["grasp"] * 25)
+    shown = demonstration.joints[:steps]
+    poses = poses_at(skill.robot, shown)
+    joints = follow_poses(
+        skill.robot, poses, shown[0], rate=25, posture=skill.neutral_posture()
+    )
+    assert joints.shape == shown.shape
+    reached = skill.robot.state(joints)
+    for link in HANDS:
+        away = reached.position(link) - poses[link].position
+        assert away.norm(dim=-1).max() < 1e-3
+    speeds = (joints.diff(dim=0) * 25).abs()
+    assert (speeds <= skill.robot.velocity + 1e-6).all()
+    assert ((joints >= skill.robot.lower) & (joints <= skill.robot.upper)).all()
+    jumps = [np.abs(np.diff(path.numpy(), 2, axis=0)).max() for path in (joints, shown)]
+    assert jumps[0] < 2 * jumps[1]
+
+
+class TestRefusing:
+    robot = upper_body(joints="l_*")
+    start = (0.5, 0.5, -0.3, -1.5, 0, 0, 0)
+
+    def test_poses_out_of_reach(self) -> None:
+        far = {"l_hand": Frame([2.0, 0.0, 0.0])}
+        with pytest.raises(DataError, match=r"'l_hand' is .* mm, .* deg away"):
+            reach(self.robot, far, self.start)
+
+    def test_links_and_shapes_that_do_not_fit(self) -> None:
+        one, many = Frame([0.2, 0.1, 0.1]), Frame(np.zeros((4, 3)))
+        with pytest.raises(UnknownNameError, match="link 'nose'"):
+            reach(self.robot, {"nose": one}, self.start)
+        with pytest.raises(ShapeError, match="one pose"):
+            reach(self.robot, {"l_hand": many}, self.start)
+        with pytest.raises(ShapeError, match="same number of poses"):
+            follow_poses(self.robot, {"l_hand": many, "r_hand": one}, self.start, rate=10)
+        with pytest.raises(ShapeError, match="one start"):
+            follow_poses(self.robot, {"l_hand": many}, np.zeros((2, 7)), rate=10)
+
+    def test_joints_that_others_mimic(self) -> None:
+        with pytest.raises(DataError, match="'elbow' moves several links by mimicry"):
+            reach(zoo(("tip",)), {"tip": Frame([0.0, 0.0, 0.0])}, np.zeros(5))
+
+    def test_a_missing_library(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(sys.modules, "mink", None)
+        with pytest.raises(DependencyError, match=r"tpgmm-torch\[ik\]"):
+            reach(self.robot, {"l_hand": Frame([0.2, 0.1, 0.1])}, self.start)

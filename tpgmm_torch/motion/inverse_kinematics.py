@@ -1,0 +1,250 @@
+"""Joints for wanted poses of links, by mink: for key poses, and to generate demonstrations.
+
+mink solves a quadratic programme at each step within the limits of position and speed. It works
+on a MuJoCo model, which is built here from what the robot's kinematics are, so that tools,
+bases and locked joints count.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.robots.robot import Robot
+
+__all__ = ["follow_poses", "reach"]
+
+#: How much a posture counts beside a pose, per radian and metre. More pulls links off their
+#: poses by a millimetre, much less leaves the null space to rounding.
+POSTURE_COST = 1e-3
+#: Steps after which a pose that is not reached counts as out of reach, and their length [s].
+MOST_STEPS, STEP = 300, 0.05
+
+
+def follow_poses(
+    robot: Robot,
+    poses: Mapping[str, Frame],
+    start: Any,
+    *,
+    rate: float,
+    posture: Any = None,
+    orientations: bool = True,
+) -> Tensor:
+    """Joints with which links follow poses, shape (T, n_joints).
+
+    Parameters
+    ----------
+    robot : Robot
+    poses : mapping of str to Frame
+        By link, T poses each in the robot's base frame. The first are those at the start.
+    start : array-like of shape (n_joints,)
+        Where the joints are at first.
+    rate : float
+        Poses per second; joints keep within their limits of position and speed.
+    posture : array-like of shape (n_joints,), optional
+        What joints seek where the poses leave them free, at one radian per second and radian
+        from it; by default the start.
+    orientations : bool, default=True
+        False lets links turn as they like.
+
+    Raises
+    ------
+    DependencyError
+        Without mink, of the extra ``ik``.
+    UnknownNameError
+        If the robot has no such link.
+    DataError, ShapeError
+        If the robot cannot be given to mink (joints that follow others), or the poses are not
+        T each.
+
+    Examples
+    --------
+    >>> from tpgmm_datasets.robots import upper_body_urdf
+    >>> robot = Robot.from_urdf(upper_body_urdf(), links=["l_hand"], joints="l_*")
+    >>> start = [0.5, 0.5, -0.3, -1.5, 0.0, 0.0, 0.0]
+    >>> here = robot.state(start).pose("l_hand")
+    >>> way = torch.linspace(0, 0.05, 50)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    >>> wanted = Frame(here.position + way.double(), here.orientation.expand(50, 4))
+    >>> joints = follow_poses(robot, {"l_hand": wanted}, start, rate=50)
+    >>> (robot.state(joints).position("l_hand") - wanted.position).norm(dim=-1).max() < 1e-3
+    tensor(True)
+    """
+    lengths = {frame.batch_shape for frame in poses.values()}
+    if len(lengths) != 1 or len(next(iter(lengths))) != 1:
+        raise ShapeError(
+            f"each link needs the same number of poses, got {[tuple(n) for n in lengths]}"
+        )
+    solver = _Solver(robot, poses, start, posture, 1 / rate, orientations)
+    joints = [solver.joints]
+    for step in range(1, int(next(iter(lengths))[0])):
+        joints.append(solver.step({link: frame[step] for link, frame in poses.items()}))
+    return torch.stack(joints)
+
+
+def reach(
+    robot: Robot,
+    poses: Mapping[str, Frame],
+    start: Any,
+    *,
+    posture: Any = None,
+    orientations: bool = True,
+    tolerance: float = 1e-4,
+) -> Tensor:
+    """Joints at which links have given poses, shape (n_joints,), found from a start.
+
+    Parameters
+    ----------
+    robot : Robot
+    poses : mapping of str to Frame
+        By link, one pose each in the robot's base frame.
+    start : array-like of shape (n_joints,)
+        Where the search begins; it ends in a posture near it.
+    posture : array-like of shape (n_joints,), optional
+        What joints seek where the poses leave them free; by default the start.
+    orientations : bool, default=True
+        False lets links turn as they like.
+    tolerance : float, default=1e-4
+        How far from a pose is near enough [m and rad].
+
+    Raises
+    ------
+    DependencyError, UnknownNameError, ShapeError
+        As for :func:`follow_poses`.
+    DataError
+        If a pose is out of reach from there, or as for :func:`follow_poses`.
+    """
+    for link, frame in poses.items():
+        if frame.batch_shape:
+            raise ShapeError(f"{link!r} needs one pose, got {tuple(frame.batch_shape)} of them")
+    solver = _Solver(robot, poses, start, posture, STEP, orientations)
+    for _ in range(MOST_STEPS):
+        left = _left(robot, solver.joints, poses, orientations)
+        if max(max(error) for error in left.values()) <= tolerance:
+            break
+        solver.step(poses)
+    else:
+        told = [
+            f"{link!r} is {1e3 * away:.1f} mm, {math.degrees(turn):.1f} deg away"
+            for link, (away, turn) in left.items()
+        ]
+        raise DataError(
+            f"the poses are not reached from this start: {', '.join(told)}. Start nearer, ask "
+            "for positions alone (orientations=False), or for poses within reach"
+        )
+    return solver.joints
+
+
+def _left(
+    robot: Robot, joints: Tensor, poses: Mapping[str, Frame], orientations: bool
+) -> dict[str, tuple[float, float]]:
+    """How far each link is from its pose [m and rad]."""
+    state, left = robot.state(joints), {}
+    for link, pose in poses.items():
+        turn = quaternions.product(
+            pose.orientation, quaternions.conjugate(state.orientation(link))
+        )
+        angle = float(quaternions.log(turn).norm()) if orientations else 0.0
+        left[link] = float((pose.position - state.position(link)).norm()), angle
+    return left
+
+
+class _Solver:
+    """mink on a model of the robot, and where the joints are."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        poses: Mapping[str, Frame],
+        start: Any,
+        posture: Any,
+        period: float,
+        orientations: bool,
+    ) -> None:
+        try:
+            import mink
+        except ImportError as error:
+            raise DependencyError(
+                "inverse kinematics needs mink: pip install 'tpgmm-torch[ik]'"
+            ) from error
+        for link in poses:
+            if link not in robot.links:
+                raise UnknownNameError("link", link, "the robot", robot.links)
+        self.mink, self.period = mink, period
+        model, self.columns = _model(robot)
+        self.joints = robot.joint_tensor(start).cpu().double()
+        if self.joints.ndim != 1:
+            raise ShapeError(f"one start is needed, got {tuple(self.joints.shape)}")
+        rest = self.joints if posture is None else robot.joint_tensor(posture).cpu().double()
+        self.configuration = mink.Configuration(model, self.joints[self.columns].numpy())
+        cost = 1.0 if orientations else 0.0
+        self.tasks = {link: mink.FrameTask(link, "body", 1.0, cost) for link in poses}
+        # a gain of one period: the posture is sought slowly, not within one step
+        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(period, 1.0))
+        self.posture.set_target(rest[self.columns].numpy())
+        speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
+        limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
+        self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
+
+    def step(self, poses: Mapping[str, Frame]) -> Tensor:
+        """The joints one period later, on the way to the poses."""
+        for link, pose in poses.items():
+            orientation, position = pose.orientation.cpu().numpy(), pose.position.cpu().numpy()
+            target = self.mink.SE3(np.concatenate((orientation, position)))
+            self.tasks[link].set_target(target)
+        tasks = [*self.tasks.values(), self.posture]
+        velocity = self.mink.solve_ik(
+            self.configuration, tasks, self.period, "daqp", damping=1e-9, limits=self.limits
+        )
+        self.configuration.integrate_inplace(velocity, self.period)
+        self.joints = self.joints.clone()
+        self.joints[self.columns] = torch.from_numpy(self.configuration.q.copy())
+        return self.joints
+
+
+def _model(robot: Robot) -> tuple[Any, list[int]]:
+    """A MuJoCo model that moves as the robot does, and which joints it has, in its order."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    bodies = [spec.worldbody]
+    columns: list[int] = []
+    for frame in robot.tree.frames:
+        name = robot.joint_names[frame.joint]
+        if frame.joint in columns or (frame.multiplier, frame.shift) != (1.0, 0.0):
+            raise DataError(
+                f"joint {name!r} moves several links by mimicry, which inverse kinematics does "
+                "not know: lock it, locked={...}, or name links that do not need it"
+            )
+        columns.append(frame.joint)
+        slide = mujoco.mjtJoint.mjJNT_SLIDE if frame.prismatic else mujoco.mjtJoint.mjJNT_HINGE
+        body = _add(bodies[frame.parent + 1], f"frame {len(columns)}", frame.offset)
+        ends = [float(limit[frame.joint]) for limit in (robot.lower, robot.upper)]
+        bounded = all(map(math.isfinite, ends))
+        joint = body.add_joint(name=name, type=slide, axis=frame.axis)
+        joint.limited = int(bounded)
+        if bounded:
+            joint.range = ends
+        bodies.append(body)
+    for link, place in zip(robot.links, robot.tree.links, strict=True):
+        _add(bodies[place.frame + 1], link, place.pose)
+    model = spec.compile()
+    names = [model.joint(i).name for i in range(model.njnt)]
+    return model, [robot.joint_names.index(name) for name in names]
+
+
+def _add(parent: Any, name: str, pose: Array) -> Any:
+    turn = quaternions.from_matrix(torch.from_numpy(pose[:3, :3].copy())).numpy()
+    # the mass says nothing here, but MuJoCo wants one of what moves
+    body = parent.add_body(name=name, pos=pose[:3, 3], quat=turn, mass=1.0, inertia=np.ones(3))
+    body.explicitinertial = True
+    return body
