@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
         ("exceptions",),
-        ("atomic", "quaternions", "gaussians"),
+        ("atomic", "quaternions", "gaussians", "notebook"),
         ("storage",),
         ("data", "em"),
         ("robots", "alignment", "large_data"),

@@ -74,6 +74,12 @@ class Command:
     impedance: Impedance | None = None
     compute_novelty: Callable[[], Tensor] | None = None
 
+    def __repr__(self) -> str:
+        return (
+            f"Command(reference of shape {tuple(self.reference.shape)}, "
+            f"time={self.time.tolist()}, status={self.status})"
+        )
+
     @property
     def status(self) -> Any:
         """A :class:`Status`, of a batch in (nested) lists.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.notebook import Tabular
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -131,7 +132,7 @@ class Reference:
         return self.carrier == other.carrier
 
 
-class Operator(ABC):
+class Operator(Tabular, ABC):
     """A candidate projection operator: a row of the paper's Table I.
 
     Subclass it for an operator of your own: give :meth:`dimension`, :meth:`linearize` and
@@ -153,6 +154,12 @@ class Operator(ABC):
     @abstractmethod
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """The local coordinates X_t of a state, shape (..., D)."""
+
+    def _rows(self) -> dict[str, object]:
+        rows: dict[str, object] = {"what": (type(self).__doc__ or "").partition("\n")[0]}
+        if is_dataclass(self):
+            rows |= {field.name: getattr(self, field.name) for field in fields(self)}
+        return rows
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """Where unit quaternions begin among the local coordinates; none by default."""

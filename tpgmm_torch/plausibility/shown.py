@@ -97,6 +97,9 @@ class Shown:
     frames: Mapping[str, ShownFrame]
     novelty: Novelty | None = None
 
+    def __repr__(self) -> str:
+        return f"Shown({self.n_demonstrations} demonstrations, frames={sorted(self.frames)})"
+
     @classmethod
     def of(cls, episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Self:
         """Summarise demonstrations.

@@ -60,6 +60,12 @@ class Estimate:
     activation: Tensor
     candidates: tuple[Candidate, ...] = ()
 
+    def __repr__(self) -> str:
+        return (
+            f"Estimate(joints of shape {tuple(self.joints.shape)}, "
+            f"{self.activation.shape[-1]} components, {len(self.candidates)} candidates)"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Components:

@@ -22,6 +22,7 @@ from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
+from tpgmm_torch.notebook import Tabular, listed
 
 __all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]
 
@@ -78,6 +79,10 @@ class RobotState:
     jacobians: Tensor
     carriers: Tensor | None = None
     joint_names: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        kind = type(self).__name__
+        return f"{kind}(joints of shape {tuple(self.joints.shape)}, links={self.links})"
 
     @property
     def robot_links(self) -> tuple[str, ...]:
@@ -261,7 +266,7 @@ class RobotState:
         return self.links.index(link)
 
 
-class Kinematics(abc.ABC):
+class Kinematics(Tabular, abc.ABC):
     """What the operators need of a robot; derive from it to bring your own.
 
     A subclass sets the attributes below and defines :meth:`state`, nothing else. It must not
@@ -318,6 +323,13 @@ class Kinematics(abc.ABC):
     def n_joints(self) -> int:
         """Number of coordinates of the joint vector."""
         return len(self.joint_names)
+
+    def _rows(self) -> dict[str, object]:
+        limits = zip(self.joint_names, self.lower.tolist(), self.upper.tolist(), strict=True)
+        return {
+            "links": listed(self.links),
+            "joints and their limits": listed(f"{n} [{a:.4g}, {b:.4g}]" for n, a, b in limits),
+        }
 
     @abc.abstractmethod
     def state(self, joints: Any) -> RobotState:
