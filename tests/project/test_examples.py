@@ -1,11 +1,14 @@
 """The gallery: every script runs, draws, and keeps what its text says."""
 
+import re
 import runpy
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from tests.support.robot_zoo import G1_PATH
 
 FOLDER = Path(__file__).parents[2] / "examples"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("plot_*.py"))
@@ -168,6 +171,16 @@ def test_the_model_hits_more_softly_than_position_control():
         for soft in (True, False)
     )
     assert 0 < soft < 0.5 * stiff
+
+
+def test_a_humanoid_takes_a_box_that_it_has_not_seen(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["g1", str(G1_PATH), "--demonstrations", "4"])
+    runpy.run_path(str(FOLDER / "g1_upper_body.py"), run_name="__main__")
+    shown, *boxes = capsys.readouterr().out.splitlines()
+    assert "17 joints, grasps to 0.0" in shown
+    errors = [float(number) for line in boxes for number in re.findall(r"([\d.]+) mm", line)]
+    assert len(errors) == 6
+    assert max(errors) < 10
 
 
 def test_moving_pictures_show_that_time_waits(tmp_path):
