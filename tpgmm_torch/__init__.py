@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     from tpgmm_torch.motion.follower import Follower
     from tpgmm_torch.motion.motion_bounds import MotionBounds
+    from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.tracked_poses import Poses
     from tpgmm_torch.sensing.pose_filter import OneEuro
     from tpgmm_torch.sensing.trust import Trust
+    from tpgmm_torch.structure.mode_selection import ModeSelection
     from tpgmm_torch.structure.operator_selection import OperatorSelection
     from tpgmm_torch.training.hold_detection import find_holds
 
@@ -72,7 +74,10 @@ __all__ = [
     "LinearDynamics",
     "Linearization",
     "LocalizingClock",
+    "ModeChoice",
+    "ModeSelection",
     "MotionBounds",
+    "MultimodalTaskParameterizedGMM",
     "OneEuro",
     "Operator",
     "OperatorSelection",
@@ -113,6 +118,7 @@ _HOMES = {
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
     "motion.follower": ("Follower",),
     "motion.motion_bounds": ("MotionBounds",),
+    "multimodal": ("ModeChoice", "MultimodalTaskParameterizedGMM"),
     "operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",
@@ -130,6 +136,7 @@ _HOMES = {
     "robots.robot": ("Robot",),
     "sensing.pose_filter": ("OneEuro",),
     "sensing.trust": ("Trust",),
+    "structure.mode_selection": ("ModeSelection",),
     "structure.operator_selection": ("OperatorSelection",),
     "data.trajectories": ("Candidate", "Trajectory"),
     "training.hold_detection": ("find_holds",),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from numbers import Integral, Real
@@ -50,7 +50,7 @@ from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
-from tpgmm_torch.persistence import CONFIG, MODEL, TENSORS, decode, encode
+from tpgmm_torch.persistence import CONFIG, MODEL, MODES, TENSORS, decode, encode
 from tpgmm_torch.plausibility.check import (
     episodes_report,
     learning_report,
@@ -1088,18 +1088,43 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
         """Mean log-likelihood per time step of each demonstration, (n,); see :meth:`score`."""
+        return np.array([float(density.mean()) for _, _, density in self._densities(X)])
+
+    def surprise(self, X: Sequence[Demonstration]) -> list[Tensor]:
+        """How much less likely demonstrations are than what is expected, instant by instant.
+
+        Parameters
+        ----------
+        X : sequence of Demonstration
+            Or motions of which it is asked whether they are the skill.
+
+        Returns
+        -------
+        list of Tensor of shape (T,)
+            Difference of the log-densities of :meth:`score` [nats].
+        """
+        regression, count = self.regression(), len(self.operators_)
+        return [
+            regression.log_density(
+                time, [regression.expected(j, time) for j in range(count)], n
+            )
+            - density
+            for time, n, density in self._densities(X)
+        ]
+
+    def _densities(
+        self, X: Sequence[Demonstration]
+    ) -> Iterator[tuple[Tensor, float | None, Tensor]]:
+        """Times (T,), number of samples and log-densities (T,) of each demonstration."""
         rows, regression = self._rows(X), self.regression()
         n_samples = None
         if self.shown_ is not None and self.covariance_shrinkage != 0:
             n_samples = self.shown_.n_demonstrations
         widths = block_widths(self.operators_, self.kinematics_)
-        scores = []
         for row in rows:
             blocks = torch.from_numpy(row).to(self.means_[0]).split(list(widths), 1)
-            local = [block[:, 1:] for block in blocks]
-            density = regression.log_density(blocks[0][:, 0], local, n_samples)
-            scores.append(float(density.mean()))
-        return np.array(scores)
+            time, local = blocks[0][:, 0], [block[:, 1:] for block in blocks]
+            yield time, n_samples, regression.log_density(time, local, n_samples)
 
     def bic(self, X: Sequence[Demonstration]) -> float:
         """Bayesian information criterion on demonstrations; lower is better."""
@@ -1400,6 +1425,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             If it is truncated, tampered with, of another version, or does not fit together,
             or its device is not there.
         """
+        if (Path(path) / MODES).is_dir():
+            raise ModelFileError(
+                f"{path} holds a model of several ways: read it by "
+                "MultimodalTaskParameterizedGMM.load, or one of its modes alone, "
+                f"{Path(path) / 'mode_0'}"
+            )
         config, tensors = MODEL.read(path)
         try:
             operators = [decode(item, custom) for item in config["operators"]]

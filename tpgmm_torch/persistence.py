@@ -30,6 +30,8 @@ __all__ = [
 #: How a model is written and read.
 MODEL = Folder("model", 1)
 TENSORS = MODEL.tensors
+#: Beside the models of several modes, the folder that says how one of them is chosen.
+MODES = "modes"
 KNOWN: dict[str, type] = {
     name: getattr(builtin_operators, name)
     for name in builtin_operators.__all__

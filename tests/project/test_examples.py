@@ -95,6 +95,14 @@ CLAIMS = {
             == ["cup", "tray"]
         ),
     ),
+    "plot_13_two_ways.py": (
+        1,
+        lambda v: (
+            v["model"].labels_.tolist() == [0, 1, 0, 0, 1, 1, 0, 1, 1, 0]
+            and min(v["passed"]["two modes"]) > 9
+            and np.median(v["passed"]["single model"]) < 6
+        ),
+    ),
     "plot_14_corrections.py": (
         1,
         lambda v: (

@@ -33,7 +33,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("events", "structure"),
         ("control", "hub"),
         ("estimator",),
-        ("corrections", "model_selection", "plotting", "viewing"),
+        ("corrections", "model_selection", "multimodal", "plotting", "viewing"),
         ("cli",),
     ),
     "tpgmm_datasets": (

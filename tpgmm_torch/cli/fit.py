@@ -15,6 +15,7 @@ from tpgmm_torch.cli.plugins import OWN, model_format
 if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.estimator import TaskParameterizedGMM
+    from tpgmm_torch.exceptions import DataError
 
 __all__ = ["app"]
 
@@ -150,6 +151,15 @@ def fit(
             "step and coordinate; not with --batch-episodes or --format lerobot."
         ),
     ] = False,
+    modes: Annotated[
+        Any,
+        learning(
+            "In how many ways the skill is done, each a model of its own; 'auto' finds it. "
+            "'tpgmm reproduce' takes several as a whole, all else one of them, DIR/mode_0.",
+            parser=options.count_or_auto,
+            metavar="auto | INTEGER",
+        ),
+    ] = 1,
     random_state: Annotated[int, learning("Seed of what is random.")] = 0,
     checkpoint: Annotated[
         Path | None,
@@ -194,6 +204,7 @@ def fit(
     from tpgmm_torch.exceptions import DataError
     from tpgmm_torch.large_data.checkpoints import Checkpoint
     from tpgmm_torch.large_data.processes import joined_processes
+    from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
     from tpgmm_torch.operators.text import default_operators, parse_operator
 
     write = model_format(output_format)
@@ -201,6 +212,12 @@ def fit(
         raise DataError(
             "--keep-demonstrations is for the format 'tpgmm', without --batch-episodes; 'tpgmm "
             "correct' makes the policy of it"
+        )
+    together = batch_episodes is None and checkpoint is None and not keep_demonstrations
+    if modes != 1 and not together:
+        raise DataError(
+            "--modes compares all episodes with each other: it goes without --batch-episodes, "
+            "--checkpoint and --keep-demonstrations"
         )
     operators: Any = "auto"
     if operator != ["auto"]:
@@ -236,7 +253,22 @@ def fit(
             epsilon=epsilon,
             blend=blend,
             plausibility=plausibility,
-        ).fit(data.source, checkpoint=state, processes=processes)
+        )
+        if modes == 1:
+            model.fit(data.source, checkpoint=state, processes=processes)
+        elif processes.count > 1:
+            raise DataError("--modes compares all episodes with each other, in one process")
+        else:
+            ways = MultimodalTaskParameterizedGMM(model, modes).fit(data.aligned)
+            assert ways.mode_selection_ is not None
+            if ways.n_modes_ > 1 and write is not None:
+                raise _refusal(ways.labels_.tolist(), output_format)
+            typer.echo(f"{ways.mode_selection_.report()}\n")
+            if ways.n_modes_ > 1:
+                ways.save(out)
+                typer.echo(f"saved            {out}, with mode_0 to mode_{ways.n_modes_ - 1}")
+                return
+            [model] = ways.models_
         durations, steps = data.summary(processes)
         if processes.rank > 0:
             return
@@ -252,6 +284,21 @@ def fit(
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
+
+
+def _refusal(labels: Sequence[int], output_format: str) -> DataError:
+    """What to say where a format holds one model, and there are several."""
+    from tpgmm_torch.exceptions import DataError
+
+    members = [
+        ",".join(str(episode) for episode, one in enumerate(labels) if one == mode)
+        for mode in range(max(labels) + 1)
+    ]
+    return DataError(
+        f"the format {output_format!r} holds one model, these are {len(members)} ways: of the "
+        f"episodes read, {' and '.join(members)}. Fit one of them, --modes 1 --episodes "
+        f"{members[0]}"
+    )
 
 
 def _report(

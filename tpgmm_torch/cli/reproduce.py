@@ -74,13 +74,22 @@ def reproduce(
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
+    from tpgmm_torch.persistence import MODES
 
     if out.suffix not in FORMATS:
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
         raise DataError("give either --situations FILE.json or --dataset DATASET")
-    fitted = TaskParameterizedGMM.load(model, device="cpu")
-    kinematics = fitted.kinematics_
+    fitted: TaskParameterizedGMM | MultimodalTaskParameterizedGMM
+    if (model / MODES).is_dir():
+        if via:
+            raise DataError(f"--via is for one way, as {model / 'mode_0'}")
+        fitted = ways = MultimodalTaskParameterizedGMM.load(model, device="cpu")
+        kinematics = ways.models_[0].kinematics_
+    else:
+        fitted = one = TaskParameterizedGMM.load(model, device="cpu")
+        kinematics = one.kinematics_
     if dataset is not None:
         wanted = [
             Situation.of(demonstration)
@@ -91,11 +100,14 @@ def reproduce(
     elif situations is not None:
         wanted = read_situations(situations, kinematics.joint_names)
     if via:
-        fitted = fitted.with_via_points(via, fade)
+        fitted = one.with_via_points(via, fade)
     trajectories = fitted.predict(wanted, candidates=False)
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
+    if isinstance(fitted, MultimodalTaskParameterizedGMM):
+        for number, choice in enumerate(fitted.choose(wanted)):
+            typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
 
 

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Observation
+from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Observation, Progress
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
@@ -307,6 +307,24 @@ class Controller:
             other._inputs = self._inputs.hear(passed, joints, frames)
             other._frames = other._inputs.frames
         return other
+
+    def switched(self, other: Self, progress: Progress) -> Self:
+        """The same robots from here on with another skill, into which they are faded.
+
+        Parameters
+        ----------
+        other : Controller
+            Of that skill, for the same robots and objects.
+        progress : Progress
+            Where they are in it.
+        """
+        skill = self.copy()
+        skill._regression, skill._end, skill._progress = other._regression, other._end, progress
+        skill._novelty, skill._via, skill._search = other._novelty, other._via, PostureSearch()
+        if not self.holding.held:
+            skill.holding = other.holding
+        skill._restart_fading(torch.ones_like(self._led))
+        return skill
 
     def _hear(
         self,

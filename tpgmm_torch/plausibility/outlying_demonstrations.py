@@ -23,7 +23,13 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.training_rows import at_phases, typical_time
 
-__all__ = ["Outlying", "left_out", "outlying_demonstrations", "outlying_rows"]
+__all__ = [
+    "Outlying",
+    "comparable_coordinates",
+    "left_out",
+    "outlying_demonstrations",
+    "outlying_rows",
+]
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
@@ -117,7 +123,7 @@ def outlying_rows(
     step = float(time[-1] - time[0]) / max(len(time) - 1, 1)
     count = min(max(round(LONG / step), 1), len(time)) if step > 0 else 1
     found: dict[int, Outlying] = {}
-    for operator, local, near in _coordinates(data, operators, kinematics):
+    for operator, local, near in comparable_coordinates(data, operators, kinematics):
         distance = torch.linalg.vector_norm(local - local.median(0).values, dim=-1)  # (M, T)
         usual = distance.median(0).values.clamp(min=near)
         ratios, instants = (distance / (CONSISTENT * usual)).topk(count, dim=1)
@@ -130,10 +136,28 @@ def outlying_rows(
     return tuple(found[episode] for episode in sorted(found))
 
 
-def _coordinates(
-    data: Tensor, operators: Sequence[Operator], kinematics: Kinematics
+def comparable_coordinates(
+    data: Tensor, operators: Sequence[Operator], kinematics: Kinematics, least: float = 0.0
 ) -> Iterator[tuple[Operator, Tensor, float]]:
-    """Coordinates (M, T, D) that have one unit, by operator, and what is near in it."""
+    """Coordinates of demonstrations that have one unit, by operator, and what is near in it.
+
+    Parameters
+    ----------
+    data : Tensor of shape (M, T, sum_j (1 + D_j))
+        Local data of M demonstrations, at equal phase.
+    operators : sequence of Operator
+        Members of a :class:`Stack` come one by one.
+    kinematics : Kinematics
+    least : float, default=0
+        Joints are compared in units of their ranges, of at least that [rad or m].
+
+    Yields
+    ------
+    operator : Operator
+    coordinates : Tensor of shape (M, T, D)
+    near : float
+        Distance at which two points mean the same.
+    """
     column = 0
     for operator in operators:
         column += 1  # time
@@ -155,7 +179,7 @@ def _coordinates(
             if leaf.determines_joints or isinstance(
                 leaf, Canonical
             ):  # of which each has a unit of its own
-                local = local[..., spread > 0] / spread[spread > 0]
+                local = local[..., spread > 0] / spread[spread > 0].clamp(min=least)
                 yield leaf, local, NEAR * local.shape[-1] ** 0.5
             else:
                 yield leaf, local, NEAR * float(torch.linalg.vector_norm(spread))

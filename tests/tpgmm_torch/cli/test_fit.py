@@ -147,3 +147,35 @@ def test_fit_finds_the_number_of_components(dataset, tmp_path):
 def test_what_is_no_number_of_components_is_refused(dataset, tmp_path):
     line = refusal("fit", dataset, "--n-components", "some", "--out", tmp_path / "model")
     assert "'some' is neither a positive integer nor 'auto'" in line
+
+
+def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
+    rng, time, shown = np.random.default_rng(0), np.linspace(0, 1.95, 40), []
+    for side in np.resize([1, -1], 8):
+        bump = 0.3 * side * np.sin(np.pi * time / 2) + 0.01 * rng.normal()
+        path = np.stack((0.4 * time, bump), axis=1)
+        shown.append(Demonstration(time, path, joint_names=["forward", "sideways"]))
+    save_lerobot(shown, tmp_path / "set", fps=20, task="pass on either side")
+    given = ("fit", tmp_path / "set", "--n-components", 5, "--alignment", "none", *CALMLY)
+    text = output(*given, "--modes", "auto", "--out", tmp_path / "model")
+    assert "2 ways:" in text and "  1  4 of 8 demonstrations: 1, 3, 5, 7" in text
+    assert {path.name for path in (tmp_path / "model").iterdir()} == {
+        "modes", "mode_0", "mode_1",
+    }  # fmt: skip
+    text = output(
+        "reproduce", tmp_path / "model", "--dataset", tmp_path / "set", "--episodes", "0",
+        "--out", tmp_path / "new.csv",
+    )  # fmt: skip
+    assert "(mode 0: p = " in text
+    line = refusal(
+        "plot", tmp_path / "model", "--dataset", tmp_path / "set", "--out", tmp_path / "plots"
+    )
+    assert "holds a model of several ways" in line
+    line = refusal(
+        *given, "--modes", 2, "--checkpoint", tmp_path / "c", "--out", tmp_path / "m"
+    )
+    assert "--modes compares all episodes" in line
+    line = refusal(*given, "--modes", 2, "--format", "lerobot", "--out", tmp_path / "policy")
+    assert (
+        "holds one model, these are 2 ways: of the episodes read, 0,2,4,6 and 1,3,5,7" in line
+    )

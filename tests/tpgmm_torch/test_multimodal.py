@@ -1,0 +1,231 @@
+"""A skill of several ways: a model for each, the one that suits, and changing it."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sklearn.base import clone
+
+from tests.support.skills import handlings, hands_model, new_handling
+from tests.support.two_ways import Handles, Obstacle, fitted, shown, tip, turned
+from tpgmm_torch import (
+    Frame,
+    ModeSelection,
+    MultimodalTaskParameterizedGMM,
+    Situation,
+    TaskParameterizedGMM,
+)
+from tpgmm_torch.exceptions import ModelFileError, NotFittedError, ShapeError, UnknownNameError
+
+FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
+
+
+def reach_of_one_handle(n, seed=0):
+    """Objects so far away that the arm reaches one of the two handles only."""
+    rng, found = np.random.default_rng(seed), []
+    while len(found) < n:
+        radius, angle = rng.uniform(0.75, 0.95), rng.uniform(0, 0.6)
+        place = (radius * np.cos(angle), radius * np.sin(angle), 0)
+        frame = Frame(place, turned(rng.uniform(-0.5, 0.5)))
+        far = Handles().handles(frame).norm(dim=-1)
+        if far.max() > 0.93 and far.min() < 0.87:
+            found.append(Situation(Handles().start(rng), {"object": frame}))
+    return found
+
+
+@pytest.mark.parametrize("task", [Obstacle, Handles])
+def test_each_way_succeeds_where_the_mean_of_both_does_not(task):
+    situations = task().situations(10, 0)
+    single = task().model().set_params(robust=False).fit(shown(task)[0])
+    done = {
+        name: sum(
+            task().succeeded(trajectory, situation)
+            for trajectory, situation in zip(
+                model.predict(situations, candidates=False), situations, strict=True
+            )
+        )
+        for name, model in (("single", single), ("modes", fitted(task)))
+    }
+    assert done["modes"] == 10
+    assert done["single"] <= 5
+
+
+def test_one_way_is_the_plain_model_bit_for_bit():
+    demonstrations = handlings(4)
+    model = MultimodalTaskParameterizedGMM(hands_model()).fit(demonstrations)
+    plain = hands_model().fit(demonstrations)
+    situation, _ = new_handling()
+    assert model.n_modes_ == 1
+    [ours], [theirs] = model.predict([situation]), plain.predict([situation])
+    assert torch.equal(ours.joints, theirs.joints)
+    assert torch.equal(ours.covariance, theirs.covariance)
+    assert model.score(demonstrations) == plain.score(demonstrations)
+    [choice] = model.choose([situation])
+    assert choice.mode == 0 and choice.probabilities == [1.0]
+    ours, theirs = (m.controller(situation.joints, situation.frames) for m in (model, plain))
+    for _ in range(5):
+        ours.step(0.1), theirs.step(0.1)
+    assert torch.equal(ours.reference, theirs.reference)
+
+
+def test_the_order_of_demonstrations_does_not_matter():
+    demonstrations, _ = shown(Handles)
+    order = np.random.default_rng(1).permutation(len(demonstrations))
+    model = fitted(Handles)
+    other = clone(model).fit([demonstrations[i] for i in order])
+    names = [model.labels_[order][other.labels_ == k][0] for k in range(2)]
+    np.testing.assert_allclose(other.weights_, model.weights_[names])
+    situations = Handles().situations(3, 0)
+    for a, b in zip(model.predict(situations), other.predict(situations), strict=True):
+        torch.testing.assert_close(a.joints, b.joints, rtol=0, atol=2e-3)
+
+
+@pytest.mark.filterwarnings(FAR)
+def test_the_mode_is_one_that_the_robot_can_do():
+    model, situations = fitted(Handles), reach_of_one_handle(3)
+    for situation, choice in zip(situations, model.choose(situations), strict=True):
+        each = [
+            Handles().succeeded(mode.predict(situation, candidates=False)[0], situation)
+            for mode in model.models_
+        ]
+        assert each[choice.mode] and not each[1 - choice.mode]
+        assert choice.misfit[1 - choice.mode] > choice.misfit[choice.mode]
+        assert choice.probabilities[choice.mode] > 0.9
+        assert str(choice).startswith(f"mode {choice.mode} (mode 0: p = ")
+        biased = copy.copy(model)  # what was shown more often does not help the arm to reach
+        biased.weights_ = np.where(np.arange(2) == choice.mode, 0.01, 0.99)
+        assert biased.choose(situation)[0].mode == choice.mode
+
+
+def test_the_mode_is_one_that_was_shown_in_situations_like_this():
+    """Objects within reach stand as far from the demonstrations of one mode as you like."""
+    model, [situation] = fitted(Handles), Handles().situations(1, 5)
+    for mode in (0, 1):
+        moved = copy.copy(model)
+        moved.models_ = [copy.copy(one) for one in model.models_]
+        shown_by_it = moved.models_[mode].shown_
+        novelty = shown_by_it.novelty
+        elsewhere = {
+            name: replace(place, mean=[x + 5 for x in place.mean])
+            for name, place in novelty.places.items()
+        }
+        novelty = replace(novelty, places=elsewhere)
+        moved.models_[mode].shown_ = replace(shown_by_it, novelty=novelty)
+        assert moved.choose(situation)[0].mode == 1 - mode
+
+
+def test_a_saved_model_is_the_same(tmp_path):
+    model, situations = fitted(Handles), Handles().situations(2, 1)
+    model.save(tmp_path / "model")
+    model.save(tmp_path / "model")  # over itself
+    again = MultimodalTaskParameterizedGMM.load(tmp_path / "model")
+    for a, b in zip(model.predict(situations), again.predict(situations), strict=True):
+        assert torch.equal(a.joints, b.joints)
+    for a, b in zip(model.choose(situations), again.choose(situations), strict=True):
+        assert a.mode == b.mode
+        np.testing.assert_array_equal(a.probabilities, b.probabilities)
+    np.testing.assert_array_equal(model.labels_, again.labels_)
+    assert again.mode_selection_ is None
+    again.save(tmp_path / "copy")
+    one = TaskParameterizedGMM.load(tmp_path / "model" / "mode_1")
+    assert torch.equal(one.weights_, model.models_[1].weights_)
+    with pytest.raises(ModelFileError, match="holds a model of several ways"):
+        TaskParameterizedGMM.load(tmp_path / "model")
+
+
+def test_files_that_are_no_such_model_are_refused_and_left_alone(tmp_path):
+    model = fitted(Handles)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes").write_text("mine")
+    with pytest.raises(ModelFileError, match="no saved model of several ways"):
+        model.save(tmp_path / "other")
+    assert (tmp_path / "other" / "notes").read_text() == "mine"
+    with pytest.raises(ModelFileError, match="is not a saved modes"):
+        MultimodalTaskParameterizedGMM.load(tmp_path / "other")
+    model.save(tmp_path / "model")
+    (tmp_path / "model" / "mode_1" / "config.json").unlink()
+    with pytest.raises(ModelFileError, match="mode_1 is not a saved model"):
+        MultimodalTaskParameterizedGMM.load(tmp_path / "model")
+
+
+def test_score_is_that_of_a_mixture():
+    model, (demonstrations, _) = fitted(Handles), shown(Handles)
+    lengths = np.array([len(one) for one in demonstrations])
+    each = np.array([mode.score_samples(demonstrations) for mode in model.models_])
+    likeliest = (lengths * each + np.log(model.weights_)[:, None]).max(0) / lengths
+    np.testing.assert_allclose(model.score_samples(demonstrations), likeliest, rtol=1e-9)
+    assert model.score(demonstrations) > max(m.score(demonstrations) for m in model.models_)
+
+
+def test_parameters_reach_the_modes():
+    model = fitted(Handles)
+    assert clone(model).set_params(model__n_components=4).model.n_components == 4
+    two = MultimodalTaskParameterizedGMM(model.model, ModeSelection(n_modes=2))
+    two.fit(shown(Handles)[0])
+    np.testing.assert_array_equal(two.labels_, model.labels_)
+    with pytest.raises(NotFittedError):
+        clone(model).predict([])
+
+
+def run(controller, situation, moved=None, at=0.8):
+    """References of a skill during which an object is moved; and the largest jump in speed."""
+    velocity, largest = torch.zeros(3).double(), 0.0
+    for _ in range(90):
+        before = moved is None or controller.time < at
+        frames = situation.frames if before else moved.frames
+        command = controller.step(0.05, controller.reference, frames)
+        largest = max(largest, float((command.velocity - velocity).abs().max()))
+        velocity = command.velocity
+        if controller.finished:
+            break
+    return largest
+
+
+@pytest.mark.filterwarnings(FAR)
+def test_while_both_are_open_the_way_is_changed_without_a_jump():
+    model, switched = fitted(Handles), 0
+    for situation, moved in zip(
+        Handles().situations(2, 2), reach_of_one_handle(2, 3), strict=True
+    ):
+        controller = model.controller(situation.joints, situation.frames)
+        first = controller.mode
+        largest = run(controller, situation, moved)
+        plain = [m.controller(situation.joints, situation.frames) for m in model.models_]
+        assert largest <= 1.2 * max(run(one, situation, moved) for one in plain)
+        gap = tip(controller.reference) - Handles().handles(moved.frames["object"])
+        assert float(gap.norm(dim=-1).min()) < 0.015
+        switched += controller.mode != first
+    assert switched >= 1
+
+
+def test_who_is_left_alone_stays_on_the_way_that_was_chosen():
+    model = fitted(Handles)
+    for situation in Handles().situations(2, 4):
+        controller = model.controller(situation.joints, situation.frames)
+        plain = model.models_[controller.mode].controller(situation.joints, situation.frames)
+        run(controller, situation), run(plain, situation)
+        assert controller.mode == model.choose(situation)[0].mode
+        assert torch.equal(controller.reference, plain.reference)
+
+
+def test_a_robot_that_is_moved_over_goes_on_the_other_way():
+    model, [situation] = fitted(Handles), Handles().situations(1, 6)
+    controller = model.controller(situation.joints, situation.frames)
+    first = controller.mode
+    while controller.time < 2.0:
+        controller.step(0.05, controller.reference, situation.frames)
+    [over] = model.models_[1 - first].predict(situation, candidates=False)
+    there = over.joints[int((over.time - controller.time).abs().argmin())]
+    for _ in range(6):
+        controller.step(0.05, there, situation.frames)
+    assert controller.mode == 1 - first
+
+
+def test_one_controller_is_for_one_robot():
+    model, situation = fitted(Handles), Handles().situations(1, 0)[0]
+    with pytest.raises(ShapeError, match="make one for each"):
+        model.controller(situation.joints.expand(2, 3), situation.frames)
+    with pytest.raises(UnknownNameError, match="object"):
+        model.controller(situation.joints)

@@ -1,0 +1,399 @@
+"""Whether demonstrations show one way of doing a skill, or several."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator
+from sklearn.utils._param_validation import Interval, StrOptions
+
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.plausibility.likeness import SMALLEST_RANGE
+from tpgmm_torch.plausibility.outlying_demonstrations import comparable_coordinates
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.structure.operator_selection import candidate_operators
+from tpgmm_torch.training.hold_detection import holds_for
+from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.training_rows import at_phases, typical_time
+
+__all__ = ["ModeSelection"]
+
+#: A way that was shown once is an exception, and has no variance.
+FEWEST = 2
+#: Stretches of the skill of which each is looked at by itself,
+STRETCHES = 20
+#: and principal axes of the coordinates there.
+AXES = 3
+#: Modes are so many times farther apart than the farthest next neighbour of one mode.
+APART = 3.0
+#: A partition that where demonstrations begin shows as well, to so large a share of what it
+#: gains in likelihood later, is one of situations.
+SITUATION = 0.5
+
+
+@dataclass(frozen=True)
+class _View:
+    """Demonstrations in the coordinates of one operator: floor, and values (N, T, D)."""
+
+    operator: Operator
+    values: Array
+    near: float
+
+
+@dataclass(frozen=True)
+class _Split:
+    """A partition of demonstrations that one stretch of one view shows.
+
+    ``bic`` (K,) is that of 1 to K modes there, ``gain`` the log-likelihood's, ``separation``
+    the smallest distance of two modes' means in standard deviations within them.
+    """
+
+    labels: NDArray[np.intp]
+    bic: Array
+    gain: float
+    separation: float
+    view: _View
+    stretch: int
+
+
+class ModeSelection(BaseEstimator):  # type: ignore[misc]
+    """Find the ways in which demonstrations do a skill, such as left and right of an obstacle.
+
+    Two ways are far apart somewhere, in units of how much demonstrations of one way differ
+    there. So each operator's coordinates are looked at stretch by stretch along aligned time:
+    the demonstrations' means there, on each of three principal axes, are divided into 1, 2, ...
+    modes of one variance, and BIC says how many. To have looked at B places costs log B nats
+    for each mode more, so that chance gaps between few demonstrations are none. Modes are
+    divided again in the same manner.
+
+    What a shift in time by ``shift`` explains is no other way, nor is what the situation
+    shows at the start: one model follows objects that stand here or there.
+
+    Parameters
+    ----------
+    operators : sequence of Operator, optional
+        In whose coordinates; by default those that
+        :class:`~tpgmm_torch.structure.operator_selection.OperatorSelection` looks at.
+    robot : Kinematics, optional
+        What they act on.
+    n_modes : "auto" or int, default="auto"
+        A number divides demonstrations into so many where that is plainest, whatever BIC says.
+    max_modes : int, default=4
+        At most so many at one place.
+    shift : float, default=0.1
+        Share of the duration by which demonstrations may be early or late.
+    holds : "auto", sequence of Hold or None, default="auto"
+        As in :class:`~tpgmm_torch.TaskParameterizedGMM`.
+    dtype : {"float64", "float32"}, default="float64"
+    device : str, default="cpu"
+
+    Attributes
+    ----------
+    n_modes_ : int
+    labels_ : array of int, of shape (N,)
+        The mode of each demonstration; mode 0 is that of the first one.
+    bic_ : array of shape (max_modes,)
+        Of 1, 2, ... modes where they are plainest; infinity for those that leave a mode less
+        than two demonstrations.
+
+    References
+    ----------
+    Schwarz: Estimating the Dimension of a Model, Annals of Statistics 6 (1978). Principal axes
+    and repeated division: Hamerly, Elkan: Learning the k in k-means, NIPS 2003.
+
+    Examples
+    --------
+    >>> rng, time = np.random.default_rng(0), np.linspace(0, 1, 50)
+    >>> shown = [
+    ...     Demonstration(time, (side * np.sin(3 * time) + 0.02 * rng.normal())[:, None])
+    ...     for side in (1, -1, 1, 1, -1, -1)
+    ... ]
+    >>> selection = ModeSelection().fit(shown)
+    >>> selection.labels_.tolist()
+    [0, 1, 0, 0, 1, 1]
+    """
+
+    _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
+        "operators": ["array-like", tuple, None],
+        "robot": [Kinematics, None],
+        "n_modes": [StrOptions({"auto"}), Interval(Integral, 1, None, closed="left")],
+        "max_modes": [Interval(Integral, 2, None, closed="left")],
+        "shift": [Interval(Real, 0, 1, closed="left")],
+        "holds": [StrOptions({"auto"}), "array-like", tuple, None],
+        "dtype": [StrOptions({"float64", "float32"})],
+        "device": [str],
+    }
+
+    def __init__(
+        self,
+        operators: Sequence[Operator] | None = None,
+        robot: Kinematics | None = None,
+        *,
+        n_modes: int | str = "auto",
+        max_modes: int = 4,
+        shift: float = 0.1,
+        holds: str | Sequence[Hold] | None = "auto",
+        dtype: str = "float64",
+        device: str = "cpu",
+    ) -> None:
+        self.operators = operators
+        self.robot = robot
+        self.n_modes = n_modes
+        self.max_modes = max_modes
+        self.shift = shift
+        self.holds = holds
+        self.dtype = dtype
+        self.device = device
+
+    def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
+        """Find them.
+
+        Parameters
+        ----------
+        X : sequence of Demonstration
+            Aligned in time; fewer than four show one way.
+        y : ignored
+            Here for scikit-learn.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError
+            If demonstrations do not fit together, or with the operators and the robot, or are
+            too few for ``n_modes``.
+        """
+        self._validate_params()
+        known = check_demonstrations(X)
+        count, wanted = len(known), self.n_modes
+        if isinstance(wanted, Integral) and wanted > 1 and count < FEWEST * wanted:
+            raise DataError(
+                f"{wanted} modes of at least {FEWEST} demonstrations each need "
+                f"{FEWEST * wanted}, got {count}"
+            )
+        self._time = as_array(typical_time(known))
+        self.labels_: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
+        self.bic_: Array = np.full(self.max_modes, np.inf)
+        self._found: list[_Split] = []
+        if count >= 2 * FEWEST and wanted != 1:
+            self._divide(self._views(known))
+        self.n_modes_ = int(self.labels_.max()) + 1
+        return self
+
+    def report(self) -> str:
+        """How many modes there are and why, as text.
+
+        Raises
+        ------
+        NotFittedError
+        """
+        if not hasattr(self, "labels_"):
+            raise NotFittedError("this ModeSelection is not fitted yet: call fit(...)")
+        count = len(self.labels_)
+        if self.n_modes_ == 1:
+            return f"1 way: nowhere do the {count} demonstrations differ as several ways would"
+        lines = [f"{self.n_modes_} ways:"]
+        for mode in range(self.n_modes_):
+            members = np.flatnonzero(self.labels_ == mode)
+            names = ", ".join(map(str, members))
+            lines.append(f"  {mode}  {len(members)} of {count} demonstrations: {names}")
+        for split in self._found:
+            begin, end = (
+                self._time[round((len(self._time) - 1) * edge / STRETCHES)]
+                for edge in (split.stretch, split.stretch + 1)
+            )
+            lines.append(
+                f"  seen by {format_operator(split.view.operator)}, plainest from {begin:.2f} "
+                f"to {end:.2f} s: {split.separation:.3g} standard deviations apart"
+            )
+        return "\n".join(lines)
+
+    def _views(self, known: Sequence[Demonstration]) -> list[_View]:
+        given = self.operators
+        if given is None:
+            given = candidate_operators(self.robot, known[0])
+        operators = check_operators(given)
+        kinematics = kinematics_for(known, operators, self.robot, self.dtype, self.device)
+        holds = holds_for(self.holds, known, operators, kinematics)
+        operators = with_mean_orientations(operators, known, kinematics, holds)
+        rows = local_data(known, operators, kinematics, holds=holds)
+        data = torch.stack([at_phases(row, len(self._time)) for row in rows])
+        return [
+            _View(leaf, as_array(values), near)
+            for leaf, values, near in comparable_coordinates(
+                data, operators, kinematics, SMALLEST_RANGE
+            )
+        ]
+
+    def _divide(self, views: Sequence[_View]) -> None:
+        """Divide all demonstrations, and the parts again until none falls apart."""
+        given = None if isinstance(self.n_modes, str) else int(self.n_modes)
+        parts, whole = [np.arange(len(self.labels_))], []
+        while parts:
+            members = parts.pop(0)
+            split = None
+            if len(members) >= 2 * FEWEST:
+                here = [_View(v.operator, v.values[members], v.near) for v in views]
+                split = self._split(here, given)
+            if len(members) == len(self.labels_) and split is not None:
+                self.bic_[: len(split.bic)] = split.bic
+            if split is None or not split.labels.any():
+                whole.append(members)
+                continue
+            self._found.append(split)
+            new = [members[split.labels == k] for k in range(split.labels.max() + 1)]
+            (whole if given else parts).extend(new)
+        for mode, members in enumerate(sorted(whole, key=lambda part: int(part[0]))):
+            self.labels_[members] = mode
+
+    def _split(self, views: Sequence[_View], given: int | None) -> _Split | None:
+        """The best division of some demonstrations; None if BIC says that they are one mode."""
+        count = len(views[0].values)
+        shown = [(view, _stretches(view.values)) for view in views]
+        places = [
+            (view, stretch, _axes(values[:, stretch]))
+            for view, values in shown
+            for stretch in range(values.shape[1])
+        ]
+        cost = math.log(max(sum(len(axes) for _, _, axes in places), 1))
+        most = min(given or self.max_modes, count // FEWEST)
+        splits = []
+        for view, stretch, axes in places:
+            for along in axes:
+                partitions = _partitions(along, most)
+                scores = [_log_likelihood(along, labels, view.near) for labels in partitions]
+                k = np.arange(1, most + 1)
+                bic = -2 * np.array(scores) + k * math.log(count) + 2 * cost * (k - 1)
+                best = most - 1 if given else int(bic.argmin())
+                if best:
+                    labels = partitions[best]
+                    apart = _separation(along, labels, view.near)
+                    gain = scores[best] - scores[0]
+                    splits.append(_Split(labels, bic, gain, apart, view, stretch))
+        splits.sort(
+            key=lambda split: split.bic[-1 if given else split.labels.max()] - split.bic[0]
+        )
+        for split in splits:
+            if given or not (self._late(split) or _situational(split, shown)):
+                return split
+        return None
+
+    def _late(self, split: _Split) -> bool:
+        """Whether there is no gap between modes, or none but for who is a little earlier."""
+        values, labels = split.view.values, split.labels
+        edges = _edges(values.shape[1])
+        now = (edges[split.stretch] + edges[split.stretch + 1]) // 2
+        most = round(self.shift * values.shape[1])
+        around = values[:, max(now - most, 0) : now + most + 1]
+        gaps = np.linalg.norm(values[:, now, None, None] - around[None], axis=-1)
+        shifted, same = gaps.min(-1), labels[:, None] == labels
+        shifted = np.minimum(shifted, shifted.T)
+        distances = np.linalg.norm(values[:, None, now] - values[None, :, now], axis=-1)
+        others = same & ~np.eye(len(labels), dtype=bool)
+        nearest = np.where(others, distances, np.inf).min(1)
+        return bool(shifted[~same].min() <= APART * max(nearest.max(), split.view.near))
+
+
+def _edges(count: int) -> NDArray[np.intp]:
+    """Where stretches of T instants begin and end."""
+    number = min(STRETCHES, count)
+    return np.linspace(0, count, number + 1).round().astype(np.intp)
+
+
+def _stretches(values: Array) -> Array:
+    """Means (N, S, D) over stretches of values (N, T, D)."""
+    edges = _edges(values.shape[1])
+    sums = np.add.reduceat(values, edges[:-1], axis=1)
+    return np.asarray(sums / np.diff(edges)[:, None])
+
+
+def _axes(values: Array) -> Array:
+    """Coordinates (A, N) of N vectors (N, D) on their first principal axes."""
+    apart = values - values.mean(0)
+    u, s, _ = np.linalg.svd(apart, full_matrices=False)
+    return np.asarray((u * s).T[:AXES])
+
+
+def _partitions(values: Array, most: int) -> list[NDArray[np.intp]]:
+    """Labels (N,) that divide numbers into 1 to ``most`` modes with the least squares.
+
+    In one dimension modes are intervals, and the best are found by dynamic programming
+    (Fisher 1958).
+    """
+    order = np.argsort(values, kind="stable")
+    ordered, n = values[order], len(values)
+    first, second = (np.concatenate(([0.0], np.cumsum(ordered**p))) for p in (1, 2))
+    begin, end = np.arange(n + 1)[:, None], np.arange(n + 1)[None]
+    size = end - begin
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = second[None] - second[:, None] - (first[None] - first[:, None]) ** 2 / size
+    squares = np.where(size >= FEWEST, squares, np.inf)  # of an interval [begin, end)
+    least, cuts = squares[0], []
+    found: list[NDArray[np.intp]] = [np.zeros(n, dtype=np.intp)]
+    for _ in range(2, most + 1):
+        total = least[:, None] + squares
+        cuts.append(total.argmin(0))
+        least = total.min(0)
+        edges = [n]
+        for where in reversed(cuts):
+            edges.append(int(where[edges[-1]]))
+        labels = np.empty(n, dtype=np.intp)
+        labels[order] = np.searchsorted(sorted(edges[1:]), np.arange(n), side="right")
+        found.append(labels)
+    return found
+
+
+def _scatter(values: Array, labels: NDArray[np.intp]) -> tuple[Array, float]:
+    """Means of modes, and the sum of squares within them."""
+    means = np.bincount(labels, values) / np.bincount(labels)
+    return means, float(((values - means[labels]) ** 2).sum())
+
+
+def _log_likelihood(values: Array, labels: NDArray[np.intp], near: float) -> float:
+    """Of numbers and their labels under modes of one variance of at least ``near^2``.
+
+    It is the restricted one: means are integrated out, from a prior as wide as all numbers,
+    because K means of few numbers take much of what tells the variance.
+    """
+    sizes = np.bincount(labels)
+    means, squares = _scatter(values, labels)
+    n, free = len(values), len(values) - len(means)
+    wide = max(float(values.std(ddof=1)), near)
+    variance = max(squares / free, near**2)
+    log_density = -0.5 * (free * math.log(2 * math.pi * variance) + squares / variance)
+    log_means = -0.5 * float(np.log(sizes).sum()) - len(means) * math.log(wide)
+    return log_density + log_means + float((sizes * np.log(sizes / n)).sum())
+
+
+def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
+    """Smallest distance of two modes' means, in standard deviations within them."""
+    means, squares = _scatter(values, labels)
+    within = max(math.sqrt(squares / (len(values) - len(means))), near)
+    return float(np.diff(np.sort(means)).min() / within)
+
+
+def _situational(split: _Split, shown: Sequence[tuple[_View, Array]]) -> bool:
+    """Whether where demonstrations begin, as some operator sees it, shows the modes too."""
+    one = np.zeros_like(split.labels)
+    gains = [
+        _log_likelihood(along, split.labels, view.near) - _log_likelihood(along, one, view.near)
+        for view, _ in shown
+        for along in _axes(view.values[:, 0])
+    ]
+    return max(gains) > SITUATION * split.gain
