@@ -24,7 +24,7 @@ from tpgmm_torch import gaussians
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
-from tpgmm_torch.control.export import export
+from tpgmm_torch.control.exported_tick import export
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
@@ -823,7 +823,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         path : str or Path
             A file, replaced in one step.
         clock : Clock or str, default="even"
-            An :class:`EvenClock` or a :class:`WaitingClock`.
+            One of the library's; a localising one begins at the beginning.
         bounds : MotionBounds or mapping, optional
             As for :meth:`controller`.
 

@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -231,8 +232,8 @@ class EvenProgress(Progress):
     like: Tensor
     now: Array
 
-    @property
-    def time(self) -> Tensor:
+    @cached_property
+    def time(self) -> Tensor:  # type: ignore[override]
         """Of shape () as long as no robot was on hold; see :attr:`Progress.time`."""
         return _tensor(self.now, self.like)
 
@@ -346,8 +347,8 @@ class WaitingProgress(Progress):
     measured: Array
     error: Array
 
-    @property
-    def time(self) -> Tensor:
+    @cached_property
+    def time(self) -> Tensor:  # type: ignore[override]
         """Of the batch's shape; see :attr:`Progress.time`."""
         return _tensor(self.now, self.regression.kinematics.lower)
 
@@ -601,7 +602,7 @@ class LocalizingProgress(WaitingProgress):
         late = now > self.rested + PAUSE
         told = np.abs(reference - self.told).max(-1)
         stopped = late & (told > self.clock.tolerance * self.clock.floor)
-        back = late & left & self.stalled & ~pushed
+        back = late & left & self.stalled & (astray | self.localized) & ~pushed
         back &= np.abs(self.rested - self.returned) > JUMP
         went = replace(
             self,

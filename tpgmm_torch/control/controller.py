@@ -565,7 +565,7 @@ class Controller:
         self._asked = self.reference
         if goal is not None:
             self._asked = torch.where(self._led.unsqueeze(-1), self._wanted, self._asked)
-        if bool(self._brought.any()):
+        if self._trust is not None and bool(self._brought.any()):
             known = self._brought.unsqueeze(-1) & estimate.joints.isfinite()
             self._asked = torch.where(known, estimate.joints, self._asked)
         codes = self._codes
@@ -595,15 +595,20 @@ class Controller:
         """What tells how new it is where robots began and objects are, or were last free."""
         if self._novelty is None:
             return None
-        frames = dict(self.holding.frames)
-        for name in self._novelty.moving:
-            if name in self._at_first:
-                frames[name] = self._at_first[name]
-        return functools.partial(_ratio, self._novelty, self._start, frames)
+        return functools.partial(
+            _ratio, self._novelty, self._start, self.holding.frames, self._at_first
+        )
 
 
-def _ratio(novelty: Novelty, start: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+def _ratio(
+    novelty: Novelty,
+    start: Tensor,
+    frames: Mapping[str, Frame],
+    at_first: Mapping[str, Frame],
+) -> Tensor:
     """Novelty of each robot (...) of a batch of start postures."""
+    moving = {name: at_first[name] for name in novelty.moving if name in at_first}
+    frames = {**frames, **moving}
     return torch.as_tensor(novelty.ratio(start, frames)).to(start).expand(start.shape[:-1])
 
 

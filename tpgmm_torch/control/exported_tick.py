@@ -11,28 +11,38 @@ a part of a stop is the rest of it, every tick keeps them.
 
 from __future__ import annotations
 
+import json
+import warnings
 from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch.control.clocks import RESTART, EvenClock, WaitingClock
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.command import Status
-from tpgmm_torch.control.compiled_tick import Tick
+from tpgmm_torch.control.compiled_tick import CompiledRegression, Tick, check_compiler
+from tpgmm_torch.control.exported import FORMAT, here
+from tpgmm_torch.control.exported_clock import exported_clock
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.motion.follower import CRUISE, HASTE, MEMORY, ROUNDING
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.robots.robot import Robot
 
-__all__ = ["BrakingLaw", "ExportedTick"]
+__all__ = ["BrakingLaw", "ExportedTick", "export"]
 
 #: Numbers of a state that are not of a joint: progress, status, whether it has begun, the last
-#: tick's duration, time since the robot went on, rate of progress.
-SCALARS = 6
+#: tick's duration, time since the robot went on.
+SCALARS = 5
 #: Numbers of each joint: position, velocity and acceleration of the motion, first and second
 #: difference of the references, the wanted posture and its drift, whether the joint is behind
-#: it, the gap that fades, where a servo would be. Behind them is the last covariance.
-ROWS = 10
+#: it, the gap that fades. Behind them are the last covariance and what the clock remembers.
+ROWS = 9
 #: Bounds that are not there.
 ENDLESS = 1e9
 #: Into how many parts the span of jerks is divided, and how often.
@@ -53,7 +63,8 @@ class ExportedTick(torch.nn.Module):
     begin, end, blend : float
         As for the controller [s].
     bounds : MotionBounds
-    clock : EvenClock or WaitingClock
+    clock : Clock
+        One that :func:`.exported_clock` knows.
     """
 
     def __init__(
@@ -64,22 +75,37 @@ class ExportedTick(torch.nn.Module):
         end: float,
         blend: float,
         bounds: MotionBounds,
-        clock: EvenClock | WaitingClock,
+        clock: Clock,
     ) -> None:
         super().__init__()
         self._tick, self._like = Tick(regression, names), regression.kinematics.lower
-        self._begin, self._end, self._blend, self._clock = begin, end, blend, clock
-        arrivals = clock.arrivals if isinstance(clock, WaitingClock) else ()
-        self._stops = torch.tensor([*arrivals, torch.inf], dtype=torch.float64)
+        assert isinstance(regression.kinematics, Robot)
+        self._robot, self._names = regression.kinematics, tuple(names)
+        self._begin, self._end, self._blend = begin, end, blend
         self._brakes = BrakingLaw(bounds)
         self._all = regression._components
         self._edges, self._table, self._peaks = regression.windows(begin, end)
+        self._clock = exported_clock(
+            clock, regression, names, begin, end, self._seen, self._estimate
+        )
 
     @property
     def size(self) -> int:
         """How many numbers a state has; zeros begin the skill where the robot stands."""
         joints = len(self._like)
-        return SCALARS + ROWS * joints + joints**2
+        return SCALARS + ROWS * joints + joints**2 + self._clock.size
+
+    def program(self) -> torch.export.ExportedProgram:
+        """The graph, which keeps constants of its own."""
+        count, double = len(self._like), torch.float64
+        self._clock.trace(len(self._names))
+        inputs = (
+            torch.zeros(self.size, dtype=double),
+            torch.tensor(0.001, dtype=double),
+            torch.zeros(count, dtype=double),
+            torch.zeros(len(self._names), 7, dtype=double),
+        )
+        return torch.export.export(self, inputs)
 
     def forward(
         self, state: Tensor, dt: Tensor, joints: Tensor, frames: Tensor
@@ -100,28 +126,36 @@ class ExportedTick(torch.nn.Module):
         timely, heard = (dt > 0) & dt.isfinite(), joints.isfinite().all()
         norms = torch.linalg.vector_norm(frames[:, 3:], dim=-1, keepdim=True)
         heard = heard & frames.isfinite().all() & (norms > 0).all()
-        before, _, begun, last_dt, since, rate = state[:SCALARS].unbind()
+        before, _, begun, last_dt, since = state[:SCALARS].unbind()
         begun = begun > 0
         count = len(joints)
-        rows, last = state[SCALARS:].split((ROWS * count, count * count))
+        rows, last, memory = state[SCALARS:].split(
+            (ROWS * count, count * count, self._clock.size)
+        )
         rows, last = rows.view(ROWS, count), last.view(count, count)
         measured = torch.where(heard, joints, rows[0])
-        standing = torch.zeros_like(rows)
-        standing[0], standing[5], standing[9] = measured, measured, measured
-        rows = torch.where(begun, rows, standing)
+        rows = torch.where(begun, rows, _standing(measured))
         before = torch.where(begun, before, self._begin)
-        rate = torch.where(begun, rate, 1.0)
-        passed = torch.where(begun & heard & timely, dt, 0.0)
-        time, rate, expected = self._progress(before, rate, passed, rows, measured, last)
-        ended = begun & (before >= self._end) & (time >= self._end)
-
+        memory = torch.where(begun, memory, self._clock.start(measured))
         unit = torch.eye(7, dtype=frames.dtype, device=frames.device)[3]
         poses = torch.where(heard, frames / torch.cat((norms.new_ones(1, 3).expand(
             len(frames), 3), norms.expand(-1, 4)), 1), unit)  # fmt: skip
+        goes = begun & heard & timely
+        passed = torch.where(goes, dt, 0.0)
+        time, remembered, moved = self._clock(
+            memory, before, passed, rows[0], measured, last, poses
+        )
+        time, memory = torch.where(goes, time, before), torch.where(goes, remembered, memory)
+        moved = goes & moved
+        # where a robot was brought, its reference begins anew
+        rows = torch.where(moved, _standing(measured), rows)
+        ended = begun & (before >= self._end) & (time >= self._end)
+
         mean, covariance = self._estimate(time, rows[0], poses)
         mean = torch.clamp(mean, self._brakes.lower, self._brakes.upper)
-        gap = torch.where(begun, rows[8], rows[0] - mean)
-        since = torch.where(begun, since + passed, 0.0)
+        fades = begun & ~moved
+        gap = torch.where(fades, rows[8], rows[0] - mean)
+        since = torch.where(fades, since + passed, 0.0)
         wanted = mean
         if self._blend > 0:
             wanted = mean + (1 - minimum_jerk(since / self._blend)) * gap
@@ -130,21 +164,21 @@ class ExportedTick(torch.nn.Module):
         moves = heard & known
         # what cannot be known brings the robot to rest
         step = torch.where(timely, dt, 1.0)
-        moved = self._brakes.follow(rows, torch.where(moves, wanted, rows[5]), moves, step,
-                                    last_dt)  # fmt: skip
+        followed = self._brakes.follow(rows, torch.where(moves, wanted, rows[5]), moves, step,
+                                       last_dt)  # fmt: skip
         status = torch.where(
             moves & (timely | ~begun),
             torch.where(ended, float(Status.FINISHED.code), float(Status.RUNNING.code)),
             float(Status.HOLDING.code),
         )
         covariance = torch.where(moves & ~ended, covariance, last)
-        kept = torch.stack((torch.where(known, gap, 0.0), expected))
         # the first reference is where the robot stands; nothing moves in no time
-        after = torch.cat((torch.where(begun, moved, rows[:8]), kept))
+        after = torch.where(begun, followed, rows[:8]).flatten()
         starts = heard & known & ~begun
         after_dt = torch.where(begun, dt, 0.0)
-        scalars = torch.stack((time, status, (begun | starts).to(time), after_dt, since, rate))
-        new = torch.cat((scalars, after.flatten(), covariance.flatten()))
+        scalars = torch.stack((time, status, (begun | starts).to(time), after_dt, since))
+        gap = torch.where(known, gap, 0.0)
+        new = torch.cat((scalars, after, gap, covariance.flatten(), memory))
         halted = torch.cat((state[:1], status[None], state[2:]))
         # who has not begun begins anew
         new = torch.where((begun & timely) | starts, new, halted)
@@ -152,39 +186,14 @@ class ExportedTick(torch.nn.Module):
         reference = torch.where(new[2] > 0, position, joints)
         return new, reference, velocity.clone(), covariance
 
-    def _progress(
-        self,
-        now: Tensor,
-        rate: Tensor,
-        passed: Tensor,
-        rows: Tensor,
-        measured: Tensor,
-        covariance: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Time, rate and where a servo would be: the formulas of the clocks."""
-        clock, reference, expected = self._clock, rows[0], rows[9]
-        late = stop = None
-        if isinstance(clock, WaitingClock):
-            expected = reference + torch.exp(-passed / clock.lag) * (expected - reference)
-            error = (measured - reference).abs()
-            usual = (reference - expected).abs() + clock.floor
-            excess = (
-                error / (usual + covariance.diagonal().sqrt())
-            ).amax() / clock.tolerance - 1
-            excess = excess.clamp(0, 1)
-            waits = (error / usual).amax() > clock.tolerance
-            follows = torch.where(waits, 1 - excess**2 * (3 - 2 * excess), 1.0)
-            rate = torch.minimum(follows, rate + passed / RESTART)
-            if clock.arrivals:
-                later = self._stops >= now
-                stop = torch.where(later, self._stops, torch.inf).amin()
-                late = error.amax() > clock.floor
-        step = clock.speed * passed * rate
-        time = now + step
-        time = torch.where(time > self._end - 1e-6 * step, self._end, time)
-        if late is not None and stop is not None:
-            time = torch.where(late, torch.minimum(time, stop), time)
-        return time, rate, expected
+    def _seen(self, joints: Tensor, poses: Tensor) -> tuple[RobotState, dict[str, Frame]]:
+        """The robot at some joints, and the objects, as a batch of one."""
+        robot, joints, poses = self._robot, joints.to(self._like)[None], poses.to(self._like)
+        frames = {
+            name: Frame._from(pose[None, :3], pose[None, 3:])
+            for name, pose in zip(self._names, poses, strict=True)
+        }
+        return RobotState(joints, robot.links, *robot.forward_kinematics(joints)), frames
 
     def _estimate(self, time: Tensor, joints: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
         """The model's mean (n,) and covariance (n, n)."""
@@ -202,6 +211,80 @@ class ExportedTick(torch.nn.Module):
         rows += [pose[None, 3:] for pose in poses]
         mean, covariance, _ = self._tick(*rows, time.to(self._like), *parts)
         return mean[0].to(time), covariance[0].to(time)
+
+
+def _standing(joints: Tensor) -> Tensor:
+    """The rows of a joint state that stands."""
+    rows = joints.new_zeros(ROWS, len(joints))
+    rows[0], rows[5] = joints, joints
+    return rows
+
+
+def export(
+    regression: Regression,
+    path: str | Path,
+    *,
+    begin: float,
+    end: float,
+    blend: float,
+    bounds: MotionBounds,
+    clock: Clock,
+) -> None:
+    """Write what ``load_exported`` reads; atomically.
+
+    Parameters
+    ----------
+    regression : Regression
+    path : str or Path
+    begin, end, blend : float
+        As for the controller [s].
+    bounds : MotionBounds
+    clock : Clock
+
+    Raises
+    ------
+    DependencyError
+        If there is no C++ compiler.
+    DataError
+        If the model or the clock is of another kind than a graph serves.
+    """
+    check_compiler("inductor", "export")
+    settings = {field.name: getattr(regression, field.name) for field in fields(Regression)}
+    regression = CompiledRegression(**settings)
+    names = regression.served_frames
+    tick = ExportedTick(regression, names, begin, end, blend, bounds, clock)
+    count = regression.kinematics.n_joints
+    contents = {
+        **here(),
+        "format": FORMAT,
+        "state_size": tick.size,
+        "joints": regression.kinematics.joint_names,
+        "frames": names,
+        "begin": begin,
+        "end": end,
+        "clock": repr(clock),
+        "bounds": {
+            field.name: getattr(bounds, field.name).tolist() for field in fields(MotionBounds)
+        },
+    }
+    # numbers by themselves, for who reads no JSON
+    sizes = {"state_size": tick.size, "n_joints": count, "n_frames": len(names)}
+    told = {"tpgmm": json.dumps(contents), **{key: str(size) for key, size in sizes.items()}}
+    with (
+        torch.inference_mode(False),
+        torch.no_grad(),
+        warnings.catch_warnings(),
+        replacing(path) as file,
+    ):
+        warnings.simplefilter("ignore")  # of what torch asks of itself
+        program = tick.program()
+        package = file.with_name("tick.pt2")  # the name that it must have
+        torch._inductor.aoti_compile_and_package(
+            program,
+            package_path=str(package),
+            inductor_configs={"aot_inductor.metadata": told},
+        )
+        package.rename(file)
 
 
 class BrakingLaw:

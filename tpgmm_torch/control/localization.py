@@ -25,7 +25,7 @@ from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 
-__all__ = ["Localizer", "Look", "local_mode", "move"]
+__all__ = ["Coordinates", "Instants", "Localizer", "Look", "local_mode", "move"]
 
 Array = NDArray[np.float64]
 #: Seconds between instants, at least: below, neighbours look alike.
@@ -66,7 +66,7 @@ class Localizer:
         count = min(MOST, max(2, round((end - begin) / STEP) + 1))
         self.instants = np.linspace(begin, end, count, dtype=np.float64)
         self.step = float(self.instants[1] - self.instants[0])
-        self._by_names: dict[frozenset[str], _Instants] = {}
+        self._by_names: dict[frozenset[str], Instants] = {}
 
     def look(self, state: RobotState, frames: Mapping[str, Frame]) -> Look:
         """See robots; operators say nothing whose frames or links are not there.
@@ -81,11 +81,20 @@ class Localizer:
         if len(state.joints) == 1:  # one robot is sooner computed without a batch
             state = state[0]
             frames = {name: f[0] if f.batch_shape else f for name, f in frames.items()}
-        names = frozenset((*frames, *state.links))
+        return Look(self.at(frozenset((*frames, *state.links))), state, frames)
+
+    def at(self, names: frozenset[str]) -> Instants:
+        """What the mixture says of all instants.
+
+        Parameters
+        ----------
+        names : frozenset of str
+            The frames and links that are there.
+        """
         if names not in self._by_names:
             with torch.inference_mode(False):
-                self._by_names[names] = _Instants(self._regression, names, self.instants)
-        return Look(self._by_names[names], state, frames)
+                self._by_names[names] = Instants(self._regression, names, self.instants)
+        return self._by_names[names]
 
 
 class Look:
@@ -93,7 +102,7 @@ class Look:
 
     Parameters
     ----------
-    instants : object
+    instants : Instants
         What the mixture says of them, given the frames and links that are there.
     state : RobotState
         Of B robots, or one without a batch.
@@ -101,7 +110,7 @@ class Look:
     """
 
     def __init__(
-        self, instants: _Instants, state: RobotState, frames: Mapping[str, Frame]
+        self, instants: Instants, state: RobotState, frames: Mapping[str, Frame]
     ) -> None:
         self._instants, self._state, self._frames = instants, state, frames
 
@@ -125,8 +134,28 @@ class Look:
             return regression.step(times, state, self._frames)
 
 
-class _Instants:
-    """The mixture at all instants, as far as certain frames and links are concerned."""
+class Instants:
+    """The mixture at all instants, as far as certain frames and links are concerned.
+
+    Parameters
+    ----------
+    regression : Regression
+        The skill.
+    names : frozenset of str
+        The frames and links that are there.
+    instants : array of shape (G,)
+        [s]
+
+    Attributes
+    ----------
+    heaviest : int array of shape (G, A)
+        The components that count at each instant; ``log_h`` are their logarithmic weights, and
+        ``elapsed`` is the time since their means [s].
+    parts : list of tuple
+        Operators, and their coordinates as Gaussians.
+    constant, curvature : array of shape (K,)
+        Of the exponent of each component as a polynomial of that time.
+    """
 
     def __init__(self, regression: Regression, names: frozenset[str], instants: Array) -> None:
         kinematics = regression.kinematics
@@ -139,14 +168,14 @@ class _Instants:
         log_h: Array = activation.numpy(force=True).astype(np.float64)
         weights = np.exp(log_h)
         width = int((weights > NEGLIGIBLE).sum(1).max())
-        self._heaviest: NDArray[np.int64] = np.argsort(-log_h, 1)[:, :width]  # (G, A)
-        self._log_h: Array = np.take_along_axis(log_h, self._heaviest, 1)
+        self.heaviest: NDArray[np.int64] = np.argsort(-log_h, 1)[:, :width]  # (G, A)
+        self.log_h: Array = np.take_along_axis(log_h, self.heaviest, 1)
         centre = first.time_mean.numpy(force=True).astype(np.float64)
-        self._elapsed = instants[:, None] - centre[self._heaviest]
+        self.elapsed = instants[:, None] - centre[self.heaviest]
         operators: list[Operator] = []
         conditionals: list[Conditionals] = []
-        self._parts: list[tuple[Operator, _Coordinates]] = []
-        self._followers: list[tuple[Operator, _Coordinates]] = []  # along paths
+        self.parts: list[tuple[Operator, Coordinates]] = []
+        self._followers: list[tuple[Operator, Coordinates]] = []  # along paths
         self._times = times
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
             leaves = operator.leaves if isinstance(operator, Stack) else (operator,)
@@ -164,9 +193,9 @@ class _Instants:
             starts = operator.quaternion_starts(kinematics)
             sizes = [leaf.dimension(kinematics) for leaf in seen]
             paths = operator.path_variances(kinematics)
-            part = _Coordinates(one, weights, sizes, starts, first, paths)
+            part = Coordinates(one, weights, sizes, starts, first, paths)
             follows = operator.at(times[0]) is not operator
-            (self._followers if follows else self._parts).append((operator, part))
+            (self._followers if follows else self.parts).append((operator, part))
         self._operators = operators
         self.regression: Regression | None = regression
         if operators != list(regression.operators):
@@ -174,15 +203,15 @@ class _Instants:
             settings |= {"operators": operators, "conditionals": conditionals}
             self.regression = Regression(**settings) if operators else None
         nothing = np.zeros(len(centre))
-        both = [*self._parts, *self._followers]
-        self._constant = sum((part.constant for _, part in both), nothing)
-        self._curvature = sum((part.curvature for _, part in self._parts), nothing)
+        both = [*self.parts, *self._followers]
+        self.constant = sum((part.constant for _, part in both), nothing)
+        self.curvature = sum((part.curvature for _, part in self.parts), nothing)
 
     def exponents(self, state: RobotState, frames: Mapping[str, Frame]) -> tuple[Array, Array]:
         """``|W (x - mu)|^2`` and its slope over time, summed over the operators, (B, K)."""
-        square: Array = np.zeros((1, len(self._constant)))
+        square: Array = np.zeros((1, len(self.constant)))
         slope = square
-        for operator, part in self._parts:
+        for operator, part in self.parts:
             local = np.atleast_2d(_local(operator, state, frames))
             one, other = part(local)
             square, slope = square + one.T, slope + other.T
@@ -193,7 +222,7 @@ class _Instants:
     ) -> Array:
         """``-0.5 |W (x(t) - mu(t))|^2`` of coordinates that follow paths, (B, G, A) or 0."""
         exponent: Array = np.zeros((1, 1, 1))
-        index, elapsed = self._heaviest[window], self._elapsed[window]
+        index, elapsed = self.heaviest[window], self.elapsed[window]
         for operator, part in self._followers:
             at = operator.at(self._times[window, None])
             local = at.coordinates(state, frames).numpy(force=True)  # (G, B, D)
@@ -203,17 +232,42 @@ class _Instants:
     def log_likelihood(self, square: Array, slope: Array, along: Array, window: slice) -> Array:
         """``log p(x | t)`` at the instants of a window, (B, G), up to a constant."""
         # -0.5 |W (x - mu(t))|^2 as a polynomial of the time since the component's mean
-        index, elapsed = self._heaviest[window], self._elapsed[window]
-        base = self._log_h[window] + self._constant[index]
-        base -= 0.5 * elapsed**2 * self._curvature[index]
+        index, elapsed = self.heaviest[window], self.elapsed[window]
+        base = self.log_h[window] + self.constant[index]
+        base -= 0.5 * elapsed**2 * self.curvature[index]
         exponent = base - 0.5 * square[:, index] + elapsed * slope[:, index] + along
         most = exponent.max(-1)
         total = most + np.log(np.exp(exponent - most[..., None]).sum(-1))
         return np.where(np.isfinite(most).all(-1, keepdims=True), total, 0.0)
 
 
-class _Coordinates:
-    """Some coordinates of an operator, as K Gaussians that move with time."""
+class Coordinates:
+    """Some coordinates of an operator, as K Gaussians that move with time.
+
+    Parameters
+    ----------
+    one : Conditionals
+        Of the coordinates, given time.
+    weights : array of shape (G, K)
+        Of the components at each instant.
+    sizes : sequence of int
+        How many coordinates each leaf has.
+    starts : iterable of int
+        Where quaternions begin.
+    first : Conditionals
+        Those of the operator that time is centred for.
+    paths : sequence of float
+        Variances of the mean paths.
+
+    Attributes
+    ----------
+    mean, rate : array of shape (K, D)
+        The mean at the components' centres, and the whitened slope over time.
+    white : array of shape (K, D, D)
+        What whitens the coordinates.
+    blocks : array of shape (Q, D)
+        Where quaternions are.
+    """
 
     def __init__(
         self,
@@ -234,27 +288,27 @@ class _Coordinates:
         slack = SLACK**2 * np.array([moved[groups == group].mean() for group in groups])
         factor = np.linalg.cholesky(covariance + np.diag(slack))
         self.size = mean.shape[1]
-        self._white = np.linalg.inv(factor)  # (K, D, D)
-        self._mean, self._gain = mean, gain
-        self._rate = (self._white @ gain[..., None])[..., 0]
-        self._blocks = quaternions.quaternion_blocks(tuple(starts), self.size).numpy()
+        self.white = np.linalg.inv(factor)  # (K, D, D)
+        self.mean, self._gain = mean, gain
+        self.rate = (self.white @ gain[..., None])[..., 0]
+        self.blocks = quaternions.quaternion_blocks(tuple(starts), self.size).numpy()
         self.constant = -np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(1)
-        self.curvature = (self._rate**2).sum(1)
+        self.curvature = (self.rate**2).sum(1)
 
     def __call__(self, local: Array) -> tuple[Array, Array]:
         """``|W (x - mu)|^2`` and ``(W gain)^T W (x - mu)`` of each component, (K, B)."""
-        if len(self._blocks):
+        if len(self.blocks):
             # of q and -q, which are one rotation, the one that is nearer
-            inner = (local * self._mean[:, None]) @ self._blocks.T
-            local = local * (1 + (np.copysign(1.0, inner) - 1) @ self._blocks)
-        white = self._white @ np.swapaxes(local - self._mean[:, None], 1, 2)  # (K, D, B)
-        return (white**2).sum(1), (self._rate[:, :, None] * white).sum(1)
+            inner = (local * self.mean[:, None]) @ self.blocks.T
+            local = local * (1 + (np.copysign(1.0, inner) - 1) @ self.blocks)
+        white = self.white @ np.swapaxes(local - self.mean[:, None], 1, 2)  # (K, D, B)
+        return (white**2).sum(1), (self.rate[:, :, None] * white).sum(1)
 
     def at_instants(self, local: Array, index: NDArray[np.int64], elapsed: Array) -> Array:
         """``-0.5 |W (x - mu)|^2`` (B, G, A) of coordinates (G, B, D), of components (G, A)."""
-        expected = self._mean[index] + self._gain[index] * elapsed[..., None]
+        expected = self.mean[index] + self._gain[index] * elapsed[..., None]
         residual = local[:, :, None] - expected[:, None]  # (G, B, A, D)
-        white = np.einsum("gaij,gbaj->gbai", self._white[index], residual)
+        white = np.einsum("gaij,gbaj->gbai", self.white[index], residual)
         square: Array = (white**2).sum(-1).swapaxes(0, 1)
         return -0.5 * square
 

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import zipfile
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -21,10 +22,13 @@ from tpgmm_torch import (
     Stack,
     Status,
     TaskParameterizedGMM,
+    WaitingClock,
     load_exported,
 )
 from tpgmm_torch.control import exported as exported_module
-from tpgmm_torch.control.exported_tick import BrakingLaw
+from tpgmm_torch.control.clocks import parse_clock
+from tpgmm_torch.control.compiled_tick import CompiledRegression
+from tpgmm_torch.control.exported_tick import BrakingLaw, ExportedTick
 from tpgmm_torch.exceptions import (
     DataError,
     DependencyError,
@@ -34,6 +38,7 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.regression import Regression
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:the (first tick|situation):tpgmm_torch.exceptions.PlausibilityWarning"
@@ -74,13 +79,13 @@ def model():
 @pytest.fixture(scope="module")
 def package(model, tmp_path_factory):
     path = tmp_path_factory.mktemp("exported") / "reach.pt2"
-    model.export(path)
+    model.export(path, clock="localizing")
     return path
 
 
 @pytest.fixture(scope="module")
 def expected(model):
-    controller = model.controller(START, CUP, clock="even", trust=None, smoothing=None)
+    controller = model.controller(START, CUP, trust=None, smoothing=None)
     commands = []
     for _ in range(TICKS):
         commands.append(controller.step(DT))
@@ -194,9 +199,107 @@ def test_the_example_in_cpp_prints_the_same_numbers(package, expected, tmp_path)
     torch.testing.assert_close(actual, wanted, rtol=0, atol=1e-9)
 
 
+@needs_compiler
+def test_it_is_the_graph_wherever_the_robot_is(model, package):
+    exported, tick = load_exported(package), graph(model, "localizing", model.motion_bounds())
+    stands = torch.tensor(START, dtype=torch.float64)
+    exported.reset(stands, CUP)
+    state, reference, *_ = tick(torch.zeros(tick.size), stands)
+    for now in range(1, 200):
+        if not 40 <= now < 90:  # else it is held
+            stands = reference
+        command = exported.step(DT, stands)
+        state, reference, _, covariance = tick(state, stands)
+        torch.testing.assert_close(command.reference, reference, rtol=0, atol=1e-9)
+        torch.testing.assert_close(command.covariance, covariance, rtol=0, atol=1e-9)
+        assert command.time == pytest.approx(float(state[0]), abs=1e-9)
+    assert command.status is Status.FINISHED
+
+
+def graph(model, clock, bounds):
+    """What is compiled, as it is: from a state and measured joints on."""
+    settings = {f.name: getattr(model.regression(), f.name) for f in fields(Regression)}
+    regression = CompiledRegression(**settings)
+    names, span = regression.served_frames, (float(model.time_[0]), float(model.time_[-1]))
+    tick = ExportedTick(regression, names, *span, model.blend, bounds, parse_clock(clock))
+    cup = torch.cat((CUP[OBJECT].position, CUP[OBJECT].orientation))[None]
+    step = torch.tensor(DT, dtype=torch.float64)
+
+    def run(state, joints):
+        with torch.inference_mode():
+            return tick(state.double(), step, joints, cup)
+
+    run.size = tick.size
+    return run
+
+
+@pytest.fixture(scope="module")
+def waving():
+    """Two joints that take four seconds for a way that is nowhere the same."""
+    time = torch.linspace(0, 4, 100, dtype=torch.float64)[:, None]
+    went, wave = minimum_jerk(time / 4), 0.3 * torch.sin(time)
+    demonstrations = [
+        Demonstration(
+            time[:, 0],
+            torch.cat((1.2 * went - 0.6 + gap * (1 - went), 0.5 + 0.6 * went + wave), 1),
+            CUP,
+        )
+        for gap in torch.linspace(-0.2, 0.2, 5, dtype=torch.float64)
+    ]
+    task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
+    return TaskParameterizedGMM(6, [Stack(*task), Canonical()], ARM, blend=0.3).fit(
+        demonstrations
+    )
+
+
+@pytest.mark.parametrize(
+    ("clock", "robot"),
+    [
+        ("even", "held"),
+        ("waiting:arrivals=1.2", "slow"),
+        ("localizing", "held"),
+        ("localizing", "pushed"),
+        ("localizing:speed=1.5,lag=0.05", "slow"),
+    ],
+)
+def test_clocks_are_those_of_the_controller(waving, clock, robot):
+    one = torch.ones(2, dtype=torch.float64)
+    bounds = MotionBounds(-3 * one, 3 * one, 300 * one, 1e6 * one, 1e9 * one)  # out of the way
+    controller = waving.controller(
+        [-0.6, 0.5], CUP, clock=clock, trust=None, smoothing=None, bounds=bounds
+    )
+    tick = graph(waving, clock, bounds)
+    stands, past, moved = torch.tensor([-0.6, 0.5], dtype=torch.float64), None, 0
+    state, times = torch.zeros(tick.size), []
+    for now in range(450):
+        command = controller.step(DT, joints=stands)
+        moved += bool(controller._progress.relocalized)
+        state, reference, velocity, covariance = tick(state, stands)
+        for actual, wanted, error in (
+            (reference, command.reference, 1e-8),
+            (velocity, command.velocity, 1e-6),
+            (covariance, command.covariance, 1e-8),
+            (state[0], command.time.reshape(()), 1e-8),
+        ):
+            torch.testing.assert_close(actual, wanted, rtol=0, atol=error)
+        times.append(float(state[0]))
+        went, last = reference, stands
+        past = went if now == 60 else past
+        if robot == "held" and 150 <= now < 260:
+            went = last
+        elif robot == "pushed" and 150 <= now < 190:
+            went = past
+        stands = last + 0.05 * (went - last) if robot == "slow" else went
+    if clock == "localizing":
+        assert moved == 1  # let go it goes on from where it was held, or pushed back to
+        back = times[149] - min(times[155:275])
+        assert abs(back) < 0.1 if robot == "held" else back > 0.3
+
+
 def test_what_cannot_be_exported_is_said(model, tmp_path, monkeypatch):
-    with pytest.raises(DataError, match="serves EvenClock and WaitingClock"):
-        model.export(tmp_path / "a.pt2", clock=LocalizingClock())
+    for clock in (LocalizingClock(initial="anywhere"), type("Own", (WaitingClock,), {})()):
+        with pytest.raises(DataError, match="run other clocks with controller"):
+            model.export(tmp_path / "a.pt2", clock=clock)
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(DependencyError, match=r"export\(\) needs a C\+\+ compiler"):
         model.export(tmp_path / "a.pt2")
