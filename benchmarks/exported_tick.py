@@ -1,67 +1,168 @@
-"""One tick of a controller: as it is, and exported, in Python."""
+"""One tick of a controller beside the model's own step: eager, and exported for Python and C++.
 
-from collections.abc import Callable, Iterator
+python -m benchmarks --only exported
+"""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 import torch
 
-from benchmarks.rows import Row
+from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
 from benchmarks.skill import learned, skill
-from tpgmm_torch import load_exported
+from benchmarks.timing import in_turns, medians, seconds
+from tpgmm_torch import Situation, load_exported
 
 __all__ = ["measure"]
 
+EXAMPLE = Path(__file__).parents[1] / "examples" / "deployment_cpp"
+WORK = "batch 1, 17 joints, two hands, K = 10, P = 2, float64"
+PLAIN = "model.step"
+#: What a tick is made with, and what it may take beside the model's own step, or at most [ms].
+CONTROLLERS: Mapping[str, tuple[Mapping[str, Any], Asked | None]] = {
+    "controller, even clock, trust=None": (
+        {"clock": "even", "trust": None, "smoothing": None},
+        Asked("times", 1.25),
+    ),
+    "controller as it is, measured joints": ({}, None),
+}
+
+Step = Callable[[float], Any]
+
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Loading, and ticks of the skill from its start to its end, again and again."""
+    """Loading, ticks of the skill from its start to its end in turns, and whole skills."""
     model, ticks = learned(settings), settings.size(5_000, 30)
     [situation] = skill(settings).situations(1, settings.seed + 1000)
     start, frames = situation.joints, situation.frames
-    dt = float(model.time_.diff().median())
+    dt, length = float(model.time_.diff().median()), len(model.time_)
 
-    def controller() -> Callable[[float], Any]:
-        made = model.controller(start, frames, clock="even", trust=None, smoothing=None)
+    def plain() -> Step:
+        joints, grid = start, iter(model.time_.tolist())
+
+        def step(dt: float) -> None:
+            nonlocal joints
+            joints = model.step(next(grid), joints, frames).joints
+
+        return step
+
+    def controlled(options: Mapping[str, Any]) -> Step:
+        made = model.controller(start, frames, **options)
         made.step(dt)
-        return made.step
+        given = {} if options else {"joints": start}
 
-    ways = {"eager": (controller, 0.45)}
-    if settings.full:  # at tiny sizes, a minute of compiling shows nothing
-        path = settings.out / "exported.pt2"
-        model.export(path)
+        def step(dt: float) -> None:
+            command = made.step(dt, **given)
+            if given:
+                given["joints"] = command.reference
+
+        return step
+
+    ways: dict[str, Callable[[], Step]] = {PLAIN: plain}
+    asked: dict[str, Asked | None] = {PLAIN: None}
+    for name, (options, most) in CONTROLLERS.items():
+        ways[name] = partial(controlled, options)
+        asked[name] = most if settings.full else None
+    # at tiny sizes, minutes of compiling show nothing
+    for clock in ("even", "localizing") if settings.full else ():
+        path = settings.out / f"exported_{clock}.pt2"
+        model.export(path, clock=clock)
         began = perf_counter()
         exported = load_exported(path)
         loading = perf_counter() - began
-        path.unlink()
-        yield Row("load_exported", "s", loading, asked=settings.asked("most", 1.0), rounds=1)
+        work = f"load_exported, {clock} clock"
+        yield Row(work, "s", loading, asked=settings.asked("most", 1.0), rounds=1)
 
-        def again() -> Callable[[float], Any]:
+        def again(exported: Any = exported) -> Step:
             exported.reset(start, frames)
             return exported.step
 
-        ways["exported"] = again, 0.12
-    work = "controller, batch 1, 17 joints, two hands, K = 10, P = 2, float64"
-    for how, (begin, most) in ways.items():
-        taken = 1e3 * _latencies(begin, dt, ticks, len(model.time_) - 1)
-        figures = float(np.median(taken)), float(np.percentile(taken, 99))
-        names = "median", "99th percentile"
-        for name, figure, limit in zip(names, figures, (most, 1.0), strict=True):
-            asked = settings.asked("most", limit)
-            yield Row(f"{work}, {how}: {name}", "ms", figure, asked=asked, rounds=ticks)
+        name = f"exported, {clock} clock"
+        ways[name], asked[name] = again, settings.asked("most", 0.12)
+        yield from _in_cpp(path, name, situation, dt, ticks, settings)
+        path.unlink()
+    taken = _latencies(ways, dt, ticks, length - 1)
+    base = float(np.median(taken[PLAIN]))
+    for name, each in taken.items():
+        middle, worst = np.percentile(each, [50, 99]).tolist()
+        beside = ("", None) if name == PLAIN else (PLAIN, base)
+        work, limit = f"tick, {WORK}, {name}", settings.asked("most", 1.0)
+        yield Row(f"{work}: median", "ms", middle, *beside, asked=asked[name], rounds=ticks)
+        yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
+
+    def whole(begin: Callable[[], Step]) -> float:
+        def run() -> None:
+            step = begin()
+            for _ in range(length - 1):
+                step(dt)
+
+        with torch.inference_mode():
+            return seconds(run)
+
+    runs = {PLAIN: partial(whole, plain)}
+    predicted = partial(model.predict, [situation], candidates=False)
+    runs["predict"] = partial(seconds, predicted)
+    if settings.full:
+        runs["exported"] = partial(whole, ways["exported, even clock"])
+    found = medians(in_turns(runs, settings.rounds(5), warm_up=settings.full))
+    # 0.65 and 0.2 s where a step takes 0.36 ms
+    limits = {"predict": 0.65, "exported": 0.2}
+    for name in runs.keys() - {PLAIN}:
+        most = Asked("times", limits[name] / (1482 * 0.36e-3)) if settings.full else None
+        work = f"one situation, {length} ticks, {name}"
+        yield Row(work, "s", found[name], f"{PLAIN} as often", found[PLAIN], asked=most)
 
 
 def _latencies(
-    begin: Callable[[], Callable[[float], Any]], dt: float, ticks: int, length: int
-) -> np.ndarray:
-    """Seconds of each tick."""
-    taken, step = np.empty(ticks), begin()
+    ways: Mapping[str, Callable[[], Step]], dt: float, ticks: int, length: int
+) -> dict[str, np.ndarray]:
+    """Milliseconds of each tick; every way takes one before any takes the next."""
+    taken = {name: np.empty(ticks) for name in ways}
+    steps = {name: begin() for name, begin in ways.items()}
     with torch.inference_mode():
         for tick in range(-min(200, ticks), ticks):  # the first ones warm up
             if tick % length == 0:
-                step = begin()
-            began = perf_counter()
-            step(dt)
-            taken[tick] = perf_counter() - began
+                steps = {name: begin() for name, begin in ways.items()}
+            for name, step in steps.items():
+                began = perf_counter()
+                step(dt)
+                taken[name][tick] = 1e3 * (perf_counter() - began)
     return taken
+
+
+def _in_cpp(
+    package: Path, name: str, situation: Situation, dt: float, ticks: int, settings: Settings
+) -> Iterator[Row]:
+    """What the example in C++ says of itself, where it can be built."""
+    folder = settings.out / "deployment_cpp"
+    if not (shutil.which("cmake") and shutil.which("g++")):
+        return
+    root = f"-DTORCH_ROOT={Path(torch.__file__).parent}"
+    for command in (["-S", EXAMPLE, "-B", folder, root], ["--build", folder]):
+        subprocess.run(["cmake", *command], check=True, capture_output=True)
+    poses = [
+        number
+        for frame in situation.frames.values()
+        for number in (*frame.position.tolist(), *frame.orientation.tolist())
+    ]
+    done = subprocess.run(
+        [folder / "control_loop", package, str(dt), str(ticks)],
+        input=" ".join(map(str, [*situation.joints.tolist(), *poses])),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = re.search(r"a tick takes ([\d.]+) ms, 99 % of them less than ([\d.]+)", done.stderr)
+    assert found is not None, done.stderr
+    work, (middle, worst) = f"tick, {WORK}, {name}, C++", map(float, found.groups())
+    yield Row(f"{work}: median", "ms", middle, asked=settings.asked("most", 0.1), rounds=ticks)
+    limit = settings.asked("most", 1.0)
+    yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
