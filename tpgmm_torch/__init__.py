@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.sensing.trust import Trust
     from tpgmm_torch.structure.mode_selection import ModeSelection
     from tpgmm_torch.structure.operator_selection import OperatorSelection
+    from tpgmm_torch.structure.segmentation import Segmentation
     from tpgmm_torch.training.hold_detection import find_holds
 
     __version__: str
@@ -86,6 +87,7 @@ __all__ = [
     "RelativePosition",
     "Robot",
     "RobotState",
+    "Segmentation",
     "Situation",
     "Stack",
     "Status",
@@ -138,6 +140,7 @@ _HOMES = {
     "sensing.trust": ("Trust",),
     "structure.mode_selection": ("ModeSelection",),
     "structure.operator_selection": ("OperatorSelection",),
+    "structure.segmentation": ("Segmentation",),
     "data.trajectories": ("Candidate", "Trajectory"),
     "training.hold_detection": ("find_holds",),
 }

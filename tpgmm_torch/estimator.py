@@ -26,7 +26,7 @@ from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.exported_tick import export
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
@@ -48,7 +48,7 @@ from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture, fit_subsets
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import CONFIG, MODEL, MODES, TENSORS, decode, encode
 from tpgmm_torch.plausibility.check import (
@@ -77,8 +77,23 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.structure.component_selection import ComponentSelection
-from tpgmm_torch.structure.operator_selection import OperatorSelection
+from tpgmm_torch.structure.operator_selection import (
+    OperatorSelection,
+    arranged,
+    candidate_operators,
+)
 from tpgmm_torch.structure.operator_weights import held_out_weights, weighted
+from tpgmm_torch.structure.parts import (
+    Part,
+    chained,
+    check_cuts,
+    components_of_parts,
+    leaves,
+    part_of,
+    stretches,
+    united,
+)
+from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.kept_rows import KeptRows
 from tpgmm_torch.training.local_data import local_data
@@ -123,7 +138,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     operators : sequence of Operator, "auto" or OperatorSelection, optional
         Candidate projection operators, one subspace each; the default is ``[Canonical()]``.
         "auto" finds those that matter, :class:`OperatorSelection`, in at least three
-        demonstrations; one of your own has candidates and thresholds of your own.
+        demonstrations; one of your own has candidates and thresholds of your own. With parts,
+        each has those that matter in it; they may be given, too, as one sequence per part.
     robot : Kinematics, optional
         A :class:`Robot`, :class:`Poses` for recorded poses without a robot, or your own;
         not needed by ``Canonical()`` alone.
@@ -137,6 +153,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         left out, of at least three, are most likely
         (:func:`~tpgmm_torch.structure.operator_weights.held_out_weights`). Frames that do not
         matter do little harm then. ``covariances_`` given time are divided by the weights.
+    parts : "auto", Segmentation, sequence of float or str, or None, default=None
+        Where the skill has parts that are learned one by one, each with operators and
+        components of its own: found (:class:`Segmentation`), or where they end, as instants in
+        the time of the skill [s] or events of the demonstrations. With a number of components
+        each part has its share of them. Demonstrations should be in step there, see
+        :meth:`Segmentation.transform`.
     covariance_type : {"full", "diag", "tied", "spherical"}, default="full"
         Shape of the local covariances.
     reg_covar : float, default=1e-5
@@ -217,11 +239,17 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     covariances_ : list of Tensor of shape (K, 1 + D_j, 1 + D_j)
         Local covariances Sigma_i^(j).
     n_components_ : int
-    component_selection_ : ComponentSelection or None
-        How likely what was left out is with each number; None where it was given.
+    component_selection_ : ComponentSelection, tuple of ComponentSelection, or None
+        How likely what was left out is with each number, one per part; None where it was given.
     operators_ : tuple of Operator
-    operator_selection_ : OperatorSelection or None
-        Which were found, and why; None where they were given, and for a model that was loaded.
+        Of all parts.
+    operator_selection_ : OperatorSelection, tuple of OperatorSelection, or None
+        Which were found, and why, one per part; None where they were given, and for a model
+        that was loaded.
+    parts_ : tuple of Part
+        One after the other; none where there is one.
+    segmentation_ : Segmentation or None
+        Why there are parts; None where they were given, and for a model that was loaded.
     operator_weights_ : Tensor of shape (K, J) or None
         How much each operator counts; None where all are equal. :meth:`partial_fit` keeps
         them.
@@ -284,6 +312,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         "robot": [Kinematics, None],
         "priorities": ["array-like", None],
         "operator_weights": [StrOptions({"equal", "held-out"})],
+        "parts": [StrOptions({"auto"}), Segmentation, "array-like", tuple, None],
         "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
         "reg_covar": [Interval(Real, 0, None, closed="left")],
         "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
@@ -317,9 +346,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     via_fade_: float
     shown_: Shown | None
     demonstration_weights_: Tensor | None
-    operator_selection_: OperatorSelection | None
+    operator_selection_: OperatorSelection | tuple[OperatorSelection, ...] | None
     operator_weights_: Tensor | None
-    component_selection_: ComponentSelection | None
+    component_selection_: ComponentSelection | tuple[ComponentSelection, ...] | None
+    parts_: tuple[Part, ...]
+    segmentation_: Segmentation | None
     acceleration_: Tensor | None
     jerk_: Tensor | None
     via_points_: tuple[ViaPoint, ...]
@@ -334,11 +365,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def __init__(
         self,
         n_components: int | str | ComponentSelection = 10,
-        operators: Sequence[Operator] | str | OperatorSelection | None = None,
+        operators: Sequence[Any] | str | OperatorSelection | None = None,
         robot: Kinematics | None = None,
         *,
         priorities: Sequence[int] | None = None,
         operator_weights: str = "equal",
+        parts: str | Segmentation | Sequence[float | str] | None = None,
         covariance_type: str = "full",
         reg_covar: float = 1e-5,
         covariance_shrinkage: float | str = "auto",
@@ -368,6 +400,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.robot = robot
         self.priorities = priorities
         self.operator_weights = operator_weights
+        self.parts = parts
         self.covariance_type = covariance_type
         self.reg_covar = reg_covar
         self.covariance_shrinkage = covariance_shrinkage
@@ -394,8 +427,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     @property
     def selects(self) -> bool:
-        """Whether :meth:`fit` finds operators, weights or the number of components itself."""
-        found = isinstance(self.operators, str | OperatorSelection)
+        """Whether :meth:`fit` finds parts, operators, weights or the number of components."""
+        found = isinstance(self.operators, str | OperatorSelection) or self.parts is not None
         found = found or self.operator_weights != "equal"
         return found or not isinstance(self.n_components, Integral)
 
@@ -453,9 +486,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         demonstrations, batches = split_batches(X)
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
-            selection = self._selection(known)
-            chosen = self.operators if selection is None else selection.operators_
-            given = operators = check_operators(chosen)
+            segmentation, cuts = self._cuts(known)
+            if cuts and (checkpoint is not None or self.warm_start):
+                raise DataError(
+                    "parts are learned one after the other: there is no one state of EM for "
+                    "a checkpoint or warm_start to go on from; partial_fit goes on with them"
+                )
+            given, of_parts, selections = self._operators(known, cuts)
+            operators = given
             kinematics = self._kinematics_for(known, operators)
             # which of them are unlike the others is seen about their mean, too
             based = with_mean_orientations(operators, known, kinematics)
@@ -472,15 +510,33 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 responsibilities=self.responsibilities,
                 holds=holds,
             )
-            components = self._components(known, gathered, operators, kinematics, holds)
-            number = None if components is None else components.n_components_
-            self._learn(gathered, operators, kinematics, checkpoint, holds, number)
+            begin, end = float(gathered.time[0]), float(gathered.time[-1])
+            pairs = list(zip(leaves(given), leaves(operators), strict=True))
+            parts = [
+                Part(
+                    first, last, reason,
+                    tuple(done for one, done in pairs if one in own or not one.links()), 0,
+                )
+                for (first, reason), (last, _), own in zip(
+                    [(begin, "the beginning"), *cuts], [*cuts, (end, "the end")], of_parts,
+                    strict=True,
+                )
+            ]  # fmt: skip
+            if cuts:
+                components = self._learn_parts(
+                    known, gathered, operators, kinematics, holds, parts
+                )
+            else:
+                components = self._components(known, gathered, operators, kinematics, holds)
+                number = None if components is None else components.n_components_
+                self._learn(gathered, operators, kinematics, checkpoint, holds, number)
             if self.operator_weights == "held-out":
                 time, variance = self.means_[0][:, 0], self.covariances_[0][:, 0, 0]
                 marginals = TimeMarginals.of(self.weights_.log(), time, variance)
                 self._weigh(held_out_weights(known, given, kinematics, marginals, holds))
             self.shown_, self.demonstration_weights_ = shown, weights
-            self.operator_selection_, self.component_selection_ = selection, components
+            self.segmentation_, self.component_selection_ = segmentation, components
+            self.operator_selection_ = selections
             self._kept = KeptRows.of(
                 gathered, list(map(len, known)), weights.nonzero()[:, 0].tolist()
             )
@@ -488,10 +544,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             return self._set_peaks(*peaks)
         if self.selects:
             raise DataError(
-                'operator_weights="held-out", operators="auto" and n_components="auto" compare '
-                "all demonstrations with each other, which those in batches or in several "
-                "processes are not: fit a model to some of them, and give its operators_ and "
-                "n_components_"
+                'operator_weights="held-out", parts, operators="auto" and n_components="auto" '
+                "compare all demonstrations with each other, which those in batches or in "
+                "several processes are not: fit a model to some of them, and give its "
+                "operators_ and n_components_"
             )
         operators = check_operators(self.operators)
         walk = checked_batches([demonstrations] if batches is None else batches)
@@ -629,17 +685,31 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     def _learn_again(self, kept: KeptRows) -> None:
         """EM from where it was, on rows that were kept."""
-        operators, kinematics = self.operators_, self.kinematics_
+        operators, kinematics, parts = self.operators_, self.kinematics_, self.parts_
         widths = block_widths(operators, kinematics)
         turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
         table, members, group_size = kept.table(widths, turns, self.time_)
-        moments = column_moments(StoredRows(table[members]))
-        shares = members.sum() / (kept.n_instants or len(members) / len(kept.rows))
-        mixture = self.unfitted_mixture(
-            moments, 1, operators, kinematics, float(shares), self.n_components_, go_on=True
-        )
-        fit_subsets([mixture], table, members[None], group_size, [moments])
+        whole = column_moments(StoredRows(table[members]))
+        belongs = part_of(parts, table[:, 0])
+        mixtures, counts, first = [], [], 0
+        for number in range(max(len(parts), 1)):
+            k = parts[number].n_components if parts else self.n_components_
+            own = belongs == number
+            shares = float(members[own].sum() * len(kept.rows) / own.sum())
+            mixture = self.unfitted_mixture(
+                whole, 1, operators, kinematics, shares, k,
+                go_on=slice(first, first + k), whole=whole if parts else None,
+            )  # fmt: skip
+            fit_subsets([mixture], table[own], members[own][None], group_size)
+            mixtures.append(mixture)
+            counts.append(int(members[own].sum()))
+            first += k
+        mixture = mixtures[0]
+        if parts:
+            variances = self._variances(whole, operators, kinematics)
+            mixture = chained(mixtures, parts, counts, operators, kinematics, variances)
         self.set_mixture(mixture, operators, kinematics, self.time_, self.holds_)
+        self.parts_ = parts
 
     def predict(
         self, X: Situation | Sequence[Situation], *, candidates: bool = True
@@ -1183,7 +1253,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         n_demonstrations: float,
         n_components: int | None = None,
         *,
-        go_on: bool = False,
+        go_on: slice | None = None,
+        whole: ColumnMoments | None = None,
     ) -> BlockGaussianMixture:
         """The mixture that :meth:`fit` learns from rows of local data.
 
@@ -1200,23 +1271,55 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             That the rows are of; segments are shares of one.
         n_components : int, optional
             By default that of the model.
-        go_on : bool, default=False
-            Whether EM is to begin where it ended, as it does with ``warm_start``.
+        go_on : slice, optional
+            With which components EM is to begin where it ended, as it does with
+            ``warm_start``.
+        whole : ColumnMoments, optional
+            Of the rows of all parts, where these are those of one.
         """
         settings = self._shared_settings(operators, kinematics, n_components)
         settings |= {"group_size": group_size, "n_demonstrations": n_demonstrations}
-        settings["reg_covar"] = regularization(
+        known = moments if whole is None else whole
+        settings |= self._regularized(known, operators, kinematics, whole is not None)
+        if (go_on is not None or self.warm_start) and hasattr(self, "mixture_"):
+            before, chosen = self.mixture_, go_on or slice(None)
+            weights = before.weights_[chosen]
+            settings["weights_init"] = weights if whole is None else weights / weights.sum()
+            settings["means_init"] = [mean[chosen] for mean in before.means_]
+            settings["covariances_init"] = [c[chosen] for c in before.unshrunk_covariances]
+        return BlockGaussianMixture(**settings)
+
+    def _regularized(
+        self,
+        moments: ColumnMoments,
+        operators: Sequence[Operator],
+        kinematics: Kinematics,
+        absolute: bool,
+    ) -> dict[str, Any]:
+        """The mixture's settings of regularisation, relative to the variances of these rows.
+
+        ``absolute``, in the units of the data: what is learned from a part of them is held to
+        the same.
+        """
+        amounts = regularization(
             moments,
             operators,
             kinematics,
             reg_covar=self.reg_covar,
             covariance_type=self.covariance_type,
         )
-        if (go_on or self.warm_start) and hasattr(self, "mixture_"):
-            before = self.mixture_
-            settings["weights_init"], settings["means_init"] = before.weights_, before.means_
-            settings["covariances_init"] = before.unshrunk_covariances
-        return BlockGaussianMixture(**settings)
+        if not absolute:
+            return {"reg_covar": amounts}
+        variances = torch.cat(self._variances(moments, operators, kinematics))
+        return {"reg_covar": amounts * variances.numpy(), "regularization": "absolute"}
+
+    def _variances(
+        self, moments: ColumnMoments, operators: Sequence[Operator], kinematics: Kinematics
+    ) -> list[Tensor]:
+        """Of the columns of each operator's block, in which the mixture is learned."""
+        isotropic = self.covariance_type == "spherical"
+        widths = block_widths(operators, kinematics)
+        return [x.square() for x in moments.standardization(widths, isotropic=isotropic).scales]
 
     def set_mixture(
         self,
@@ -1278,6 +1381,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.n_components_ = len(self.weights_)
         self.shown_ = self.demonstration_weights_ = self._kept = None
         self.operator_selection_ = self.component_selection_ = self.operator_weights_ = None
+        self.parts_, self.segmentation_ = (), None
         self.via_points_, self.via_fade_ = (), 1.0
         self._untried = True
         return self
@@ -1366,6 +1470,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if not isinstance(parameters["random_state"], int):
             parameters["random_state"] = None
         parameters["n_components"] = self.n_components_
+        if isinstance(self.parts, Segmentation):
+            parameters["parts"] = "auto"
         if not isinstance(parameters["holds"], str | None):
             parameters["holds"] = [hold.to_list() for hold in parameters["holds"]]
         config: dict[str, Any] = {
@@ -1381,6 +1487,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         }
         if self.operator_weights_ is not None:
             config["operator_weights"] = self.operator_weights_.tolist()
+        if self.parts_:
+            config["parts"] = [
+                [p.begin, p.end, p.reason, list(map(encode, p.operators)), p.n_components]
+                for p in self.parts_
+            ]
         if self.via_points_:
             config["via_points"] = [
                 [one.time, encode(one.operator), one.value, one.tolerance]
@@ -1467,6 +1578,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             model.holds = given
             model.robot = None if isinstance(kinematics, JointSpace) else kinematics
             model.n_iter_, model.converged_ = config["n_iter"], config["converged"]
+            model.parts_ = tuple(
+                Part(begin, end, reason, tuple(decode(one, custom) for one in own), number)
+                for begin, end, reason, own, number in config.get("parts", ())
+            )
             known = config["lower_bound"] is not None
             model.lower_bound_ = config["lower_bound"] if known else math.nan
             if "peaks" in config:
@@ -1659,6 +1774,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators: tuple[Operator, ...],
         kinematics: Kinematics,
         holds: Sequence[Hold],
+        whole: ColumnMoments | None = None,
     ) -> ComponentSelection | None:
         """Find the number of components, where none is given."""
         if isinstance(self.n_components, Integral):
@@ -1670,7 +1786,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         def make(
             number: int, moments: ColumnMoments, size: int, n: int
         ) -> BlockGaussianMixture:
-            return fold.unfitted_mixture(moments, size, operators, kinematics, n, number)
+            return fold.unfitted_mixture(moments, size, operators, kinematics, n, number, whole)
 
         def condition(mixture: BlockGaussianMixture) -> Regression:
             fold.set_mixture(mixture, operators, kinematics, learning.time, holds)
@@ -1678,17 +1794,112 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
         return selection.choose(demonstrations, learning, make, condition, holds)
 
-    def _selection(self, demonstrations: Sequence[Demonstration]) -> OperatorSelection | None:
-        """Find the operators that matter, where none are given."""
-        if not isinstance(self.operators, str | OperatorSelection):
-            return None
-        own = isinstance(self.operators, OperatorSelection)
-        selection = clone(self.operators) if own else OperatorSelection()
-        shared = {name: getattr(self, name) for name in ("holds", "robust", "dtype", "device")}
-        selection.set_params(**shared)
-        if selection.robot is None:
-            selection.set_params(robot=self.robot)
-        return selection.fit(demonstrations)
+    def _learn_parts(
+        self,
+        demonstrations: Sequence[Demonstration],
+        learning: LearningRows,
+        operators: tuple[Operator, ...],
+        kinematics: Kinematics,
+        holds: Sequence[Hold],
+        parts: Sequence[Part],
+    ) -> tuple[ComponentSelection, ...] | None:
+        """Fit a mixture to the rows of each part, and chain them."""
+        [rows] = learning.rows
+        whole, time = ColumnMoments.of(rows), as_array(learning.time)
+        belongs, instants = part_of(parts, rows[:, 0]), part_of(parts, time)
+        selections: list[ComponentSelection | None] = []
+        numbers = [0] * len(parts)
+        lasting = np.bincount(instants, minlength=len(parts)).tolist()
+        if isinstance(self.n_components, Integral):
+            numbers = components_of_parts(int(self.n_components), lasting)
+        mixtures, learned = [], []
+        for number, part in enumerate(parts):
+            own = rows[belongs == number]
+            stretch = replace(
+                learning,
+                rows=StoredRows(own),
+                time=learning.time[torch.from_numpy(instants == number)],
+            )
+            shown = stretches(demonstrations, parts, kinematics.lower)[number]
+            found = self._components(shown, stretch, operators, kinematics, holds, whole)
+            selections.append(found)
+            k = numbers[number] if found is None else found.n_components_
+            learned.append(replace(part, n_components=k))
+            moments = ColumnMoments.of(own)
+            mixture = self.unfitted_mixture(
+                moments, learning.group_size, operators, kinematics,
+                learning.n_demonstrations, k, whole=whole,
+            )  # fmt: skip
+            mixtures.append(mixture.fit_rows(stretch.rows, moments=moments))
+        variances = self._variances(whole, operators, kinematics)
+        counts = np.bincount(belongs, minlength=len(parts)).tolist()
+        mixture = chained(mixtures, learned, counts, operators, kinematics, variances)
+        self.set_mixture(mixture, operators, kinematics, learning.time, holds)
+        self.parts_ = tuple(learned)
+        return None if selections[0] is None else tuple(filter(None, selections))
+
+    def _cuts(
+        self, demonstrations: Sequence[Demonstration]
+    ) -> tuple[Segmentation | None, list[tuple[float, str]]]:
+        """When parts end, but for the last, and why."""
+        if self.parts is None:
+            return None, []
+        if not isinstance(self.parts, str | Segmentation):
+            times = check_cuts(self.parts, demonstrations)
+            return None, [(time, "given") for time in times]
+        own = isinstance(self.parts, Segmentation)
+        segmentation = clone(self.parts) if own else Segmentation()
+        if segmentation.robot is None:
+            segmentation.set_params(robot=self.robot)
+        segmentation.fit(demonstrations)
+        times = np.median(segmentation.boundaries_, axis=0).tolist()
+        segmentation.out_of_step(demonstrations).act(self.plausibility, stacklevel=3)
+        return segmentation, list(zip(times, segmentation.reasons_, strict=True))
+
+    def _operators(
+        self, demonstrations: Sequence[Demonstration], cuts: Sequence[tuple[float, str]]
+    ) -> tuple[tuple[Operator, ...], list[tuple[Operator, ...]], Any]:
+        """All operators, those that matter in each part, of stacks their members; and why."""
+        given, n_parts = self.operators, len(cuts) + 1
+        if not isinstance(given, str | OperatorSelection):
+            entries = [Canonical()] if given is None else list(given)
+            lists = [own for own in entries if not isinstance(own, Operator | str)]
+            if not lists:
+                operators = check_operators(given)
+                return operators, [leaves(operators)] * n_parts, None
+            if not len(lists) == len(entries) == n_parts:
+                raise DataError(
+                    f"operators has {len(entries)} entries, {len(lists)} of them sequences: "
+                    f"with {n_parts} parts give operators, or {n_parts} sequences of operators"
+                )
+            of_parts = [leaves(check_operators(own)) for own in lists]
+            return united(lists), of_parts, None
+        selections = []
+        parts = [Part(time, time, "", (), 0) for time in (0.0, *(time for time, _ in cuts))]
+        settings = {
+            name: getattr(self, name) for name in ("holds", "robust", "dtype", "device")
+        }
+        if cuts:  # what is held is seen in the whole skill
+            given = given if isinstance(given, OperatorSelection) else OperatorSelection()
+            robot = given.robot or self.robot
+            candidates = given.candidates or candidate_operators(robot, demonstrations[0])
+            candidates = check_operators(candidates)
+            kinematics = kinematics_for(
+                demonstrations, candidates, robot, self.dtype, self.device
+            )
+            settings["holds"] = holds_for(self.holds, demonstrations, candidates, kinematics)
+        for shown in stretches(demonstrations, parts):
+            selection = OperatorSelection() if isinstance(given, str) else clone(given)
+            selection.set_params(**settings)
+            if selection.robot is None:
+                selection.set_params(robot=self.robot)
+            selections.append(selection.fit(shown))
+        if not cuts:
+            [selection] = selections
+            return selection.operators_, [leaves(selection.operators_)], selection
+        of_parts = [leaves(selection.operators_) for selection in selections]
+        every = dict.fromkeys(leaf for own in of_parts for leaf in own)
+        return arranged(list(every)), of_parts, tuple(selections)
 
     def _examined(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.operator_selection import OperatorSelection
+from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.local_data import local_data
 
 if TYPE_CHECKING:
@@ -27,6 +29,7 @@ __all__ = [
     "plot_candidates",
     "plot_components",
     "plot_local",
+    "plot_parts",
     "plot_relevance",
     "shade",
 ]
@@ -212,3 +215,39 @@ def plot_relevance(axes: Axes, selection: OperatorSelection) -> None:
     axes.axhline(selection.support_.sum() - 0.5, color=REPRODUCTION, linewidth=1.0)
     axes.set_xlabel("time [s]")
     axes.figure.colorbar(image, ax=axes, label="gain [nats]")
+
+
+def plot_parts(
+    axes: Axes, segmentation: Segmentation, demonstrations: Sequence[Demonstration]
+) -> None:
+    """Where parts begin and end: a bar per demonstration, and above them why.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+        Where to draw.
+    segmentation : Segmentation
+        Fitted.
+    demonstrations : sequence of Demonstration
+        To these.
+    """
+    boundaries = segmentation.boundaries_
+    for row, (one, own) in enumerate(zip(demonstrations, boundaries, strict=True)):
+        edges = np.concatenate(([one.time[0]], own, [one.time[-1]]))
+        for part, (begin, end) in enumerate(pairwise(edges)):
+            axes.barh(row, end - begin, 0.8, begin, color="0.85" if part % 2 else "0.65")
+    for reason, own in zip(segmentation.reasons_, boundaries.T, strict=True):
+        axes.plot(own, range(len(own)), ".-", color=REPRODUCTION, linewidth=1.0)
+        axes.annotate(
+            reason.replace(", ", "\n"),
+            (own[0], -0.5),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize="x-small",
+            annotation_clip=False,
+        )
+    axes.set_ylim(len(boundaries) - 0.5, -0.5)
+    axes.set_ylabel("demonstration")
+    axes.set_xlabel("time [s]")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from numbers import Integral, Real
 from typing import Any, Self
@@ -37,8 +38,8 @@ class EventAlignment(Alignment):
     Parameters
     ----------
     events : sequence of str, optional
-        The anchors in their order; by default all events of the demonstrations, in the order
-        of their median phases.
+        The anchors in their order, by name or pattern (``"part *"``); by default all events of
+        the demonstrations, in the order of their median phases.
     duration : {"mean", "median"} or float, default="mean"
         Which average of the lengths of each part; or the sum of their means is scaled to
         this [s], and 1.0 makes time the phase.
@@ -139,7 +140,14 @@ class EventAlignment(Alignment):
     def _order(self, demonstrations: Sequence[Demonstration]) -> tuple[str, ...]:
         """Names of the anchors, each of which every demonstration has."""
         there = {name: None for one in demonstrations for name in one.events}
-        wanted = there if self.events is None else dict.fromkeys(self.events)
+        wanted = there
+        if self.events is not None:
+            fits = [[n for n in there if fnmatchcase(n, event)] for event in self.events]
+            wanted = dict.fromkeys(
+                name
+                for event, names in zip(self.events, fits, strict=True)
+                for name in names or [event]
+            )
         names = [name for name in wanted if name not in ("start", "end")]
         if not names:
             raise DataError(

@@ -105,6 +105,16 @@ def fit(
             metavar="auto | INTEGER",
         ),
     ] = 10,
+    parts: Annotated[
+        str | None,
+        learning(
+            "Where the skill has parts that are learned one by one, each with its share of "
+            "--n-components and, with --operator auto, what matters in it: 'auto' finds and "
+            "explains them; or when they end, as seconds and events joined by commas. "
+            "See --alignment parts.",
+            metavar="auto | 4.2,8.1 | grasp,rest",
+        ),
+    ] = None,
     covariance_type: Annotated[
         Literal["full", "diag", "tied", "spherical"], learning("Shape of the covariances.")
     ] = "full",
@@ -236,6 +246,7 @@ def fit(
             n_components,
             operators or default_operators(links, list(data.frames)),
             kinematics,
+            parts=options.parts(parts),
             holds=given if hold else "auto",
             operator_weights=operator_weights,
             covariance_type=covariance_type,
@@ -277,8 +288,13 @@ def fit(
     else:
         write(model, out, recordings.signals())
     _report(model, durations, steps, data.aligned)
-    if model.operator_selection_ is not None:
-        typer.echo(f"\n{model.operator_selection_.report()}\n")
+    if model.segmentation_ is not None:
+        typer.echo(f"\n{model.segmentation_.report()}")
+    selections = model.operator_selection_ or ()
+    for selection in selections if isinstance(selections, tuple) else (selections,):
+        typer.echo(f"\n{selection.report()}")
+    if model.segmentation_ is not None or selections:
+        typer.echo()
     if kept:
         typer.echo(f"resumed          {checkpoint}, after {kept} iterations")
     if processes.count > 1:
@@ -321,6 +337,11 @@ def _report(
     for number, operator in enumerate(model.operators_, start=1):
         size = operator.dimension(kinematics)
         lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"
+    for number, part in enumerate(model.parts_, start=1):
+        texts = ", ".join(map(format_operator, part.operators))
+        lines[f"part {number}"] = (
+            f"{part.begin:.2f} to {part.end:.2f} s, {part.n_components} components: {texts}"
+        )
     for hold in model.holds_:
         end = "the end" if math.isinf(hold.end) else f"{hold.end:.2f} s"
         shown = f"{max(hold.begin, 0.0):.2f} s to {end} (in {hold.share:.0%} of them)"

@@ -11,10 +11,13 @@ import typer
 from tpgmm_torch.cli import plugins
 
 if TYPE_CHECKING:
+    from sklearn.pipeline import Pipeline
+
+    from tpgmm_torch.alignment.base import Alignment
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["align", "in_panel", "read_robot", "recordings"]
+__all__ = ["align", "aligner", "in_panel", "parts", "read_robot", "recordings"]
 
 
 def in_panel(panel: str) -> Callable[..., Any]:
@@ -89,11 +92,11 @@ Plausibility = Annotated[
     ),
 ]
 AlignmentMethod = Annotated[
-    Literal["dtw", "barycenter", "linear", "events", "events+dtw", "none"],
+    Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"],
     of_data(
         "Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, by stretching it between events, by warping it "
-        "between events, or not at all."
+        "their average, by stretching time, by stretching it between events or, with "
+        "'parts', between the parts that are found, by warping it between events, or not at all."
     ),
 ]
 RobotFile = Annotated[
@@ -226,11 +229,45 @@ def count_or_auto(text: str | int) -> int | str:
     raise typer.BadParameter(f"{text!r} is neither a positive integer nor 'auto'")
 
 
+def parts(text: str | None) -> str | list[float | str] | None:
+    """Where a skill has parts, as an option's text has it: "auto", or instants and events.
+
+    Parameters
+    ----------
+    text : str or None
+        Joined by commas.
+    """
+    if text is None or text == "auto":
+        return text
+    cuts: list[float | str] = []
+    for word in map(str.strip, text.split(",")):
+        try:
+            cuts.append(float(word))
+        except ValueError:
+            cuts.append(word)
+    return cuts
+
+
+def aligner(method: str, robot: Kinematics | None) -> Alignment | Pipeline | None:
+    """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
+    from tpgmm_torch.alignment.events import EventAlignment
+    from tpgmm_torch.alignment.text import parse_alignment
+
+    if method != "parts":
+        return parse_alignment(method, robot)
+    from sklearn.pipeline import make_pipeline
+
+    from tpgmm_torch.structure.segmentation import Segmentation
+
+    return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
+
+
 def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
-    """Bring ``demonstrations`` of ``robot`` onto one clock, as ``--alignment method`` says."""
-    from tpgmm_torch.alignment.text import parse_alignment
-
-    chosen = parse_alignment(method, robot)
-    return demonstrations if chosen is None else chosen.fit_transform(demonstrations)
+    """Bring ``demonstrations`` onto one clock, as :func:`aligner` does by ``method, robot``."""
+    chosen = aligner(method, robot)
+    if chosen is None:
+        return demonstrations
+    aligned: list[Demonstration] = chosen.fit_transform(demonstrations)
+    return aligned

@@ -11,6 +11,8 @@ import torch
 from tpgmm_torch.cli import options
 
 if TYPE_CHECKING:
+    from sklearn.pipeline import Pipeline
+
     from tpgmm_torch.alignment.base import Alignment
     from tpgmm_torch.cli.plugins import Recordings
     from tpgmm_torch.data.demonstrations import Demonstration
@@ -28,7 +30,7 @@ class AlignedBatches:
     ----------
     batches : iterable of sequence of Demonstration
         Those of this process.
-    alignment : Alignment or None
+    alignment : Alignment, Pipeline or None
         Fitted already.
     durations : list of float
         Of the episodes of the last pass, before alignment [s].
@@ -37,7 +39,7 @@ class AlignedBatches:
     """
 
     batches: Iterable[Sequence[Demonstration]]
-    alignment: Alignment | None
+    alignment: Alignment | Pipeline | None
     durations: list[float] = field(default_factory=list)
     steps: int = 0
 
@@ -102,14 +104,12 @@ def read_training_data(
     recordings, robot, alignment, batch_episodes, processes
         What the options say, and those that learn together.
     """
-    from tpgmm_torch.alignment.text import parse_alignment
-
     if batch_episodes is None:
         read = recordings.demonstrations()
         aligned = options.align(read, alignment, robot)
         return TrainingData(processes.share(aligned), tuple(read[0].frames), read, aligned)
     first = next(iter(recordings.batches(batch_episodes)))
-    chosen = parse_alignment(alignment, robot)
+    chosen = options.aligner(alignment, robot)
     fitted = None if chosen is None else chosen.fit(first)
     batches = recordings.batches(batch_episodes, processes)
     return TrainingData(AlignedBatches(batches, fitted), tuple(first[0].frames), (), ())

@@ -14,6 +14,7 @@ from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.pose_names import pose_groups, words
 from tpgmm_torch.events.detection import (
+    LEAST_CONFIDENCE,
     NOTHING,
     Detection,
     Detector,
@@ -24,7 +25,7 @@ from tpgmm_torch.events.detection import (
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.plausibility.joints import is_gripper
 
-__all__ = ["SignalEvent", "gripper_signals"]
+__all__ = ["SignalEvent", "gripper_groups", "gripper_signals", "level_changes"]
 
 #: From one level (0) to the other (1): there from here on, and no more below this.
 ON, OFF = 0.65, 0.35
@@ -165,6 +166,65 @@ def gripper_signals(names: Sequence[str], link: str | None = None) -> tuple[str,
             "--event close=closing:SIGNAL, events={'close': 'closing:SIGNAL'}"
         )
     return tuple(found)
+
+
+def gripper_groups(names: Sequence[str]) -> dict[str, list[int]]:
+    """Columns of the signals of each gripper; the fingers of one side's hand are one.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of all signals.
+
+    Examples
+    --------
+    >>> gripper_groups(["l_elbow.pos", "l_gripper.pos", "r_gripper.pos"])
+    {'l_gripper.pos': [1], 'r_gripper.pos': [2]}
+    """
+    posed = {i for columns in pose_groups(names).values() for i in columns}
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        if i not in posed and is_gripper(name):
+            side = "".join(sorted(SIDES & {*words(name)}))
+            groups.setdefault(side, []).append(i)
+    return {
+        names[own[0]] if len(own) == 1 else f"{side} hand".strip(): own
+        for side, own in groups.items()
+    }
+
+
+def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]:
+    """All changes of signals between their two levels.
+
+    Parameters
+    ----------
+    time : array of shape (T,)
+    values : array of shape (T, n)
+        Which count as one, as for :class:`SignalEvent`.
+
+    Returns
+    -------
+    list of (float, float, bool)
+        When each begins and ends (35 % and 65 % of the way), and whether it falls; none where
+        the two levels do not stand out.
+    """
+    signal = _principal(values)
+    low, high, within = _levels(signal)
+    swing, size = high - low, float(np.abs(signal).max())
+    if swing <= 1e-9 * size:
+        return []
+    if max(0.0, 1 - 2 * within / swing) * min(1.0, swing / (LARGE * size)) < LEAST_CONFIDENCE:
+        return []
+    share = 1 - (signal - low) / swing  # 1 where it is low
+    found = []
+    for start, stop in hysteresis(share, ON, OFF):
+        if start > 0:
+            at, change = _edge(time, share, start, stop, "begin")
+            found.append((at - change, at, True))
+        if stop < len(share):
+            at, change = _edge(time, share, start, stop, "end")
+            found.append((at, at + change, False))
+    return found
 
 
 def _principal(values: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -34,7 +34,7 @@ from tpgmm_torch.structure.evidence import Evidence, gather_evidence
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 
-__all__ = ["Judgement", "OperatorSelection", "candidate_operators"]
+__all__ = ["Judgement", "OperatorSelection", "arranged", "candidate_operators"]
 
 #: Of two, one is left to learn from, and has no variance.
 FEWEST = 3
@@ -121,6 +121,9 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         Gains at each instant, given the others that were kept [nats].
     time_ : array of shape (T,)
         The instants [s].
+    frame_relevance_ : dict of str to array of shape (T,)
+        The same for each frame that matters: what all operators gain together that were kept
+        and see from it, of which one may say what another says [nats].
     judgements_ : tuple of Judgement
         One per candidate: why.
 
@@ -230,7 +233,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         chosen = self._select(evidence, joints, free)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
-        self.operators_ = _arranged([operators[j] for j in chosen])
+        self.operators_ = arranged([operators[j] for j in chosen])
         self._judge(evidence, chosen, joints, kinematics)
         return self
 
@@ -353,6 +356,12 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
                 )
             )
         self.relevance_ = torch.stack(relevance, -1).cpu().numpy()
+        self.frame_relevance_ = {}
+        for name in dict.fromkeys(chain(*(self.candidates_[j].references() for j in chosen))):
+            if name not in kinematics.links:
+                apart = [j for j in chosen if name not in self.candidates_[j].references()]
+                without = evidence.log_likelihood(evidence.of(apart))
+                self.frame_relevance_[name] = (likely - without).mean(0).cpu().numpy()
         self.judgements_ = tuple(judgements)
 
     def _check_fitted(self) -> None:
@@ -406,8 +415,8 @@ def _without(chosen: Sequence[int], dropped: int) -> list[int]:
     return [j for j in chosen if j != dropped]
 
 
-def _arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """What refers to one place stacked, joints behind it."""
+def arranged(operators: Sequence[Operator]) -> tuple[Operator, ...]:
+    """Of some ``operators``, what refers to one place stacked, joints behind it."""
     groups: dict[Any, list[Operator]] = {}
     joints = []
     for operator in operators:

@@ -63,6 +63,23 @@ def test_fit_takes_holds_as_text(dataset, tmp_path):
     assert "frame 'cup' is not in the demonstration" in line
 
 
+def test_fit_finds_parts_and_says_why(dataset, tmp_path):
+    few = ("--n-components", 8, *CALMLY, "--rate", 10)
+    found = ("--parts", "auto", "--alignment", "parts")
+    text = output("fit", dataset, *UPPER_BODY, *found, *few, "--out", tmp_path / "model")
+    model = TaskParameterizedGMM.load(tmp_path / "model")
+    assert model.parts == "auto" and len(model.parts_) == 4
+    assert text.count("stop\n") == 3 and "because of" in text
+    assert f"part 1           0.00 to {model.parts_[0].end:.2f} s, " in text
+    given = ("--parts", "2.5, grasp", "--alignment", "linear")
+    output("fit", dataset, *UPPER_BODY, *given, *few, "--out", tmp_path / "other")
+    assert TaskParameterizedGMM.load(tmp_path / "other").parts == [2.5, "grasp"]
+    line = refusal(
+        "fit", dataset, *UPPER_BODY, "--parts", "thrown", *few, "--out", tmp_path / "m"
+    )
+    assert "event 'thrown' is not in a demonstration" in line
+
+
 def test_fit_without_a_robot_learns_joints(dataset, tmp_path):
     few = ("--n-components", 3, "--alignment", "none", "--rate", 5, *CALMLY)
     output("fit", dataset, *few, "--out", tmp_path / "model")
