@@ -1863,7 +1863,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         given, n_parts = self.operators, len(cuts) + 1
         if not isinstance(given, str | OperatorSelection):
             entries = [Canonical()] if given is None else list(given)
-            lists = [own for own in entries if not isinstance(own, Operator | str)]
+            lists = [own for own in entries if isinstance(own, list | tuple)]
             if not lists:
                 operators = check_operators(given)
                 return operators, [leaves(operators)] * n_parts, None

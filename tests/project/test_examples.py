@@ -95,6 +95,16 @@ CLAIMS = {
             == ["cup", "tray"]
         ),
     ),
+    "plot_12_parts.py": (
+        2,
+        lambda v: (
+            v["segmentation"].reasons_ == ("stop", "stop")
+            and v["off"] < 0.3
+            and [len(part.operators) for part in v["model"].parts_] == [2, 3, 2]
+            and v["model"].frame_names_ == ("cup", "tray")
+            and max(v["least"].values()) < 10
+        ),
+    ),
     "plot_13_two_ways.py": (
         1,
         lambda v: (
