@@ -95,8 +95,8 @@ AlignmentMethod = Annotated[
     Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"],
     of_data(
         "Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, by stretching it between events or, with "
-        "'parts', between the parts that are found, by warping it between events, or not at all."
+        "their average, by stretching time, by stretching it between events, by warping it "
+        "between events, by stretching each of the parts that are found, or not at all."
     ),
 ]
 RobotFile = Annotated[
