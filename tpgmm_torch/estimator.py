@@ -1786,7 +1786,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         def make(
             number: int, moments: ColumnMoments, size: int, n: int
         ) -> BlockGaussianMixture:
-            return fold.unfitted_mixture(moments, size, operators, kinematics, n, number, whole)
+            return fold.unfitted_mixture(
+                moments, size, operators, kinematics, n, number, whole=whole
+            )
 
         def condition(mixture: BlockGaussianMixture) -> Regression:
             fold.set_mixture(mixture, operators, kinematics, learning.time, holds)
