@@ -1,0 +1,157 @@
+"""How a robot fares with bottles that were never shown, many of them out of reach.
+
+Bottles stand up to half a metre outside the box in which they were demonstrated, each as far
+from its nearest point as a draw says. The robots of a batch
+
+1. run the whole skill by the clock. Counted are reversals, ticks at which a joint's velocity
+   changes its sign with more than 1 rad/s before and after, and ticks beyond the bounds of
+   speed and acceleration;
+2. run it up to the grasp, where time stands for some seconds more, so that they come to rest as
+   near to the bottle as they get. Their distance is sqrt(2 F), that of the fused Gaussian, in
+   units of what demonstrations allow; it is compared with the best of many starts, drawn
+   between the limits of the joints, from each of which the same cost is minimised.
+
+    python examples/out_of_reach.py --bottles 200
+
+Of the bottles that can be reached the distance says nothing: shares are of the others, whose
+nearest posture is more than 100 standard deviations away.
+"""
+
+import argparse
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.control.clocks import EvenProgress
+from tpgmm_torch.regression.posture import _Cost, _descended
+from tpgmm_torch.regression.regression import Regression
+
+#: When the hands are at the bottle, shortly before it is moved [s].
+GRASP = 4.4
+DT = 0.01
+#: A velocity that counts as a reversal's [rad/s].
+FAST = 1.0
+#: Distances below are those of bottles in reach.
+REACHED = 100.0
+
+
+@dataclass(frozen=True)
+class UpTo(EvenClock):
+    """A clock that stops in the middle of the skill."""
+
+    stop: float = GRASP
+
+    def start(
+        self,
+        regression: Regression,
+        begin: float,
+        end: float,
+        joints: Tensor,
+        frames: Mapping[str, Frame],
+    ) -> EvenProgress:
+        """See :class:`EvenClock`."""
+        return super().start(regression, begin, min(end, self.stop), joints, frames)
+
+
+def outside(n: int, seed: int, most: float) -> Frame:
+    """Bottles up to so far outside the box of those demonstrated [m], turned as they were."""
+    rng, skill = np.random.default_rng(seed), BottleShaking()
+    inside = skill.bottle_poses(n, rng)
+    lowest, highest = torch.tensor([skill.lowest, skill.highest], dtype=torch.float64)
+    far = inside.position + torch.from_numpy(rng.standard_normal((n, 3)))
+    nearest = torch.clamp(far, lowest, highest)
+    away = torch.nn.functional.normalize(far - nearest, dim=-1)
+    distance = torch.from_numpy(rng.uniform(0, most, (n, 1)))
+    return Frame(nearest + distance * away, inside.orientation)
+
+
+def learned(n_demonstrations: int = 10, n_components: int = 30) -> TaskParameterizedGMM:
+    """The skill from generated demonstrations."""
+    demonstrations = BottleShaking().demonstrations(n_demonstrations, seed=0)
+    aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
+    model = TaskParameterizedGMM(n_components, bottle_operators(), BottleShaking().robot)
+    return model.fit(aligned)
+
+
+def played(model: TaskParameterizedGMM, bottles: Frame, clock: EvenClock, ticks: int) -> Tensor:
+    """References of all robots at each tick, (ticks, n, 17)."""
+    starts = BottleShaking().neutral_posture().expand(len(bottles.position), -1)
+    controller = model.controller(starts, {"bottle": bottles}, clock=clock)
+    with torch.inference_mode():
+        return torch.stack([controller.step(DT).reference for _ in range(ticks)])
+
+
+def calm(model: TaskParameterizedGMM, references: Tensor) -> dict[str, float]:
+    """Reversals, and the largest speed and acceleration as shares of their bounds."""
+    bounds = model.motion_bounds()
+    speed = references.diff(dim=0) / DT
+    acceleration = speed.diff(dim=0) / DT
+    slower = torch.minimum(speed[1:].abs(), speed[:-1].abs())
+    reversals = (speed[1:] * speed[:-1] < 0) & (slower > FAST)
+    return {
+        "reversals": int(reversals.sum()),
+        "robots with one": int(reversals.any(0).any(-1).sum()),
+        "speed": float((speed.abs() / bounds.velocity).max()),
+        "acceleration": float((acceleration.abs() / bounds.acceleration).max()),
+    }
+
+
+def distances(
+    model: TaskParameterizedGMM, bottles: Frame, joints: Tensor, starts: int, steps: int
+) -> tuple[Tensor, Tensor]:
+    """Where robots are (n,), and the least from many starts (n,)."""
+    regression, robot = model.regression(), BottleShaking().robot
+    time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
+    heaviest = regression.tick(time, joints, frames).activation.argmax(-1).expand(len(joints))
+
+    def cost(count: int) -> _Cost:
+        index = heaviest.expand(count, -1)
+        return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
+
+    generator = torch.Generator().manual_seed(1)
+    share = torch.rand(starts, *joints.shape, generator=generator, dtype=torch.float64)
+    many = robot.lower + (robot.upper - robot.lower) * share
+    damping, looked = torch.zeros(many.shape[:-1], dtype=torch.float64), cost(starts)
+    for _ in range(steps):
+        many, damping, height, _ = _descended(looked, many, damping, robot.lower, robot.upper)
+    # from where they are, too: nobody is nearer than the nearest
+    here = cost(1)(joints.unsqueeze(0))[0][0]
+    least = torch.minimum(height.amin(0), here)
+    return (2 * here).sqrt(), (2 * least).sqrt()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--bottles", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--most", type=float, default=0.5, help="metres outside the box")
+    parser.add_argument("--rest", type=float, default=4.0, help="seconds at the grasp")
+    parser.add_argument("--starts", type=int, default=60, help="of the minimisation")
+    parser.add_argument("--steps", type=int, default=25, help="of each, two trials each")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore")  # of bottles that nobody has shown
+    model = learned()
+    bottles = outside(options.bottles, options.seed, options.most)
+    whole = played(model, bottles, EvenClock(), len(model.time_) + round(0.5 / DT))
+    print("whole skill:", calm(model, whole), flush=True)
+    stops = played(model, bottles, UpTo(), round((GRASP + options.rest) / DT))
+    print("up to the grasp:", calm(model, stops), flush=True)
+    moving = float((stops[-1] - stops[-2]).abs().max() / DT)
+    here, least = distances(model, bottles, stops[-1], options.starts, options.steps)
+    far = least > REACHED
+    excess = (here / least - 1)[far]
+    print(
+        f"at the end they move by at most {moving:.3f} rad/s; of {int(far.sum())} bottles out "
+        f"of reach {int((excess <= 0.05).sum())} are approached to within 5 % of the nearest "
+        f"distance, {int((excess <= 0.12).sum())} to within 12 %; median excess "
+        f"{100 * float(excess.median()):.2f} %, largest {100 * float(excess.max()):.0f} %"
+    )
