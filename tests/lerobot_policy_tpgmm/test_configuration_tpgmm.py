@@ -22,7 +22,7 @@ HANDED_OVER = [Hold("bottle", "l_hand", 4.3, 5.0), Hold("bottle", "r_hand", 5.0)
 def test_what_the_estimator_defaults_to_is_the_default():
     parameters = inspect.signature(TaskParameterizedGMM).parameters
     config = TPGMMConfig(device="cpu")
-    left_out = {"operators", "robot", "holds", "warm_start", "device", "verbose"}
+    left_out = {"operators", "parts", "robot", "holds", "warm_start", "device", "verbose"}
     assert set(HYPERPARAMETERS) == set(parameters) - left_out
     for name in HYPERPARAMETERS:
         assert getattr(config, name) == parameters[name].default
