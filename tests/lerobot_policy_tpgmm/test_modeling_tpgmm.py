@@ -11,6 +11,7 @@ import lerobot_policy_tpgmm
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.carrying import carrying_model, scenes
+from tests.support.errands import HAND, errands
 from tests.support.policies import (
     ENVIRONMENT,
     OPEN,
@@ -21,6 +22,7 @@ from tests.support.policies import (
     fitted,
     played,
     policy,
+    pose,
     situations,
 )
 from tests.support.skills import (
@@ -33,7 +35,7 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
-from tpgmm_torch import Canonical, Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch import Canonical, Frame, RelativePosition, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
@@ -202,6 +204,24 @@ def test_tracked_bodies_are_moved_on_their_manifold():
     for start in HANDS.quaternion_starts:
         norms = actions[:, start : start + 4].norm(dim=-1)
         torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
+
+
+def test_parts_with_operators_of_their_own_are_played(tmp_path):
+    cup, tray = RelativePosition("hand", "cup"), RelativePosition("hand", "tray")
+    lists = [[cup, Canonical()], [cup, tray, Canonical()]]
+    model = TaskParameterizedGMM(8, lists, HAND, parts=[3.0], blend=0.0).fit(errands())
+    TPGMMPolicy.from_estimator(model, **OPEN).save_pretrained(tmp_path)
+    new = errands(1, seed=8)[0]
+    poses = [pose(new.frames[name]) for name in ("cup", "tray")]
+    observed = {STATE: new.joints[:1].float(), ENVIRONMENT: torch.cat(poses)[None].float()}
+    actions = act(TPGMMPolicy.from_pretrained(tmp_path), observed, len(model.time_))
+    frames = {
+        name: Frame(at.float().double()[:3])
+        for name, at in zip(("cup", "tray"), poses, strict=True)
+    }
+    given = Situation(observed[STATE][0].double(), frames)
+    assert_close(actions[0], predicted(model, [given])[0])
+    assert float((actions[0, -1] - new.frames["tray"].position).norm()) < 0.02
 
 
 def test_several_frames_follow_one_another_in_the_environments_state():

@@ -2,6 +2,7 @@
 
 import pickle
 import shutil
+from typing import Any
 
 import pytest
 import torch
@@ -34,8 +35,10 @@ URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="l
 </joint></robot>"""
 
 
-def fitted(dtype: str = "float64", robot: bool = True) -> TaskParameterizedGMM:
-    """Two joints that reach for a cup, or two joints and nothing else."""
+def fitted(
+    dtype: str = "float64", robot: bool = True, parts: bool = False, **options: Any
+) -> TaskParameterizedGMM:
+    """Two joints that reach for a cup, or two joints and nothing else, in one part or two."""
     arm = Robot.from_urdf(URDF, ["hand"], tools={"hand": ("lower", [0.2, 0, 0])})
     time = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
     demonstrations = []
@@ -48,9 +51,11 @@ def fitted(dtype: str = "float64", robot: bool = True) -> TaskParameterizedGMM:
     if robot:
         task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
         operators = [Stack(*task), Canonical()]
-    return TaskParameterizedGMM(3, operators, arm if robot else None, dtype=dtype).fit(
-        demonstrations
-    )
+    if parts:  # the cup does not matter in the first
+        options |= {"parts": [0.5], "n_components": 4}
+        operators = [[Canonical()], operators]
+    settings = {"n_components": 3, "operators": operators, "dtype": dtype, **options}
+    return TaskParameterizedGMM(robot=arm if robot else None, **settings).fit(demonstrations)
 
 
 def cup(*batch: int) -> dict[str, Frame]:
@@ -184,3 +189,13 @@ def test_priorities_are_part_of_the_graph():
     at = 0.4, [0.2, 0.5], cup()
     assert_same(compiled.step(*at), plain.step(*at))
     assert float((plain.step(*at).joints - soft.step(*at).joints).abs().max()) > 1e-4
+
+
+def test_parts_are_served():
+    plain, compiled = fitted(parts=True), fitted(parts=True).compile("aot_eager")
+    assert [part.n_components for part in compiled.parts_] == [2, 2]
+    for time in (0.0, 0.31, 0.499, 0.501, 0.9, 5.0):
+        assert_same(compiled.step(time, [0.2, 0.5], cup()), plain.step(time, [0.2, 0.5], cup()))
+    situation = Situation([0.1, 0.4], cup())
+    [actual], [expected] = compiled.predict([situation]), plain.predict([situation])
+    torch.testing.assert_close(actual.joints, expected.joints, rtol=0, atol=1e-9)

@@ -62,7 +62,7 @@ CUP = {OBJECT: Frame(HAND.position("hand"), HAND.orientation("hand"))}
 
 
 @pytest.fixture(scope="module")
-def model():
+def shown():
     """Two joints that reach for a cup."""
     time = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
     demonstrations = []
@@ -70,10 +70,13 @@ def model():
         went = minimum_jerk(time)  # from rest to rest
         joints = torch.cat((0.3 * went + gap * (1 - went), 0.5 + 0.3 * went), 1)
         demonstrations.append(Demonstration(time[:, 0], joints, CUP))
+    return demonstrations
+
+
+@pytest.fixture(scope="module")
+def model(shown):
     task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
-    return TaskParameterizedGMM(3, [Stack(*task), Canonical()], ARM, blend=0.3).fit(
-        demonstrations
-    )
+    return TaskParameterizedGMM(3, [Stack(*task), Canonical()], ARM, blend=0.3).fit(shown)
 
 
 @pytest.fixture(scope="module")
@@ -294,6 +297,27 @@ def test_clocks_are_those_of_the_controller(waving, clock, robot):
         assert moved == 1  # let go it goes on from where it was held, or pushed back to
         back = times[149] - min(times[155:275])
         assert abs(back) < 0.1 if robot == "held" else back > 0.3
+
+
+@pytest.mark.parametrize("clock", ["even", "localizing"])
+def test_parts_are_exported(shown, clock):
+    task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
+    lists = [[Canonical()], [Stack(*task), Canonical()]]  # the cup does not matter in the first
+    model = TaskParameterizedGMM(4, lists, ARM, parts=[0.5], blend=0.3).fit(shown)
+    assert len(model.parts_) == 2
+    controller = model.controller(START, CUP, clock=clock, trust=None, smoothing=None)
+    tick = graph(model, clock, model.motion_bounds())
+    stands = torch.tensor(START, dtype=torch.float64)
+    state = torch.zeros(tick.size)
+    for _ in range(TICKS):
+        command = controller.step(DT, joints=stands)
+        state, reference, velocity, covariance = tick(state, stands)
+        torch.testing.assert_close(reference, command.reference, rtol=0, atol=1e-8)
+        torch.testing.assert_close(velocity, command.velocity, rtol=0, atol=1e-6)
+        torch.testing.assert_close(covariance, command.estimate.covariance, rtol=0, atol=1e-8)
+        torch.testing.assert_close(state[0], command.time.reshape(()), rtol=0, atol=1e-8)
+        stands = reference
+    assert command.status is Status.FINISHED
 
 
 def test_what_cannot_be_exported_is_said(model, tmp_path, monkeypatch):
