@@ -48,7 +48,7 @@ from tpgmm_torch.large_data.row_file import RowFile
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture, fit_subsets
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrated_peaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.persistence import CONFIG, MODEL, MODES, TENSORS, decode, encode
 from tpgmm_torch.plausibility.check import (
@@ -89,6 +89,7 @@ from tpgmm_torch.structure.parts import (
     check_cuts,
     components_of_parts,
     leaves,
+    matters,
     part_of,
     stretches,
     united,
@@ -531,9 +532,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 number = None if components is None else components.n_components_
                 self._learn(gathered, operators, kinematics, checkpoint, holds, number)
             if self.operator_weights == "held-out":
-                time, variance = self.means_[0][:, 0], self.covariances_[0][:, 0, 0]
-                marginals = TimeMarginals.of(self.weights_.log(), time, variance)
-                self._weigh(held_out_weights(known, given, kinematics, marginals, holds))
+                self._weigh(self._held_out(known, given, kinematics, holds))
             self.shown_, self.demonstration_weights_ = shown, weights
             self.segmentation_, self.component_selection_ = segmentation, components
             self.operator_selection_ = selections
@@ -1239,7 +1238,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                     self.prior_std, self.kinematics_, self.operators_, *mixture
                 ),
                 negligible=self.negligible,
-                priorities=self._checked_priorities(self.operators_),
+                priorities=self._checked_priorities(
+                    self.operators_, self.kinematics_, self.parts_
+                ),
             )
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]
@@ -1367,7 +1368,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 f"activation='product' asks how operators move with time, and the base of "
                 f"{tangent} moves along: use activation='time' or geometry='quaternion'"
             )
-        self._checked_priorities(operators)
+        self._checked_priorities(operators, kinematics)
         self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
         self.frame_names_, self.time_ = frame_names(operators, kinematics), time
         self.acceleration_ = self.jerk_ = None
@@ -1743,8 +1744,13 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         )
         return self.set_mixture(mixture, operators, kinematics, learning.time, holds)
 
-    def _checked_priorities(self, operators: Sequence[Operator]) -> list[int] | None:
-        """One per operator; they ask for the default fusion and activation."""
+    def _checked_priorities(
+        self, operators: Sequence[Operator], kinematics: Kinematics, parts: Sequence[Part] = ()
+    ) -> list[int] | None:
+        """One per operator; they ask for the default fusion and activation.
+
+        What is fulfilled strictly is so at all times, and so it has to matter in all ``parts``.
+        """
         if self.priorities is None:
             return None
         given = list(self.priorities)
@@ -1759,7 +1765,50 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 f"regulariser that they would drown in; got {self.fusion!r}, "
                 f"{self.activation!r}"
             )
+        strict = [one for one, p in zip(operators, given, strict=True) if p > min(given)]
+        for number, part in enumerate(parts, start=1):
+            for operator in strict:
+                if not matters(part, operator, kinematics).all():
+                    raise DataError(
+                        f"what has priority is fulfilled strictly at all times, but not all of "
+                        f"{operator} matters in part {number}, from {part.begin:.4g} to "
+                        f"{part.end:.4g} s: name it in every part, or give it the priority "
+                        f"{min(given)}"
+                    )
         return list(map(int, given))
+
+    def _held_out(
+        self,
+        demonstrations: Sequence[Demonstration],
+        given: Sequence[Operator],
+        kinematics: Kinematics,
+        holds: Sequence[Hold],
+    ) -> Tensor:
+        """Weights (K, J) of the ``given`` operators, found in what is shown of each part.
+
+        Where an operator does not matter it says next to nothing already: its weight is one.
+        """
+        parts = self.parts_ or (Part(0, 0, "", leaves(self.operators_), self.n_components_),)
+        shown, found, first = stretches(demonstrations, parts, kinematics.lower), [], 0
+        for part, stretch in zip(parts, shown, strict=True):
+            own = slice(first, first + part.n_components)
+            first += part.n_components
+            mattering: dict[int, Operator] = {}
+            for j, pair in enumerate(zip(given, self.operators_, strict=True)):
+                members = list(zip(*map(leaves, ([one] for one in pair)), strict=True))
+                kept = [one for one, done in members if done in part.operators]
+                if kept:
+                    whole = len(kept) == len(members)
+                    mattering[j] = pair[0] if whole else Stack(*kept) if kept[1:] else kept[0]
+            time, variance = self.means_[0][own, 0], self.covariances_[0][own, 0, 0]
+            marginals = TimeMarginals.of(self.weights_[own].log(), time, variance)
+            weights = held_out_weights(
+                stretch, list(mattering.values()), kinematics, marginals, holds
+            )
+            rows = weights.new_ones(len(weights), len(given))
+            rows[:, list(mattering)] = weights
+            found.append(rows)
+        return torch.cat(found)
 
     def _weigh(self, weights: Tensor) -> None:
         """Let operators count for weights (K, J) only."""
@@ -1806,6 +1855,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         parts: Sequence[Part],
     ) -> tuple[ComponentSelection, ...] | None:
         """Fit a mixture to the rows of each part, and chain them."""
+        self._checked_priorities(operators, kinematics, parts)
         [rows] = learning.rows
         whole, time = ColumnMoments.of(rows), as_array(learning.time)
         belongs, instants = part_of(parts, rows[:, 0]), part_of(parts, time)

@@ -34,6 +34,7 @@ __all__ = [
     "check_cuts",
     "components_of_parts",
     "leaves",
+    "matters",
     "part_of",
     "stretches",
     "united",
@@ -205,6 +206,21 @@ def components_of_parts(number: int, instants: Sequence[int]) -> list[int]:
     return [int(count) for count in counts]
 
 
+def matters(part: Part, operator: Operator, kinematics: Kinematics) -> NDArray[np.bool_]:
+    """Which coordinates of an operator matter in a part.
+
+    Parameters
+    ----------
+    part : Part
+    operator : Operator
+        A member of a stack, or a whole one.
+    kinematics : Kinematics
+    """
+    members = leaves([operator])
+    counts = [one in part.operators for one in members]
+    return np.repeat(counts, [one.dimension(kinematics) for one in members])
+
+
 def chained(
     mixtures: Sequence[BlockGaussianMixture],
     parts: Sequence[Part],
@@ -242,7 +258,7 @@ def chained(
     whole.covariances_ = []
     for j, (operator, variance) in enumerate(zip(operators, variances, strict=True)):
         own = [
-            _widened(one.covariances_[j], _matters(part, operator, kinematics), variance)
+            _widened(one.covariances_[j], matters(part, operator, kinematics), variance)
             for one, part in zip(mixtures, parts, strict=True)
         ]
         whole.covariances_.append(torch.cat(own))
@@ -253,13 +269,6 @@ def chained(
     whole.lower_bound_ = float(shares @ bounds)
     whole.lower_bounds_ = [whole.lower_bound_]
     return whole
-
-
-def _matters(part: Part, operator: Operator, kinematics: Kinematics) -> NDArray[np.bool_]:
-    """Which coordinates of an operator matter in a part."""
-    members = leaves([operator])
-    counts = [one in part.operators for one in members]
-    return np.repeat(counts, [one.dimension(kinematics) for one in members])
 
 
 def _widened(covariances: Tensor, matters: NDArray[np.bool_], variances: Tensor) -> Tensor:

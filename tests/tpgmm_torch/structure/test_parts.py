@@ -33,6 +33,7 @@ from tpgmm_torch.structure.component_selection import ComponentSelection
 from tpgmm_torch.structure.parts import check_cuts, components_of_parts, united
 
 CUP, TRAY = RelativePosition("hand", "cup"), RelativePosition("hand", "tray")
+IN_PARTS = [[CUP, Canonical()], [CUP, TRAY, Canonical()]]
 
 
 def model(**options):
@@ -171,6 +172,39 @@ def test_components_are_found_part_by_part():
     assert found.n_components_ == sum(numbers) == len(found.weights_)
 
 
+def test_operators_are_weighed_by_what_is_shown_of_each_part():
+    """What does not matter in a part has no say in how much the others do."""
+    settings = {"n_components": 2, "parts": [3.0], "operator_weights": "held-out"}
+    shown = errands()
+    found = model(**settings, operators=IN_PARTS).fit(shown)
+    alone = model(**settings, operators=[[CUP, Canonical()]] * 2).fit(shown)
+    stacked = [[CUP, Canonical()], [Stack(CUP, TRAY), Canonical()]]
+    together = model(**settings, operators=stacked).fit(shown)
+    weights = found.operator_weights_
+    assert weights.shape == (2, 3) and float(weights[0, 2]) == 1.0  # the tray says nothing
+    assert bool((weights[0, :2] < 1).all() and (weights[1] < 1).all())
+    for other in (alone, together):
+        torch.testing.assert_close(
+            other.operator_weights_[0], weights[0, :2], rtol=1e-3, atol=1e-3
+        )
+    plain = model(**settings | {"operator_weights": "equal"}, operators=IN_PARTS).fit(shown)
+    given_time, before = (
+        torch.stack([c.covariance for c in one.regression().conditionals], 1)
+        for one in (found, plain)
+    )
+    expected = before / weights[:, :, None, None]
+    torch.testing.assert_close(given_time, expected, rtol=1e-8, atol=1e-14)
+
+
+def test_what_matters_in_every_part_can_have_priority():
+    new, gaps = errands(1, seed=7)[0], []
+    for priorities in ([1, 0, 0], None):
+        one = model(parts=[3.0], operators=IN_PARTS, priorities=priorities).fit(errands())
+        [path] = one.predict([Situation(new.joints[0], new.frames, np.linspace(0, 6, 121))])
+        gaps.append(float((path.joints - path.candidates[0].mean).abs().max()))
+    assert gaps[0] < 0.1 * gaps[1]
+
+
 def test_folds_find_their_own_parts():
     shown = errands()
     [fold] = fit_folds(model(parts="auto"), shown, [[0, 1, 2, 3]])
@@ -225,6 +259,11 @@ def test_every_part_has_components_and_all_are_given(number):
         ({"parts": [3.0], "operators": [[CUP]]}, DataError, "2 sequences of operators"),
         ({"operators": [[CUP], [TRAY]]}, DataError, "1 parts give operators"),
         ({"parts": [3.0], "warm_start": True}, DataError, "no one state of EM"),
+        (
+            {"parts": [3.0], "operators": IN_PARTS, "priorities": [0, 0, 1]},
+            DataError,
+            "matters in part 1, from 0 to 3 s: name it in every part, or give it .* 0",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused(options, error, message):
