@@ -12,6 +12,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE / "pictures")]
 
 import inventories  # noqa: E402
+import notebooks  # noqa: E402
 
 torch.set_num_threads(1)  # the matrices are small
 
@@ -34,6 +35,7 @@ extensions = [
     # our own
     "commands",
     "internals",
+    "notebooks",
     "picturebook",
     "report",
     "sitelinks",
@@ -78,6 +80,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": False,
     "only_warn_on_example_error": False,
     "capture_repr": (),
+    "first_notebook_cell": notebooks.FIRST_CELL,
     "image_scrapers": ("matplotlib",),
     "remove_config_comments": True,
     "show_memory": False,

@@ -37,7 +37,7 @@ torch.set_num_threads(1)  # the matrices are small
 # rate, features, and problems if there are any.
 
 temporary = tempfile.TemporaryDirectory()
-if len(sys.argv) > 1:
+if len(sys.argv) > 1 and "__file__" in globals():  # a notebook's arguments are its kernel's
     folder = Path(sys.argv[1])
 else:
     folder = Path(temporary.name) / "bottle"

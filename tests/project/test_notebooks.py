@@ -1,0 +1,74 @@
+"""Notebooks of the gallery run from the first cell to the last, and can be read."""
+
+import json
+import os
+import re
+import sys
+from copy import deepcopy
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
+from sphinx_gallery.notebook import jupyter_notebook
+from sphinx_gallery.py_source_parser import split_code_and_text_blocks
+
+ROOT = Path(__file__).parents[2]
+#: One of each kind: a robot, two hands, a data set in files, alignment, what matters.
+EXECUTED = (
+    "plot_01_planar_arm",
+    "plot_04_competing_constraints",
+    "plot_07_lerobot_dataset",
+    "plot_08_alignment",
+    "plot_11_what_matters",
+)
+SCRIPTS = sorted((ROOT / "examples").glob("plot_*.py"))
+
+
+@pytest.fixture
+def extension(monkeypatch):
+    """What the site changes of the gallery's conversion."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    import notebooks
+
+    monkeypatch.setattr("sphinx_gallery.notebook.rst2md", notebooks.rst2md)
+    return notebooks
+
+
+def converted(script: Path, extension) -> nbformat.NotebookNode:
+    """A script as a notebook, by the gallery's own converter."""
+    settings = deepcopy(DEFAULT_GALLERY_CONF) | {"first_notebook_cell": extension.FIRST_CELL}
+    _, cells = split_code_and_text_blocks(script)
+    text = json.dumps(jupyter_notebook(cells, settings, script.parent))
+    return nbformat.reads(text, as_version=4)
+
+
+@pytest.mark.parametrize("name", EXECUTED)
+def test_a_notebook_runs_and_shows_a_picture(name, extension, tmp_path, monkeypatch):
+    for folder in (
+        "JUPYTER_RUNTIME_DIR",
+        "JUPYTER_CONFIG_DIR",
+        "JUPYTER_DATA_DIR",
+        "IPYTHONDIR",
+    ):
+        monkeypatch.setenv(folder, str(tmp_path / folder.lower()))
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own is to draw
+    # a checkout comes before what is installed, as in the tests' own process
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    notebook = converted(ROOT / "examples" / f"{name}.py", extension)
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=120, kernel_name="python3", resources=resources).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert any("image/png" in output.get("data", ()) for output in outputs)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
+def test_a_notebook_can_be_read(script, extension):
+    install, title, *cells = converted(script, extension).cells
+    assert install.source.splitlines()[-1] == "# %pip install 'tpgmm-torch[cli]'"
+    assert title.source.strip().startswith("# ")
+    texts = [cell.source for cell in (title, *cells) if cell.cell_type == "markdown"]
+    assert sum(text.strip().startswith("## ") for text in texts) >= 2
+    for text in texts:
+        assert not re.search(r":[a-z]+:`|^\.\. |^[-=]{4,}$", text, re.MULTILINE), text
