@@ -144,7 +144,7 @@ class Instants:
     names : frozenset of str
         The frames and links that are there.
     instants : array of shape (G,)
-        [s]
+        When they are [s].
 
     Attributes
     ----------
