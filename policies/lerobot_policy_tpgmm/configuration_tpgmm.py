@@ -31,6 +31,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.plausibility import Shown
+from tpgmm_torch.structure.parts import parse_parts
 
 __all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
@@ -50,7 +51,7 @@ ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
 
 CHOICES = {
     "feedback": ("reference", "observation"),
-    "alignment": METHODS,
+    "alignment": (*METHODS, "parts"),
     "learn_from": ("measured", "commanded"),
     "loss": ("likelihood", "imitation"),
 }
@@ -114,6 +115,9 @@ class TPGMMConfig(StatePolicyConfig):
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
         :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
         all links in all frames, stacked, and the joints.
+    parts : str, optional
+        Where the skill has parts that are learned one by one: ``"auto"``, or when they end, as
+        seconds and events joined by commas, ``"4.2,grasp"``.
     holds : list of str, optional
         From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
         the aligned skill. By default it is found in frames that are read at every step
@@ -191,9 +195,11 @@ class TPGMMConfig(StatePolicyConfig):
         or the unit is wrong then, or the robot does not stand where the skill begins.
     chunk_size : int, default=50
         Number of steps of ``predict_action_chunk``.
-    alignment : {"dtw", "barycenter", "linear", "events", "events+dtw", "none"}, default="dtw"
+    alignment : {"dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"}, \
+    default="dtw"
         How training brings episodes onto one clock; ``"events"`` anchors them at all events,
-        ``"events+dtw"`` warps them in between, too.
+        ``"events+dtw"`` warps them in between, too; ``"parts"`` stretches each of the parts
+        that are found.
     alignment_features : list of str, optional
         What time warping compares, as for
         :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
@@ -239,6 +245,7 @@ class TPGMMConfig(StatePolicyConfig):
 
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
+    parts: str | None = None
     holds: list[str] | None = None
     via_points: list[str] | None = None
     via_fade: float = 1.0
@@ -366,8 +373,8 @@ class TPGMMConfig(StatePolicyConfig):
         if "auto" in self.operators:
             raise DataError(
                 "a policy has its operators before it sees demonstrations: find them with "
-                "'tpgmm fit --operator auto', which can write a policy, --format lerobot; or "
-                "name those that it reports in operators"
+                "'tpgmm fit --operator auto', which can write a policy, --format lerobot, also "
+                "with --parts auto; or name those that it reports in operators"
             )
         return [
             parse_operator(item) if isinstance(item, str) else decode(item)
@@ -392,6 +399,7 @@ class TPGMMConfig(StatePolicyConfig):
         self.n_steps = len(model.time_)
         # with the paths that it found
         self.operators = [_description(operator) for operator in model.operators_]
+        self.parts = ",".join(f"{part.begin:.6g}" for part in model.parts_[1:]) or None
         self.holds = list(map(str, model.holds_))
         self.via_points = list(map(str, model.via_points_)) or None
         self.via_fade = model.via_fade_
@@ -421,6 +429,7 @@ class TPGMMConfig(StatePolicyConfig):
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters."""
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
+        settings["parts"] = parse_parts(self.parts)
         settings["holds"] = "auto" if self.holds is None else list(map(Hold.parse, self.holds))
         return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
 

@@ -28,6 +28,7 @@ def test_what_the_estimator_defaults_to_is_the_default():
         assert getattr(config, name) == parameters[name].default
     assert config.holds is None and config.estimator(None, ()).holds == "auto"
     assert TPGMMConfig(holds=[]).estimator(None, ()).holds == []
+    assert config.parts is None and config.estimator(None, ()).parts is None
 
 
 def test_every_field_is_explained():
@@ -64,6 +65,15 @@ def test_fields_can_be_overridden(saved):
 def test_holds_can_be_overridden(saved, override, wanted):
     policy = loaded(saved, override, env_cfg=make_env_config("bottle_shaking"))
     assert policy.to_estimator().holds_ == tuple(wanted)
+
+
+@pytest.mark.parametrize(
+    ("override", "wanted"),
+    [("--parts=auto", "auto"), ("--parts=2.5", [2.5]), ("--parts=2.5,close", [2.5, "close"])],
+)
+def test_parts_can_be_told(saved, override, wanted):
+    config = PreTrainedConfig.from_pretrained(saved, cli_overrides=[override])
+    assert config.estimator(None, ()).parts == wanted
 
 
 def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):

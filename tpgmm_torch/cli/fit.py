@@ -216,6 +216,7 @@ def fit(
     from tpgmm_torch.large_data.processes import joined_processes
     from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
     from tpgmm_torch.operators.text import default_operators, parse_operator
+    from tpgmm_torch.structure.parts import parse_parts
 
     write = model_format(output_format)
     if keep_demonstrations and (write is not None or batch_episodes is not None):
@@ -246,7 +247,7 @@ def fit(
             n_components,
             operators or default_operators(links, list(data.frames)),
             kinematics,
-            parts=options.parts(parts),
+            parts=parse_parts(parts),
             holds=given if hold else "auto",
             operator_weights=operator_weights,
             covariance_type=covariance_type,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["align", "aligner", "in_panel", "parts", "read_robot", "recordings"]
+__all__ = ["align", "aligner", "in_panel", "read_robot", "recordings"]
 
 
 def in_panel(panel: str) -> Callable[..., Any]:
@@ -227,25 +227,6 @@ def count_or_auto(text: str | int) -> int | str:
     if text == "auto" or (str(text).isdecimal() and int(text) > 0):
         return "auto" if text == "auto" else int(text)
     raise typer.BadParameter(f"{text!r} is neither a positive integer nor 'auto'")
-
-
-def parts(text: str | None) -> str | list[float | str] | None:
-    """Where a skill has parts, as an option's text has it: "auto", or instants and events.
-
-    Parameters
-    ----------
-    text : str or None
-        Joined by commas.
-    """
-    if text is None or text == "auto":
-        return text
-    cuts: list[float | str] = []
-    for word in map(str.strip, text.split(",")):
-        try:
-            cuts.append(float(word))
-        except ValueError:
-            cuts.append(word)
-    return cuts
 
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | Pipeline | None:

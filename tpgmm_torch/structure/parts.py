@@ -35,6 +35,7 @@ __all__ = [
     "components_of_parts",
     "leaves",
     "matters",
+    "parse_parts",
     "part_of",
     "stretches",
     "united",
@@ -170,6 +171,30 @@ def check_cuts(cuts: Sequence[Any], demonstrations: Sequence[Demonstration]) -> 
                 f"{late:.4g} s is not after {first} at {early:.4g} s"
             )
     return [time for time, _ in times]
+
+
+def parse_parts(text: str | None) -> str | list[float | str] | None:
+    """Where a skill has parts, as a text has it: "auto", or instants and events.
+
+    Parameters
+    ----------
+    text : str or None
+        Joined by commas.
+
+    Examples
+    --------
+    >>> parse_parts("4.2, grasp")
+    [4.2, 'grasp']
+    """
+    if text is None or text == "auto":
+        return text
+    cuts: list[float | str] = []
+    for word in map(str.strip, text.split(",")):
+        try:
+            cuts.append(float(word))
+        except ValueError:
+            cuts.append(word)
+    return cuts
 
 
 def components_of_parts(number: int, instants: Sequence[int]) -> list[int]:

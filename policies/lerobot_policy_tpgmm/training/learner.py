@@ -43,11 +43,13 @@ from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
 from tpgmm_torch.alignment.base import Alignment
+from tpgmm_torch.alignment.events import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.events.detection import Detector, find_events
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
+from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
 
@@ -159,15 +161,11 @@ class Learner:
                 f"there is nothing to evaluate before the first epoch is over: {recorder}. "
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
-        if self._config.holds or self._config.link_frames:
-            # frames by themselves do not tell where an object was last free, nor where a
-            # link is at an event of the episode
+        if unlearnable := self._unlearnable():
             if not self._told:
-                why = "objects are held" if self._config.holds else "frames are at events"
                 log.warning(
-                    "%s, %s: the mixture stays as EM fitted it, and more steps change nothing",
-                    why,
-                    ", ".join(self._config.holds or self._config.link_frames.values()),
+                    "%s: the mixture stays as EM fitted it, and more steps change nothing",
+                    unlearnable,
                 )
             self._told = True
             return torch.zeros((), requires_grad=True)
@@ -180,6 +178,17 @@ class Learner:
         """Fit, if all frames are there; a loop that evaluates or saves may stop right then."""
         if self._recorder is not None and self._recorder.complete:
             self._finish(self._recorder)
+
+    def _unlearnable(self) -> str:
+        """Why frames by themselves are not enough for a gradient; empty if they are."""
+        config = self._config
+        if config.holds:  # they do not tell where an object was last free
+            return f"objects are held, {', '.join(config.holds)}"
+        if config.link_frames:  # nor where a link is at an event of the episode
+            return f"frames are at events, {', '.join(config.link_frames.values())}"
+        if config.parts:  # and would narrow what does not matter in a part
+            return f"parts are learned one by one, they end at {config.parts} s"
+        return ""
 
     def check_saveable(self) -> None:
         """Refuse to save a policy that has nothing learned.
@@ -206,7 +215,12 @@ class Learner:
         demonstrations = self._linked(
             {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
         )
-        aligner = parse_alignment(config.alignment, kinematics, config.alignment_features)
+        aligner: Alignment | None
+        if config.alignment == "parts":
+            demonstrations = Segmentation(kinematics).fit_transform(demonstrations)
+            aligner = EventAlignment(["part *"], robot=kinematics)
+        else:
+            aligner = parse_alignment(config.alignment, kinematics, config.alignment_features)
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(numbers))
         if aligner is not None:
@@ -273,7 +287,8 @@ class Learner:
         """Demonstrations with the events and the frames at links that are asked for."""
         config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
-        if self._stored and (poses or config.alignment.startswith("events")):
+        named = config.parts or config.alignment.startswith("events")
+        if self._stored and (poses or named):
             # LeRobot's preprocessor hands no such columns on
             log.info("reading events: %s", ", ".join(self._stored))
             stored = stored_events(Path(self._dataset.root), shown)

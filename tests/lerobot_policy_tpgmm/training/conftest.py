@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.support.errands import errands
 from tests.support.training import FPS, dataset, handlings_set, slow_waves, waves_set
 from tpgmm_datasets import save_lerobot
 
@@ -25,3 +26,11 @@ def commanded(tmp_path_factory):
 def handlings(tmp_path_factory):
     """Two hands and a cup."""
     return dataset(handlings_set(tmp_path_factory.mktemp("handlings") / "set"))
+
+
+@pytest.fixture(scope="session")
+def errand_set(tmp_path_factory):
+    """A hand that takes from a cup to a tray, now sooner, now later."""
+    path = tmp_path_factory.mktemp("errands") / "set"
+    save_lerobot(errands(6, shift=0.35), path, fps=20, task="carry")
+    return dataset(path)
