@@ -81,8 +81,8 @@ figure, (above, below) = plt.subplots(
 )
 plot_candidates(above, trajectory, "l_shoulder_pitch", ("hands seen from the bottle", "joints"))
 above.set_ylim(-0.8, 0.8)
-above.legend(loc="lower left", fontsize="small")
-below.plot(trajectory.time, share, color="tab:green")
+above.legend(loc="lower left", fontsize="small", handlelength=3.5)
+below.plot(trajectory.time, share, color=above.lines[1].get_color())  # of the joints
 below.set(xlabel="time [s]", ylabel="share of joint space", ylim=(0, 1))
 for axes in (above, below):
     for name, span in spans.items():

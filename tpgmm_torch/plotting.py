@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,18 +26,42 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
+    "STYLE",
     "figure",
+    "legend",
     "plot_candidates",
     "plot_components",
     "plot_local",
     "plot_parts",
     "plot_relevance",
+    "save",
     "shade",
 ]
 
-DEMONSTRATION, REPRODUCTION = "0.15", "tab:red"
-COMPONENT = "tab:green"
-OPERATORS = ("tab:red", "tab:green", "tab:blue", "tab:orange", "tab:purple")
+#: Colours of Okabe and Ito, which readers with any kind of colour vision tell apart.
+BLUE, GREEN, PURPLE, SKY, VERMILION = "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"
+DEMONSTRATION, REPRODUCTION, COMPONENT = "0.15", VERMILION, GREEN
+#: Colour and line of each operator; in grey print, lines differ where colours do not.
+OPERATORS = (
+    (VERMILION, "--"),
+    (BLUE, "-."),
+    (GREEN, ":"),
+    (SKY, (0, (5, 1))),
+    (PURPLE, (0, (3, 1, 1, 1, 1, 1))),
+)
+#: What matplotlib's settings are while :func:`figure` and :func:`save` are at work.
+STYLE: dict[str, Any] = {
+    "axes.labelsize": 9,
+    "font.size": 9,
+    "legend.fontsize": 8,
+    "legend.handlelength": 3.5,  # a whole period of every line
+    "lines.solid_capstyle": "round",
+    "pdf.fonttype": 42,  # publishers refuse Type 3
+    "ps.fonttype": 42,
+    "savefig.dpi": 150,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+}
 
 
 def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Figure:
@@ -66,16 +91,60 @@ def figure(rows: int, title: str, width: float = 7.0, height: float = 1.7) -> Fi
     2
     """
     try:
+        from matplotlib import rc_context
         from matplotlib.figure import Figure
     except ImportError:
         raise DependencyError(
             "pictures need matplotlib: pip install 'tpgmm-torch[plot]'"
         ) from None
-    drawing = Figure(figsize=(width, height * rows + 0.9), layout="constrained")
-    axes = drawing.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
-    axes[-1].set_xlabel("time [s]")
-    drawing.suptitle(title, fontsize="medium")
+    with rc_context(STYLE):
+        drawing = Figure(figsize=(width, height * rows + 0.9), layout="constrained")
+        axes = drawing.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+        axes[-1].set_xlabel("time [s]")
+        drawing.suptitle(title, fontsize="medium")
     return drawing
+
+
+def legend(drawing: Figure) -> None:
+    """One legend below all panels, where it hides nothing: each label once.
+
+    Parameters
+    ----------
+    drawing : matplotlib Figure
+        As :func:`figure` gives it, with all that is to be named in it.
+    """
+    from matplotlib import rc_context
+
+    shown: dict[str, Any] = {}
+    for axes in drawing.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, handle)
+    with rc_context(STYLE):
+        drawing.legend(
+            shown.values(), shown.keys(), loc="outside lower center", ncols=min(4, len(shown))
+        )
+
+
+def save(drawing: Figure, path: Path) -> Path:
+    """Write a figure in :data:`STYLE`, in the format of its suffix; vectors in PDF and SVG.
+
+    Parameters
+    ----------
+    drawing : matplotlib Figure
+        As :func:`figure` gives it.
+    path : Path
+        Ends in ``.png``, ``.pdf``, ``.svg``, or what else matplotlib writes.
+
+    Returns
+    -------
+    Path
+        The same.
+    """
+    from matplotlib import rc_context
+
+    with rc_context(STYLE):
+        drawing.savefig(path)
+    return path
 
 
 def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
@@ -112,12 +181,21 @@ def plot_components(
     plane = [0, 1 + column]
     means = as_array(model.means_[operator][:, plane])
     covariances = as_array(model.covariances_[operator][:, plane][:, :, plane])
-    for mean, covariance in zip(means, covariances, strict=True):
+    for k, (mean, covariance) in enumerate(zip(means, covariances, strict=True)):
         variances, directions = np.linalg.eigh(covariance)
         angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
         small, large = 2 * np.sqrt(variances.clip(min=0))
         axes.add_patch(
-            Ellipse(mean, large, small, angle=angle, color=COMPONENT, alpha=0.35, zorder=3)
+            Ellipse(
+                mean,
+                large,
+                small,
+                angle=angle,
+                color=COMPONENT,
+                alpha=0.35,
+                zorder=3,
+                label="" if k else "Gaussians, one standard deviation",
+            )
         )
 
 
@@ -140,16 +218,21 @@ def plot_local(
     demonstrations : sequence of Demonstration
         Black.
     reproductions : sequence of (Trajectory, frames, style)
-        Red; ``style`` is passed to ``Axes.plot``. Trajectories may come from other models.
+        Orange, labelled "reproduction" unless ``style``, which is passed to ``Axes.plot``, says
+        otherwise. Trajectories may come from other models.
     """
     chosen = model.operators_[operator]
     shown: list[tuple[Demonstration, dict[str, Any]]] = [
-        (demonstration, {"color": DEMONSTRATION, "linewidth": 0.7})
-        for demonstration in demonstrations
+        (
+            demonstration,
+            {"color": DEMONSTRATION, "linewidth": 0.6, "label": "" if i else "demonstrations"},
+        )
+        for i, demonstration in enumerate(demonstrations)
     ]
     for trajectory, frames, style in reproductions:
         motion = Demonstration(trajectory.time, trajectory.joints, frames)
-        shown.append((motion, {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, **style}))
+        look = {"color": REPRODUCTION, "linewidth": 1.8, "zorder": 4, "label": "reproduction"}
+        shown.append((motion, {**look, **style}))
 
     def expected(_operator: int, time: Tensor) -> Tensor:
         return model.regression().expected(operator, time)
@@ -180,13 +263,14 @@ def plot_candidates(
     for j, candidate in enumerate(trajectory.candidates):
         mean = as_array(candidate.mean[:, column])
         spread = np.sqrt(as_array(candidate.covariance[:, column, column]).clip(min=0))
-        color = OPERATORS[j % len(OPERATORS)]
+        color, line = OPERATORS[j % len(OPERATORS)]
         label = labels[j] if j < len(labels) else f"operator {j + 1}"
         axes.fill_between(
             time, mean - spread, mean + spread, color=color, alpha=0.2, linewidth=0
         )
-        axes.plot(time, mean, color=color, linewidth=1.6, label=label)
-    axes.plot(time, as_array(trajectory.joints[:, column]), "k", linewidth=1.2, label="TP-GMM")
+        axes.plot(time, mean, color=color, linestyle=line, linewidth=2.2, label=label)
+    # thin enough to see whose estimate it follows
+    axes.plot(time, as_array(trajectory.joints[:, column]), "k", linewidth=1.0, label="TP-GMM")
     axes.set_ylabel(f"{joint} [rad]")
 
 

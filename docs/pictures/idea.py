@@ -15,11 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from tpgmm_torch import Demonstration, TaskParameterizedGMM, Trajectory
-from tpgmm_torch.plotting import plot_candidates, shade
+from tpgmm_torch.plotting import OPERATORS, plot_candidates, shade
 
 __all__ = ["draw"]
 
-TASK, JOINTS, RESULT, PAST = "tab:red", "tab:green", "black", "0.75"
+(TASK, _), (JOINTS, _), *_ = OPERATORS
+RESULT, PAST = "black", "0.75"
 PHASES = {"touch": (0.7, planar.TOUCH + 0.1), "wave": (planar.WAVE, planar.END)}
 #: One instant of each phase [s].
 INSTANTS = {"while it touches the object": planar.TOUCH, "while it waves": 3.1}
@@ -105,7 +106,7 @@ def reproduction() -> Figure:
     plot_candidates(right, trajectory, "q1", ("object", "joints"))
     right.set(ylabel="shoulder [rad]", xlabel="time [s]", ylim=(-1.6, 1.8))
     right.margins(x=0)
-    right.legend(fontsize="small", loc="lower right")
+    right.legend(fontsize="small", loc="lower right", handlelength=3.5)
     return drawing
 
 

@@ -32,4 +32,4 @@ def draw(out: Path) -> None:
         for orientation in (True, False)
     ]
     motions = [model.predict([situation])[0] for model in models]
-    draw_figures(out, models[0], aligned, *motions, situation, spans)
+    draw_figures(out, models[0], aligned, *motions, situation, spans, ("png",))

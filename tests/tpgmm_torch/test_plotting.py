@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
 from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
@@ -15,11 +16,14 @@ from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParamet
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plotting import (
+    OPERATORS,
     figure,
+    legend,
     plot_candidates,
     plot_components,
     plot_local,
     plot_relevance,
+    save,
     shade,
 )
 
@@ -127,13 +131,46 @@ def test_candidates_are_drawn_with_their_spread():
     assert axes.get_ylabel() == "b [rad]"
 
 
+def test_a_legend_names_all_that_is_drawn_once():
+    demonstrations, drawing = handlings(2), figure(2, "")
+    [trajectory] = hands().predict(demonstrations[:1])
+    frames = demonstrations[0].frames
+    shown = [(trajectory, frames, {}), (trajectory, frames, {"label": "another"})]
+    for column, axes in enumerate(drawing.axes):
+        plot_local(axes, hands(), 0, column, demonstrations, shown)
+    legend(drawing)
+    [box] = drawing.legends
+    assert [text.get_text() for text in box.get_texts()] == [
+        "demonstrations",
+        "reproduction",
+        "another",
+        "Gaussians, one standard deviation",
+    ]
+
+
+def test_operators_differ_in_colour_and_in_grey_print_by_their_lines():
+    colours, lines = zip(*OPERATORS, strict=True)
+    assert len({to_rgb(colour) for colour in colours}) == len(set(lines)) == len(OPERATORS)
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_a_figure_is_written_in_vectors_with_fonts_that_publishers_take(
+    suffix, magic, tmp_path
+):
+    drawing = figure(1, "a title")
+    shade(drawing.axes[0], {"reach": (0.0, 1.0)})
+    written = save(drawing, tmp_path / f"figure.{suffix}").read_bytes()
+    assert written.startswith(magic)
+    assert b"<image" not in written and b"/Subtype /Image" not in written
+    assert b"/Subtype /Type3" not in written
+
+
 def test_a_figure_is_written(tmp_path):
     [trajectory] = joints_model().predict([Situation([0.0, 1.0, 0.0])])
     drawing = figure(3, "joints")
     for axes, joint in zip(drawing.axes, JOINT_NAMES, strict=True):
         plot_candidates(axes, trajectory, joint)
-    drawing.savefig(tmp_path / "figure.png")
-    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert save(drawing, tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_candidates_that_matter_stand_above_the_others():

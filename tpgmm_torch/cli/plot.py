@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -37,6 +37,10 @@ def plot(
         list[str] | None,
         typer.Option(help="Also draw each operator's estimate of this joint; repeatable."),
     ] = None,
+    form: Annotated[
+        Literal["png", "pdf", "svg"],
+        typer.Option("--format", help="Pixels, or vectors for print."),
+    ] = "png",
     frame: options.Frames = None,
     event: options.Events = None,
     episodes: options.Episodes = None,
@@ -48,13 +52,13 @@ def plot(
     """Draw what a model has learned.
 
     For every operator a picture of its coordinates over time: the demonstrations (black), the
-    components (green), and the reproduction in the situation of the first episode (red).
+    components (green), and the reproduction in the situation of the first episode (orange).
     """
     from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.operators.text import format_operator
-    from tpgmm_torch.plotting import figure, plot_candidates, plot_local
+    from tpgmm_torch.plotting import figure, legend, plot_candidates, plot_local, save
 
     fitted = TaskParameterizedGMM.load(model, device="cpu")
     kinematics = fitted.kinematics_
@@ -79,16 +83,15 @@ def plot(
         for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
             plot_local(axes, fitted, index, column, demonstrations, shown)
             axes.set_ylabel(name, fontsize="small")
-        drawings[f"operator_{index + 1}.png"] = drawing
+        drawings[f"operator_{index + 1}"] = drawing
     for name in chosen:
         drawing = figure(1, f"{name}: what each operator asks for, and the result", height=3.2)
         plot_candidates(drawing.axes[0], trajectory, name, labels)
-        drawing.axes[0].legend(fontsize="x-small")
-        drawings[f"joint_{name}.png"] = drawing
+        drawings[f"joint_{name}"] = drawing
     out.mkdir(parents=True, exist_ok=True)
     for name, drawing in drawings.items():
-        drawing.savefig(out / name, dpi=110)
-        typer.echo(out / name)
+        legend(drawing)
+        typer.echo(save(drawing, out / f"{name}.{form}"))
 
 
 def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:

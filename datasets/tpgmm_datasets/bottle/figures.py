@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, Trajectory
-from tpgmm_torch.plotting import figure, plot_candidates, plot_local, shade
+from tpgmm_torch.plotting import BLUE, figure, legend, plot_candidates, plot_local, save, shade
 
 __all__ = ["draw_figures"]
 
@@ -19,8 +20,9 @@ def draw_figures(
     position_only: Trajectory,
     situation: Situation,
     spans: Mapping[str, tuple[float, float]],
+    formats: Sequence[str] = ("png", "pdf"),
 ) -> list[Path]:
-    """Write ``figure_3.png`` to ``figure_6.png``.
+    """Write ``figure_3`` to ``figure_6``, for screens and, in vectors, for print.
 
     Parameters
     ----------
@@ -36,28 +38,31 @@ def draw_figures(
         In which both were made.
     spans : mapping of str to (float, float)
         Phases to shade [s].
+    formats : sequence of str
+        Suffixes: each figure is written in each.
 
     Returns
     -------
     list of Path
     """
-    solid = (reproduction, situation.frames, {"label": "reproduction"})
-    dashed = (position_only, situation.frames, {"linestyle": "--", "label": "position only"})
+    other = {"color": BLUE, "linestyle": "--", "label": "position only"}
+    solid: tuple[Any, Any, Any] = (reproduction, situation.frames, {})
+    dashed = (position_only, situation.frames, other)
     joints = reproduction.joint_names
     panels = {
-        "figure_3.png": (
+        "figure_3": (
             "Left hand's position seen from the bottle's initial frame",
             0,
             {f"$x_{i + 1}$ [m]": i for i in range(3)},
             [solid],
         ),
-        "figure_4.png": (
+        "figure_4": (
             "Left hand's orientation seen from the bottle's initial frame",
             0,
             {rf"$\epsilon_{i}$": 3 + i for i in range(4)},
             [solid, dashed],
         ),
-        "figure_5.png": (
+        "figure_5": (
             "Waist and left shoulder",
             1,
             {
@@ -67,7 +72,7 @@ def draw_figures(
             [solid],
         ),
     }
-    paths = []
+    drawings = {}
     for name, (title, operator, columns, shown) in panels.items():
         drawing = figure(len(columns), title)
         for axes, (label, column) in zip(drawing.axes, columns.items(), strict=True):
@@ -75,16 +80,21 @@ def draw_figures(
             plot_local(axes, model, operator, column, demonstrations, shown)
             axes.set_ylabel(label)
             axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
-        drawing.axes[-1].legend(loc="lower right", fontsize="x-small")
-        paths.append(out / name)
-        drawing.savefig(paths[-1], dpi=110)
-    drawing = figure(
-        1, "Left shoulder: what each operator asks for, and the result", height=3.2
+        drawings[name] = drawing
+    drawings["figure_6"] = figure(
+        1,
+        "Left shoulder: what each operator asks for (bands: one standard deviation), "
+        "and the result",
+        height=3.2,
     )
-    [axes] = drawing.axes
+    [axes] = drawings["figure_6"].axes
     shade(axes, spans)
     plot_candidates(axes, reproduction, "l_shoulder_pitch", ("bottle", "canonical"))
-    axes.legend(loc="lower left", fontsize="x-small")
-    paths.append(out / "figure_6.png")
-    drawing.savefig(paths[-1], dpi=110)
-    return paths
+    axes.set_xlim(float(model.time_[0]), float(model.time_[-1]))
+    for drawing in drawings.values():
+        legend(drawing)
+    return [
+        save(drawing, out / f"{name}.{form}")
+        for name, drawing in drawings.items()
+        for form in formats
+    ]

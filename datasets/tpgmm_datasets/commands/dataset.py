@@ -114,7 +114,7 @@ def plot(
     """Draw the joints and the positions of the frames over time, a line per episode."""
     import numpy as np
 
-    from tpgmm_torch.plotting import figure
+    from tpgmm_torch.plotting import figure, save
 
     recordings = Recordings(path, None, frame, episodes, units, joints, rate, events=event)
     demonstrations = recordings.demonstrations()
@@ -135,8 +135,7 @@ def plot(
         axes.set_ylabel(name, fontsize="x-small", rotation=0, ha="right")
         axes.tick_params(labelsize="x-small")
     out.parent.mkdir(parents=True, exist_ok=True)
-    drawing.savefig(out, dpi=110)
-    typer.echo(out)
+    typer.echo(save(drawing, out))
 
 
 @app.command(epilog="Example: tpgmm dataset generate out/shake --n-demonstrations 20")

@@ -62,6 +62,7 @@ def test_the_experiment_writes_all_its_files(experiment):
         json.loads((out / "metrics.json").read_text())["rows"].keys() == metrics["rows"].keys()
     )
     for number in (3, 4, 5, 6):
-        assert (out / f"figure_{number}.png").stat().st_size > 10_000
+        for form in ("png", "pdf"):
+            assert (out / f"figure_{number}.{form}").stat().st_size > 10_000
     assert (out / "dataset" / "meta" / "info.json").is_file()
     assert (out / "model" / "model.safetensors").is_file()
