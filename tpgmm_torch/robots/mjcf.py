@@ -21,7 +21,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematic_tree import motion
-from tpgmm_torch.robots.urdf import Mimic, UrdfJoint, description_text
+from tpgmm_torch.robots.urdf import Mimic, UrdfJoint, description_text, is_text
 from tpgmm_torch.robots.urdf_writer import free_name, numbers, origin, write_urdf
 
 __all__ = ["mjcf_to_urdf", "root_element"]
@@ -63,8 +63,8 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
     if (tag := root_element(mjcf)) != "mujoco":
         raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
     try:
-        if isinstance(mjcf, str) and mjcf.lstrip().startswith("<"):
-            model = mujoco.MjModel.from_xml_string(mjcf.strip())
+        if is_text(mjcf):
+            model = mujoco.MjModel.from_xml_string(description_text(mjcf).rstrip())
         else:
             model = mujoco.MjModel.from_xml_path(os.fspath(mjcf))
     except (ValueError, mujoco.FatalError) as error:

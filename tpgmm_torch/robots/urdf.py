@@ -20,12 +20,22 @@ from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["Mimic", "UrdfJoint", "UrdfModel", "description_text", "placement", "read_urdf"]
+__all__ = [
+    "Mimic",
+    "UrdfJoint",
+    "UrdfModel",
+    "description_text",
+    "is_text",
+    "placement",
+    "read_urdf",
+]
 
 MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
 #: Joints of more than one degree of freedom: read, but no :class:`Robot` can be moved by them.
 MULTIPLE_TYPES = ("floating", "planar")
 XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
+#: What may stand before the first element of a text: a byte order mark, and space.
+BEFORE_XML = "\ufeff \t\r\n"
 #: What to do with a description that begins with another element.
 OTHER_FORMATS = {
     "mujoco": ": that is an MJCF, Robot.from_mjcf reads it",
@@ -190,6 +200,16 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     return UrdfModel(root.get("name", ""), text, _root_link(links, joints), links, joints)
 
 
+def is_text(source: str | bytes | os.PathLike[str]) -> bool:
+    """Whether a robot's description is given as text, and not as the path of a file.
+
+    Parameters
+    ----------
+    source : str, bytes or path
+    """
+    return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
+
+
 def description_text(source: str | bytes | os.PathLike[str]) -> str:
     """The text of a robot's description, in the encoding that it declares.
 
@@ -203,8 +223,8 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
     DataError
         If the file cannot be read, or is no text in that encoding.
     """
-    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
-        return source.lstrip("\ufeff \t\r\n")
+    if is_text(source):
+        return str(source).lstrip(BEFORE_XML)
     if not isinstance(source, bytes):
         try:
             source = read_whole(Path(source))

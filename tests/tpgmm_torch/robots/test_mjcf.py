@@ -182,6 +182,11 @@ class TestLimits:
         assert Robot.from_mjcf(one(joints, tie), ["b"]).joint_names == ("j", "k")
 
 
+def test_a_byte_order_mark_does_not_make_a_text_a_path():
+    text = one('<joint name="j" axis="0 0 1"/>')
+    assert mjcf_to_urdf(f"\ufeff\n{text}\n") == mjcf_to_urdf(text)
+
+
 RADIANS = '<mujoco><compiler angle="radian"/>'
 
 
