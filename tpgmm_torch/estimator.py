@@ -1865,6 +1865,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if isinstance(self.n_components, Integral):
             numbers = components_of_parts(int(self.n_components), lasting)
         mixtures, learned = [], []
+        shown = stretches(demonstrations, parts, kinematics.lower)
         for number, part in enumerate(parts):
             own = rows[belongs == number]
             stretch = replace(
@@ -1872,8 +1873,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 rows=StoredRows(own),
                 time=learning.time[torch.from_numpy(instants == number)],
             )
-            shown = stretches(demonstrations, parts, kinematics.lower)[number]
-            found = self._components(shown, stretch, operators, kinematics, holds, whole)
+            found = self._components(
+                shown[number], stretch, operators, kinematics, holds, whole
+            )
             selections.append(found)
             k = numbers[number] if found is None else found.n_components_
             learned.append(replace(part, n_components=k))

@@ -1,4 +1,4 @@
-"""What objects show of themselves at the end of a notebook cell, and curves over time."""
+"""What objects show of themselves: tables in notebooks and as text, and curves over time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Tabular", "listed", "panels"]
+__all__ = ["Tabular", "in_columns", "listed", "panels"]
 
 
 class Tabular:
@@ -39,6 +39,27 @@ def listed(names: Iterable[object]) -> str:
     ('shoulder, elbow', '-')
     """
     return ", ".join(map(str, names)) or "-"
+
+
+def in_columns(lines: Sequence[Sequence[str]]) -> str:
+    """Lines of cells as text, with columns as wide as they need.
+
+    Parameters
+    ----------
+    lines : sequence of sequence of str
+        As many cells in each.
+
+    Examples
+    --------
+    >>> print(in_columns([("joint", "range"), ("lift", "0 to 2")]))
+    joint  range
+    lift   0 to 2
+    """
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )
 
 
 def panels(

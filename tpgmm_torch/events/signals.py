@@ -101,11 +101,7 @@ class SignalEvent(Detector):
         signal = _principal(as_array(demonstration.joints)[:, self._columns(demonstration)])
         half = max(1, round(SPIKE / 2 / float(np.median(np.diff(time)))))
         signal = median_filter(signal, size=2 * half + 1, mode="nearest")
-        low, high, within = _levels(signal)
-        swing, size = high - low, float(np.abs(signal).max())
-        if swing <= 1e-9 * size:
-            return NOTHING
-        share = (signal - low) / swing
+        share, contrast = _between_levels(signal)
         share = 1 - share if self.level == "low" else share
         stretches = hysteresis(share, ON, OFF)
         begun = [(start, stop) for start, stop in stretches if start > 0]
@@ -117,7 +113,6 @@ class SignalEvent(Detector):
         lengths = np.array([time[stop - 1] - time[start] for start, stop in begun])
         longest = int(lengths.argmax())
         at, change = _edge(time, share, *begun[longest], self.edge)
-        contrast = max(0.0, 1 - 2 * within / swing) * min(1.0, swing / (LARGE * size))
         steepness = max(0.0, 1 - 2 * change / max(lengths[longest], 1e-9))
         return Detection(at, float(contrast * steepness * uniqueness(lengths, longest)))
 
@@ -208,14 +203,10 @@ def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]
         When each begins and ends (35 % and 65 % of the way), and whether it falls; none where
         the two levels do not stand out.
     """
-    signal = _principal(values)
-    low, high, within = _levels(signal)
-    swing, size = high - low, float(np.abs(signal).max())
-    if swing <= 1e-9 * size:
+    share, contrast = _between_levels(_principal(values))
+    if contrast < LEAST_CONFIDENCE:
         return []
-    if max(0.0, 1 - 2 * within / swing) * min(1.0, swing / (LARGE * size)) < LEAST_CONFIDENCE:
-        return []
-    share = 1 - (signal - low) / swing  # 1 where it is low
+    share = 1 - share  # 1 where it is low
     found = []
     for start, stop in hysteresis(share, ON, OFF):
         if start > 0:
@@ -234,6 +225,19 @@ def _principal(values: Array) -> Array:
     weights = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)[2][0]
     summed: Array = values @ (weights if weights.sum() >= 0 else -weights)
     return summed
+
+
+def _between_levels(signal: Array) -> tuple[Array, float]:
+    """Where a signal (T,) is from its low level (0) to its high one (1), and how plainly.
+
+    The second is 0 where there is one level only, and at most 1.
+    """
+    low, high, within = _levels(signal)
+    swing, size = high - low, float(np.abs(signal).max())
+    if swing <= 1e-9 * size:
+        return np.zeros_like(signal), 0.0
+    contrast = max(0.0, 1 - 2 * within / swing) * min(1.0, swing / (LARGE * size))
+    return (signal - low) / swing, contrast
 
 
 def _levels(values: Array) -> tuple[float, float, float]:

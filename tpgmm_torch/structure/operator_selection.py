@@ -18,6 +18,7 @@ from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.operators import (
     AbsoluteOrientation,
     AbsolutePosition,
@@ -276,13 +277,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
                     why,
                 )
             )
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        return "\n".join(
-            "  ".join(
-                cell.ljust(width) for cell, width in zip(line, widths, strict=True)
-            ).rstrip()
-            for line in lines
-        )
+        return in_columns(lines)
 
     def _select(
         self, evidence: Evidence, joints: Sequence[int], free: Sequence[int]

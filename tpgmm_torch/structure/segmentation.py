@@ -20,6 +20,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.events.boundaries import find_boundaries
 from tpgmm_torch.exceptions import NotFittedError
+from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.plausibility.findings import Finding, Report
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.operator_selection import FEWEST, OperatorSelection
@@ -204,11 +205,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
                     self.reasons_[number],
                 )
             )
-        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-        return "\n".join(
-            "  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip()
-            for line in lines
-        )
+        return in_columns(lines)
 
     def out_of_step(self, demonstrations: Sequence[Demonstration]) -> Report:
         """What there is to say of boundaries that are not at one time in all demonstrations.

@@ -36,17 +36,14 @@ def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
     from tpgmm_datasets.description import describe_lerobot
     from tpgmm_datasets.errors import summed_up
+    from tpgmm_torch.notebook import in_columns
 
     description = describe_lerobot(path)
     for name, value in _summary(description).items():
         typer.echo(f"{name:<10} {value}")
     rows = [("column", "type", "value", "unit", "from", "to")]
     rows += [row for column in description.columns for row in _rows(column)]
-    widths = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
-    typer.echo()
-    for row in rows:
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=True)]
-        typer.echo("  ".join(cells).rstrip())
+    typer.echo(f"\n{in_columns(rows)}")
     for problem in summed_up(description.problems):
         typer.echo(f"problem: {problem}")
 
