@@ -154,7 +154,7 @@ class CarryAndPut(BottleSkill):
         """
         n = len(situations)
         slides = np.zeros((n, 2)) if slides is None else slides
-        return self._demonstrations(situations, slides, self._nominal_ends(n))
+        return self._demonstrations(situations, slides, self._timing.nominal_ends(n))
 
     def put_error(self, bottle: Frame, tray: Frame) -> tuple[Tensor, Tensor]:
         """How far a bottle is from its place on a tray.
@@ -181,13 +181,15 @@ class CarryAndPut(BottleSkill):
         )
         first = self.robot.state(starts)
         hands = [Frame(first.position(hand), first.orientation(hand)) for hand in HANDS]
-        lengths = self._steps(ends)
+        lengths = self._timing.steps(ends)
 
         def bottle_at(time: Tensor) -> Frame:
-            return self._bottle(self._progress(time, ends), time, ends, bottles, trays, slides)
+            return self._bottle(
+                self._timing.progress(time, ends), time, ends, bottles, trays, slides
+            )
 
         def wanted(time: Tensor) -> list[Frame]:
-            progress = self._progress(time, ends)
+            progress = self._timing.progress(time, ends)
             held = before_sliding(bottle_at(time), slides)
             poses = []
             for start, hand in zip(hands, HANDS, strict=True):
@@ -206,7 +208,7 @@ class CarryAndPut(BottleSkill):
             return poses
 
         joints = self._follow(starts, wanted, max(lengths))
-        times = self._times(max(lengths))
+        times = self._timing.times(max(lengths))
         poses = [bottle_at(time.expand(len(starts))) for time in times]
         demonstrations = []
         for i, steps in enumerate(lengths):

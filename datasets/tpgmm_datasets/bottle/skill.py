@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
     Demonstration,
@@ -37,6 +38,7 @@ __all__ = [
     "BottleSkill",
     "attached",
     "between",
+    "follow_hands",
     "upper_body",
     "upright",
 ]
@@ -181,55 +183,19 @@ class BottleSkill:
         return torch.from_numpy(self._phase_lengths(n, rng).cumsum(1))
 
     def _phase_lengths(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        nominal = np.array(list(self.phases.values()))
-        shares = nominal * rng.uniform(0.88, 1.12, (n, len(nominal)))
-        total = nominal.sum() * rng.permutation(np.linspace(-1, 1, n) * self.stretch + 1)
-        return np.asarray(shares / shares.sum(1, keepdims=True) * total[:, None])
+        return self._timing.lengths(n, rng)
 
-    def _nominal_ends(self, n: int) -> Tensor:
-        """The same without any spread."""
-        return (
-            torch.tensor(list(self.phases.values()), dtype=torch.float64)
-            .cumsum(0)
-            .expand(n, -1)
-        )
-
-    def _progress(self, time: Tensor, ends: Tensor) -> dict[str, Tensor]:
-        """How much of each phase is done at times (..., n), in [0, 1]."""
-        starts = torch.cat((torch.zeros_like(ends[:, :1]), ends[:, :-1]), dim=1)
-        done = ((time[..., None] - starts) / (ends - starts)).clamp(0, 1)
-        return dict(zip(self.phases, done.unbind(-1), strict=True))
-
-    def _steps(self, ends: Tensor) -> list[int]:
-        """How many time steps each demonstration has."""
-        return [int(last) + 1 for last in torch.floor(ends[:, -1] * self.rate + 1e-9)]
-
-    def _times(self, steps: int) -> Tensor:
-        return torch.arange(steps, dtype=torch.float64) / self.rate
+    @property
+    def _timing(self) -> Phases:
+        return Phases(self.phases, self.rate, self.stretch)
 
     def _follow(
         self, starts: Tensor, wanted: Callable[[Tensor], list[Frame]], steps: int
     ) -> Tensor:
-        """Inverse kinematics of all demonstrations at once, shape (steps, n, 17).
-
-        ``wanted`` gives the poses of both hands at times (n,).
-        """
-        robot = self.robot
-        weights = torch.ones(robot.n_joints, dtype=torch.float64)
-        weights[
-            [robot.joint_names.index(f"waist_{axis}") for axis in ("roll", "pitch", "yaw")]
-        ] = 0.3
-        neutral = self.neutral_posture()
-        limit = robot.velocity / self.rate
-        joints, out = starts, [starts]
-        for time in self._times(steps)[1:]:
-            targets = wanted(time.expand(len(starts)))
-            step = _least_squares(robot, joints, targets, weights, neutral, 1 / self.rate)
-            joints = torch.clamp(
-                joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
-            )
-            out.append(joints)
-        return torch.stack(out)
+        """Inverse kinematics of all demonstrations at once, shape (steps, n, 17)."""
+        return follow_hands(
+            self.robot, starts, wanted, self._timing.times(steps), self.neutral_posture()
+        )
 
 
 @dataclass(frozen=True)
@@ -329,7 +295,7 @@ class BottleShaking(BottleSkill):
             Frame.stack([situation.frames["bottle"] for situation in situations]),
             Frame(CHEST).expand((n,)),
             torch.stack([situation.joints for situation in situations]),
-            self._nominal_ends(n),
+            self._timing.nominal_ends(n),
             torch.full((n,), self.amplitude, dtype=torch.float64),
         )
 
@@ -342,13 +308,13 @@ class BottleShaking(BottleSkill):
         amplitudes: Tensor,
     ) -> list[Demonstration]:
         paths = [_Path(self.robot.state(starts), hand, bottles, chests) for hand in HANDS]
-        lengths = self._steps(ends)
+        lengths = self._timing.steps(ends)
         joints = self._follow(
             starts,
-            lambda time: [path.at(self._progress(time, ends)) for path in paths],
+            lambda time: [path.at(self._timing.progress(time, ends)) for path in paths],
             max(lengths),
         )
-        u = self._progress(self._times(max(lengths))[:, None], ends)["shake"]
+        u = self._timing.progress(self._timing.times(max(lengths))[:, None], ends)["shake"]
         ramp = minimum_jerk(8 * u) * minimum_jerk(8 * (1 - u))
         swing = amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u)
         joints[..., [self.robot.joint_names.index(name) for name in SHOULDERS]] += swing[
@@ -364,7 +330,7 @@ class BottleShaking(BottleSkill):
             }
             demonstrations.append(
                 Demonstration(
-                    self._times(steps),
+                    self._timing.times(steps),
                     joints[:steps, i],
                     {"bottle": bottles[i]},
                     self.robot.joint_names,
@@ -434,6 +400,48 @@ def between(a: Frame, b: Frame, progress: Tensor) -> Frame:
     position = a.position + u[:, None] * (b.position - a.position)
     start, end = torch.broadcast_tensors(a.orientation, b.orientation)
     return Frame(position, quaternions.slerp(start, end, u))
+
+
+def follow_hands(
+    robot: Robot,
+    starts: Tensor,
+    wanted: Callable[[Tensor], list[Frame]],
+    times: Tensor,
+    posture: Tensor,
+) -> Tensor:
+    """Inverse kinematics of both hands along their ways, of all demonstrations at once.
+
+    Parameters
+    ----------
+    robot : Robot
+        The upper body, whose waist shall move less than its arms.
+    starts : Tensor of shape (n, n_joints)
+        Where the joints begin [rad].
+    wanted : callable
+        Gives the poses of both hands, :data:`HANDS`, at times (n,).
+    times : Tensor of shape (T,)
+        At even distances [s].
+    posture : Tensor of shape (n_joints,) or (n, n_joints)
+        Which the null space seeks [rad].
+
+    Returns
+    -------
+    Tensor of shape (T, n, n_joints)
+    """
+    weights = torch.ones(robot.n_joints, dtype=torch.float64)
+    waist = [robot.joint_names.index(f"waist_{axis}") for axis in ("roll", "pitch", "yaw")]
+    weights[waist] = 0.3
+    dt = float(times[1] - times[0])
+    limit = robot.velocity * dt
+    joints, out = starts, [starts]
+    for time in times[1:]:
+        targets = wanted(time.expand(len(starts)))
+        step = _least_squares(robot, joints, targets, weights, posture, dt)
+        joints = torch.clamp(
+            joints + torch.clamp(step, -limit, limit), robot.lower, robot.upper
+        )
+        out.append(joints)
+    return torch.stack(out)
 
 
 def _least_squares(

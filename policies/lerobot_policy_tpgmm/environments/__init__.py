@@ -14,9 +14,16 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.control_rate import rate_processors
 from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
+from lerobot_policy_tpgmm.environments.suite.names import SUITE
 from tpgmm_torch.exceptions import UnknownNameError
 
-__all__ = ["AlohaStateConfig", "BottleShakingConfig", "BottleTorqueConfig", "CarryAndPutConfig"]
+__all__ = [
+    "AlohaStateConfig",
+    "BimanualConfig",
+    "BottleShakingConfig",
+    "BottleTorqueConfig",
+    "CarryAndPutConfig",
+]
 
 _PACKAGE = "lerobot_policy_tpgmm"
 
@@ -31,6 +38,10 @@ gym.register(
 gym.register(
     id=f"{_PACKAGE}/CarryAndPut-v0",
     entry_point=f"{_PACKAGE}.environments.bottle.carrying:CarryAndPutEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/Bimanual-v0",
+    entry_point=f"{_PACKAGE}.environments.suite.env:SuiteEnv",
 )
 gym.register(
     id=f"{_PACKAGE}/AlohaState-v0",
@@ -164,6 +175,48 @@ class CarryAndPutConfig(_StateEnvConfig):
     noise: float = 0.0
     condition: str = NOMINAL
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17, 2))
+
+
+@EnvConfig.register_subclass("bimanual")
+@dataclass
+class BimanualConfig(_StateEnvConfig):
+    """``--env.type=bimanual``: the tasks of the suite.
+
+    Parameters
+    ----------
+    task : str, default="handover"
+        One of :data:`~lerobot_policy_tpgmm.environments.suite.names.SUITE`.
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot; the features follow from the task.
+    fps, episode_length, pushes, noise, condition
+        Options of :class:`~lerobot_policy_tpgmm.environments.suite.env.SuiteEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "handover"
+    fps: int = 100
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    condition: str = NOMINAL
+
+    def __post_init__(self) -> None:
+        if self.task is None or self.task not in SUITE:
+            raise UnknownNameError("task", str(self.task), "bimanual", SUITE)
+        if not self.features:
+            self.features = _features(17, len(SUITE[self.task]))
+
+    @property
+    def gym_id(self) -> str:
+        """The one environment that has all tasks."""
+        return f"{_PACKAGE}/Bimanual-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        return {"task": self.task, **super().gym_kwargs}
 
 
 @EnvConfig.register_subclass("aloha_state")

@@ -12,9 +12,17 @@ import warnings
 import weakref
 from typing import Any
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
+
+from tpgmm_torch.exceptions import DependencyError
+
+try:
+    import mujoco
+except ModuleNotFoundError as error:
+    raise DependencyError(
+        "the simulated robots need MuJoCo: pip install 'lerobot_policy_tpgmm[environments]'"
+    ) from error
 
 __all__ = ["Renderer", "offscreen"]
 

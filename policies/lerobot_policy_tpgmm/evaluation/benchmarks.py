@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +17,9 @@ from lerobot_policy_tpgmm.environments.aloha.demonstrations import record_aloha
 from lerobot_policy_tpgmm.environments.aloha.robot import aloha_operators, aloha_robot
 from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS, PUT_LIMITS
 from lerobot_policy_tpgmm.environments.disturbances import CONDITIONS, NOMINAL
+from lerobot_policy_tpgmm.environments.suite.env import SUITE_CONDITIONS
+from lerobot_policy_tpgmm.environments.suite.names import SUITE
+from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.carrying import TASK as CARRY
 from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
@@ -61,9 +65,9 @@ class Benchmark(ABC):
     #: Whether all demonstrations run on one clock from the beginning.
     synchronous: ClassVar[bool] = False
     #: The entries of ``info`` that the report shows, with heading and digits.
-    figures: ClassVar[dict[str, tuple[str, int]]]
+    figures: Mapping[str, tuple[str, int]]
     #: Between which bounds they have to lie in a success.
-    criteria: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    criteria: Mapping[str, tuple[float, float]] = {}
     #: K of TP-GMM.
     n_components: ClassVar[int]
     #: Disturbances of the evaluation and the options that make them.
@@ -128,11 +132,16 @@ class _HandlingBenchmark(Benchmark):
     conditions: ClassVar = CONDITIONS
     #: The environment's name, what its data sets call the task, and what is observed.
     gym_id: ClassVar[str]
-    task: ClassVar[str]
-    objects: ClassVar[tuple[str, ...]]
+    task: str
+    objects: tuple[str, ...]
+    #: Options of the environment in recording alone.
+    recording: ClassVar[Mapping[str, Any]] = {}
     #: Demonstrations are drawn together; the first may train, the last ones validate.
     POOL, RESERVED = 100, 10
-    skill: BottleShaking | CarryAndPut
+
+    @abstractmethod
+    def motions(self, n: int, seed: int) -> list[Demonstration]:
+        """Generated demonstrations."""
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
         """Let the environment follow generated demonstrations."""
@@ -141,12 +150,16 @@ class _HandlingBenchmark(Benchmark):
                 f"{self.env} offers {self.POOL} demonstrations for training and "
                 f"{self.RESERVED} for validation, {training} and {validation} are asked for"
             )
-        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
+        pool = self.motions(self.POOL + self.RESERVED, seed)
         numbers = {
             "training": range(training),
             "validation": range(self.POOL, self.POOL + validation),
         }
-        env = gym.make(f"lerobot_policy_tpgmm/{self.gym_id}", fps=self.rate, **self.options)
+        env = gym.make(
+            f"lerobot_policy_tpgmm/{self.gym_id}",
+            fps=self.rate,
+            **{**self.options, **self.recording},
+        )
         successes = {}
         for name, chosen in numbers.items():
             motions = [pool[number] for number in chosen]
@@ -204,7 +217,7 @@ class BottleBenchmark(_HandlingBenchmark):
 
     env = "bottle_shaking"
     gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
-    figures: ClassVar = {
+    figures: Mapping[str, tuple[str, int]] = {
         "grasp_mm": ("grasp [mm]", 1),
         "grasp_deg": ("grasp [deg]", 1),
         "lift_mm": ("lift [mm]", 0),
@@ -212,7 +225,7 @@ class BottleBenchmark(_HandlingBenchmark):
         "amplitude_error": ("amplitude error", 2),
         **PEAKS,
     }
-    criteria: ClassVar = LIMITS
+    criteria = LIMITS
 
     def __init__(
         self, rate: int | None = None, options: Mapping[str, Any] | None = None
@@ -220,6 +233,10 @@ class BottleBenchmark(_HandlingBenchmark):
         super().__init__(rate, options)
         self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
         self.robot = self.skill.robot
+
+    def motions(self, n: int, seed: int) -> list[Demonstration]:
+        """Of the skill's generator."""
+        return self.skill.demonstrations(n, seed)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle, and the joints."""
@@ -231,14 +248,14 @@ class CarryBenchmark(_HandlingBenchmark):
 
     env = "carry_and_put"
     gym_id, task, objects = "CarryAndPut-v0", CARRY, ("bottle", "tray")
-    figures: ClassVar = {
+    figures: Mapping[str, tuple[str, int]] = {
         "put_mm": ("at the tray [mm]", 2),
         "put_deg": ("at the tray [deg]", 2),
         "standing": ("put down", 0),
         "grasp_mm": ("grasp [mm]", 1),
         **PEAKS,
     }
-    criteria: ClassVar = PUT_LIMITS
+    criteria = PUT_LIMITS
 
     def __init__(
         self, rate: int | None = None, options: Mapping[str, Any] | None = None
@@ -246,6 +263,10 @@ class CarryBenchmark(_HandlingBenchmark):
         super().__init__(rate, options)
         self.skill = CarryAndPut(rate=self.rate)
         self.robot = self.skill.robot
+
+    def motions(self, n: int, seed: int) -> list[Demonstration]:
+        """Of the skill's generator."""
+        return self.skill.demonstrations(n, seed)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle and the tray, and the joints.
@@ -261,6 +282,40 @@ class CarryBenchmark(_HandlingBenchmark):
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         return {**super()._start(motion), "slide": slid(motion)}
+
+
+class SuiteBenchmark(_HandlingBenchmark):
+    """A task of the suite, demonstrated as people would, by sensors that are not perfect.
+
+    Parameters
+    ----------
+    name : str
+        Of the task.
+    rate, options
+        As for :class:`Benchmark`.
+    """
+
+    env = "bimanual"
+    gym_id = "Bimanual-v0"
+    recording: ClassVar[Mapping[str, Any]] = {"noise": 0.5}
+    conditions: ClassVar = SUITE_CONDITIONS
+
+    def __init__(
+        self, name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        self.skill = suite_task(name)
+        super().__init__(rate, {"task": name, **(options or {})})
+        self.robot, self.objects = self.skill.robot, self.skill.objects
+        self.task, self.criteria = self.skill.description, self.skill.limits
+        self.figures = {**self.skill.headings, **PEAKS}
+
+    def motions(self, n: int, seed: int) -> list[Demonstration]:
+        """Of the task's expert."""
+        return self.skill.demonstrations(n, seed, self.rate)
+
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """As the task says."""
+        return self.skill.operators(orientation, held)
 
 
 def _poses(links: Sequence[str], frame: str, orientation: bool) -> Stack:
@@ -282,7 +337,10 @@ class AlohaBenchmark(Benchmark):
     default_rate = 50
     synchronous = True
     n_components = 20
-    figures: ClassVar = {"max_reward": ("stage, 0 to 4", 0), "lift_mm": ("lift [mm]", 0)}
+    figures: Mapping[str, tuple[str, int]] = {
+        "max_reward": ("stage, 0 to 4", 0),
+        "lift_mm": ("lift [mm]", 0),
+    }
     #: Added to the seed of the first validation episode; evaluation begins further on.
     VALIDATION = 50_000
 
@@ -312,9 +370,10 @@ class AlohaInsertionBenchmark(AlohaBenchmark):
     fixed: ClassVar = {"task": "insertion"}
 
 
-BENCHMARKS: dict[str, type[Benchmark]] = {
+BENCHMARKS: dict[str, Callable[[int | None, Mapping[str, Any] | None], Benchmark]] = {
     "bottle_shaking": BottleBenchmark,
     "carry_and_put": CarryBenchmark,
+    **{name: partial(SuiteBenchmark, name) for name in SUITE},
     "aloha_state": AlohaBenchmark,
     "aloha_insertion": AlohaInsertionBenchmark,
 }

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lerobot_policy_tpgmm.environments.bottle.conditions import Conditions, skill
 from lerobot_policy_tpgmm.environments.bottle.handling import BottleEnv
 from lerobot_policy_tpgmm.environments.bottle.measures import PUT_LIMITS, Closing, successful
-from lerobot_policy_tpgmm.environments.bottle.scene import TrayScene
+from lerobot_policy_tpgmm.environments.bottle.scene import Snapshot, TrayScene
 from lerobot_policy_tpgmm.environments.disturbances import (
     NOMINAL,
     Course,
@@ -64,7 +64,7 @@ class CarryConditions(Conditions):
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Self:
         """Draw, first what all tasks with the bottle draw."""
-        drawn = cls._drawn(rng, carrying())
+        drawn = cls._with_bottle(rng, carrying())
         position = torch.from_numpy(drawn["bottle"][None, :3])
         tray = carrying().tray_poses(Frame(position), rng)[0]
         return cls(
@@ -171,7 +171,7 @@ class CarryAndPutEnv(BottleEnv):
     def _successful(self, figures: Mapping[str, float]) -> bool:
         return successful(figures, PUT_LIMITS)
 
-    def _begin(self, options: Mapping[str, Any]) -> CarryConditions:
+    def _draw(self, options: Mapping[str, Any]) -> CarryConditions:
         start = CarryConditions.draw(self.np_random).with_start(options)
         self._scene.reset(start.bottle, start.joints, start.mass)
         self._scene.put_tray(start.tray)
@@ -209,8 +209,8 @@ class CarryAndPutEnv(BottleEnv):
                 self._put = True
                 self._scene.let_go()
 
-    def _put_back(self, time: float) -> None:
-        super()._put_back(time)
+    def _restore(self, before: Snapshot) -> None:
+        super()._restore(before)
         self._opening, self._closed = Closing(reach=PUT), None
         self._lifted &= self._grasp_step is not None
         self._put &= not self._scene.held and self._lifted
@@ -219,7 +219,7 @@ class CarryAndPutEnv(BottleEnv):
         start = self._start
         return _path(*map(tuple, (start.joints, self._standing(), start.tray, start.slide)))
 
-    def _usual(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
         return carrying().usual(Frame(bottle[:3], bottle[3:]))
 
 

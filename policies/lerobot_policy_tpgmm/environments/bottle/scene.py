@@ -10,47 +10,19 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_policy_tpgmm.environments.robot_scene import PALM, TIMESTEP, RobotScene, robot_spec
 from tpgmm_datasets.bottle.skill import FOOT, GRASP_POINT, HANDS
-from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch.exceptions import DataError, DependencyError
 
-try:
-    import mujoco
-except ModuleNotFoundError as error:
-    raise DependencyError(
-        "bottle_shaking needs MuJoCo: pip install 'lerobot_policy_tpgmm[environments]'"
-    ) from error
+__all__ = ["FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "TrayScene", "bottle_spec"]
 
-__all__ = [
-    "CAMERA",
-    "DAMPING",
-    "FOOT",
-    "STIFFNESS",
-    "TABLE_LOW",
-    "TIMESTEP",
-    "BottleScene",
-    "Snapshot",
-    "TrayScene",
-    "bottle_spec",
-]
-
-#: Of the simulation and of the position control of the joints [s].
-TIMESTEP = 1e-3
-#: Gains of the position control [N m / rad, N m s / rad].
-STIFFNESS, DAMPING = 1000.0, 30.0
 #: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
 #: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2
-#: Name of the model's camera.
-CAMERA = "front"
-
-_DIVERGED = [
-    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC")
-]
-_TABLE, _PALM = 1, 2  # what collides with the bottle, as bits; nothing else collides
+_TABLE = 1  # what else collides with the bottle, as a bit
 
 
 def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
@@ -68,20 +40,9 @@ def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
         free joint; bodies ``bottle`` and ``table``; geoms ``bottle``, ``l_palm`` and
         ``r_palm``; a weld between each hand and the bottle, not active.
     """
-    spec = mujoco.MjSpec.from_string(upper_body_urdf())
-    spec.option.timestep = TIMESTEP
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    for joint in spec.joints:
-        motor = spec.add_actuator(name=joint.name, target=joint.name)
-        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
-    for body in spec.bodies[1:]:
-        body.gravcomp = 1.0  # as the controllers of such robots do
-    for hand in HANDS:
-        palm = spec.body(hand).geoms[0]
-        palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", _PALM, (0.85, 0.45, 0.2, 1)
+    spec = robot_spec()
     _add_table(spec)
-    _add_bottle(spec, abs(GRASP_POINT[HANDS[0]][1]) - float(palm.size[1]))
+    _add_bottle(spec, abs(GRASP_POINT[HANDS[0]][1]) - float(spec.geom("l_palm").size[1]))
     for hand in HANDS:
         weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2="bottle")
         weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
@@ -94,7 +55,6 @@ def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
             conaffinity=0,
             rgba=(0.2, 0.6, 0.3, 1),
         )
-    _add_view(spec)
     return spec
 
 
@@ -123,25 +83,6 @@ def _add_bottle(spec: Any, radius: float) -> None:
         bottle.add_geom(**shape, mass=0, conaffinity=0, size=size, pos=(0, 0, height))
 
 
-def _add_view(spec: Any) -> None:
-    """A camera before the robot, light and a bright sky: cheap to draw by a processor."""
-    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
-    world, texture = spec.worldbody, mujoco.mjtTexture
-    world.add_camera(
-        name=CAMERA, pos=(1.05, 0.6, 0.55), xyaxes=(-0.54, 0.84, 0, -0.33, -0.21, 0.92), fovy=45
-    )
-    world.add_light(pos=(0.8, 0.6, 1.4), dir=(-0.5, -0.4, -1), diffuse=(0.8, 0.8, 0.8))
-    spec.add_texture(
-        name="sky",
-        type=texture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=(0.95, 0.95, 0.95),
-        rgb2=(0.7, 0.75, 0.8),
-        width=64,
-        height=384,
-    )
-
-
 @dataclass(frozen=True)
 class Snapshot:
     """Where everything is at an instant.
@@ -161,7 +102,7 @@ class Snapshot:
     table: float
 
 
-class BottleScene:
+class BottleScene(RobotScene):
     """The state of the simulated world, and what can happen in it.
 
     Parameters
@@ -171,27 +112,18 @@ class BottleScene:
 
     Attributes
     ----------
-    model : mujoco.MjModel
-    data : mujoco.MjData
     held : bool
         Whether the bottle is attached to both hands.
     """
 
     def __init__(self, spec: mujoco.MjSpec | None = None) -> None:
-        self.model = model = (bottle_spec() if spec is None else spec).compile()
-        self.data = mujoco.MjData(model)
-        self.held = False
-        self._n = model.nu
+        super().__init__(bottle_spec() if spec is None else spec)
+        self.held, model = False, self.model
         self._hands = [model.body(hand).id for hand in HANDS]
         self._palms = [model.geom(f"{hand[0]}_palm").id for hand in HANDS]
         self._bottle, self._table = model.body("bottle").id, model.body("table").id
         self._surface = model.geom("bottle").id
         self._unit_inertia = model.body_inertia[self._bottle].copy()  # of 1 kg
-
-    @property
-    def joints(self) -> NDArray[np.float64]:
-        """Joint positions, shape (17,) [rad]."""
-        return self.data.qpos[: self._n].copy()
 
     @property
     def bottle(self) -> NDArray[np.float64]:
@@ -225,7 +157,7 @@ class BottleScene:
         model.body_inertia[self._bottle] = mass * self._unit_inertia
         mujoco.mj_setConst(model, data)
         mujoco.mj_resetData(model, data)
-        model.geom_conaffinity[self._surface] = _TABLE | _PALM
+        model.geom_conaffinity[self._surface] = _TABLE | PALM
         self.held = False
         data.ctrl[:] = data.qpos[: self._n] = joints
         data.qpos[self._n :] = bottle
@@ -235,40 +167,10 @@ class BottleScene:
     def follow(
         self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
     ) -> None:
-        """Simulate position control.
-
-        Parameters
-        ----------
-        references : ndarray of shape (n + 1, 17)
-            Where the joints should be now and at the end of the next ``n`` time steps [rad].
-        torques : ndarray of shape (n, 17), optional
-            From outside, during each time step [N m].
-        """
-        model, data, n = self.model, self.data, self._n
-        control = self._controls(references[1:], np.diff(references, axis=0) / TIMESTEP)
-        for i in range(len(control)):
-            if torques is not None:
-                data.qfrc_applied[:n] = torques[i]
-            self._step(control[i])
-        if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
-            raise DataError(f"the simulation diverges at {references[-1].tolist()}")
-        mujoco.mj_kinematics(model, data)
+        """Simulate position control, as :meth:`RobotScene.follow` says; the table sinks."""
+        super().follow(references, torques)
         if self.held:
-            self._sink(len(control) * TIMESTEP)
-
-    def _controls(
-        self, references: NDArray[np.float64], speeds: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """What the actuators are told at each time step."""
-        # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
-        # is its damping, the joint's own and the control's: so much it has to be led
-        model = self.model
-        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
-        return references + damping / model.actuator_gainprm[:, 0] * speeds
-
-    def _step(self, control: NDArray[np.float64]) -> None:
-        self.data.ctrl[:] = control
-        mujoco.mj_step(self.model, self.data)
+            self._sink((len(references) - 1) * TIMESTEP)
 
     def place(self, joints: NDArray[np.float64], seconds: float) -> None:
         """Put the joints somewhere without dynamics.
@@ -296,13 +198,6 @@ class BottleScene:
             data.qpos[n + 2] = self.model.body_pos[self._table, 2] + FOOT
         data.time += seconds
 
-    def rest(self) -> None:
-        """Stand still, as it is."""
-        data = self.data
-        data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
-        data.ctrl[:] = data.qpos[: self._n]
-        mujoco.mj_forward(self.model, data)
-
     def put_bottle(self, pose: NDArray[np.float64]) -> None:
         """Put the bottle somewhere, at rest; shape (7,)."""
         data, n = self.data, self._n
@@ -319,7 +214,7 @@ class BottleScene:
         self.model.body_pos[self._table, 2] = snapshot.table
         self.held = snapshot.held
         self.data.eq_active[:] = snapshot.held
-        self.model.geom_conaffinity[self._surface] = _TABLE | (0 if self.held else _PALM)
+        self.model.geom_conaffinity[self._surface] = _TABLE | (0 if self.held else PALM)
         mujoco.mj_kinematics(self.model, self.data)
 
     def gap(self) -> float:

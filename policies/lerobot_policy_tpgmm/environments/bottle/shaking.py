@@ -175,7 +175,7 @@ class BottleShakingEnv(BottleEnv):
     def _successful(self, figures: Mapping[str, float]) -> bool:
         return successful(figures)
 
-    def _begin(self, options: Mapping[str, Any]) -> Conditions:
+    def _draw(self, options: Mapping[str, Any]) -> Conditions:
         start = Conditions.draw(self.np_random).with_start(options)
         self._scene.reset(start.bottle, start.joints, start.mass)
         return start
@@ -183,7 +183,7 @@ class BottleShakingEnv(BottleEnv):
     def _nominal(self) -> Demonstration:
         return _path(tuple(self._start.joints), tuple(self._standing()))
 
-    def _usual(self, bottle: NDArray[np.float64]) -> bool:
+    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
         return skill().usual(Frame(bottle[:3], bottle[3:]))
 
 

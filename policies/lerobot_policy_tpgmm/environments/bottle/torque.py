@@ -12,13 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_policy_tpgmm.environments.base import Observation
 from lerobot_policy_tpgmm.environments.bottle.conditions import skill
-from lerobot_policy_tpgmm.environments.bottle.scene import (
-    DAMPING,
-    STIFFNESS,
-    BottleScene,
-    bottle_spec,
-)
+from lerobot_policy_tpgmm.environments.bottle.scene import BottleScene, bottle_spec
 from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
+from lerobot_policy_tpgmm.environments.robot_scene import DAMPING, STIFFNESS
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError, ShapeError
 
@@ -33,7 +29,7 @@ MOST_STIFFNESS, MOST_DAMPING = 2000.0, 100.0
 RADIUS, HEIGHT, CLEARANCE, INSTANT = 0.03, 0.2, 0.03, (1.0, 2.0)
 #: Where it is when it is not in the way [m].
 AWAY = (0.0, 0.0, -5.0)
-#: What collides with it, as bits; :mod:`.scene` has the other ones.
+#: What collides with it, as bits; scene and robot have the other ones.
 _OBSTACLE = 4
 #: The group of the geoms that the URDF describes.
 _ROBOT = 1

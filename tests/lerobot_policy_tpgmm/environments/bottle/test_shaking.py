@@ -11,13 +11,14 @@ from lerobot.envs import env_to_policy_features, make_env, make_env_config
 from stable_baselines3.common.env_checker import check_env as check_by_stable_baselines
 
 import lerobot_policy_tpgmm  # noqa: F401  registers the environment
-from lerobot_policy_tpgmm.environments.bottle.conditions import PUSHED, skill
+from lerobot_policy_tpgmm.environments.bottle.conditions import skill
 from lerobot_policy_tpgmm.environments.bottle.handling import GRIP_FORCE
 from lerobot_policy_tpgmm.environments.bottle.shaking import (
     AMPLITUDE,
     FREQUENCY,
     BottleShakingEnv,
 )
+from lerobot_policy_tpgmm.environments.start import PUSHED
 from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError

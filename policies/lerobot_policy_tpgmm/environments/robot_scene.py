@@ -1,0 +1,140 @@
+"""The simulated upper body under joint position control, in MuJoCo."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_datasets.bottle.skill import HANDS
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["CAMERA", "DAMPING", "PALM", "STIFFNESS", "TIMESTEP", "RobotScene", "robot_spec"]
+
+#: Of the simulation and of the position control of the joints [s].
+TIMESTEP = 1e-3
+#: Gains of the position control [N m / rad, N m s / rad].
+STIFFNESS, DAMPING = 1000.0, 30.0
+#: Name of the model's camera.
+CAMERA = "front"
+
+_DIVERGED = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC")
+]
+#: What the palms collide with, as a bit; no other part of the robot collides.
+PALM = 2
+
+
+def robot_spec() -> mujoco.MjSpec:
+    """The robot alone, with a light and a camera before it.
+
+    Returns
+    -------
+    mujoco.MjSpec
+        The joints in the URDF's order with a position actuator each; geoms ``l_palm`` and
+        ``r_palm``.
+    """
+    spec = mujoco.MjSpec.from_string(upper_body_urdf())
+    spec.option.timestep = TIMESTEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for joint in spec.joints:
+        motor = spec.add_actuator(name=joint.name, target=joint.name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
+    for body in spec.bodies[1:]:
+        body.gravcomp = 1.0  # as the controllers of such robots do
+    for hand in HANDS:
+        palm = spec.body(hand).geoms[0]
+        palm.name, palm.contype, palm.rgba = f"{hand[0]}_palm", PALM, (0.85, 0.45, 0.2, 1)
+    _add_view(spec)
+    return spec
+
+
+def _add_view(spec: Any) -> None:
+    """A camera before the robot, light and a bright sky: cheap to draw by a processor."""
+    spec.visual.quality.shadowsize, spec.visual.quality.offsamples = 0, 0
+    world, texture = spec.worldbody, mujoco.mjtTexture
+    world.add_camera(
+        name=CAMERA, pos=(1.05, 0.6, 0.55), xyaxes=(-0.54, 0.84, 0, -0.33, -0.21, 0.92), fovy=45
+    )
+    world.add_light(pos=(0.8, 0.6, 1.4), dir=(-0.5, -0.4, -1), diffuse=(0.8, 0.8, 0.8))
+    spec.add_texture(
+        name="sky",
+        type=texture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.95, 0.95, 0.95),
+        rgb2=(0.7, 0.75, 0.8),
+        width=64,
+        height=384,
+    )
+
+
+class RobotScene:
+    """A simulated world with the robot in it, whose joints come first.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        That of :func:`robot_spec`, with more in it.
+
+    Attributes
+    ----------
+    model : mujoco.MjModel
+    data : mujoco.MjData
+    """
+
+    def __init__(self, spec: mujoco.MjSpec) -> None:
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+        self._n = self.model.nu
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """Joint positions, shape (17,) [rad]."""
+        return self.data.qpos[: self._n].copy()
+
+    def follow(
+        self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
+    ) -> None:
+        """Simulate position control.
+
+        Parameters
+        ----------
+        references : ndarray of shape (n + 1, 17)
+            Where the joints should be now and at the end of the next ``n`` time steps [rad].
+        torques : ndarray of shape (n, 17), optional
+            From outside, during each time step [N m].
+        """
+        model, data, n = self.model, self.data, self._n
+        control = self._controls(references[1:], np.diff(references, axis=0) / TIMESTEP)
+        for i in range(len(control)):
+            if torques is not None:
+                data.qfrc_applied[:n] = torques[i]
+            self._step(control[i])
+        if data.warning.number[_DIVERGED].any():  # MuJoCo then resets itself
+            raise DataError(f"the simulation diverges at {references[-1].tolist()}")
+        mujoco.mj_kinematics(model, data)
+
+    def _controls(
+        self, references: NDArray[np.float64], speeds: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """What the actuators are told at each time step."""
+        # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
+        # is its damping, the joint's own and the control's: so much it has to be led
+        model = self.model
+        damping = model.dof_damping[: self._n] - model.actuator_biasprm[:, 2]
+        return references + damping / model.actuator_gainprm[:, 0] * speeds
+
+    def _step(self, control: NDArray[np.float64]) -> None:
+        self.data.ctrl[:] = control
+        mujoco.mj_step(self.model, self.data)
+
+    def rest(self) -> None:
+        """Stand still, as it is."""
+        data = self.data
+        data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
+        data.ctrl[:] = data.qpos[: self._n]
+        mujoco.mj_forward(self.model, data)

@@ -1,0 +1,27 @@
+"""The tasks of the suite by their names."""
+
+from __future__ import annotations
+
+import functools
+
+from lerobot_policy_tpgmm.environments.suite.handover import Handover
+from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = ["TASKS", "suite_task"]
+
+TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover,)}
+
+
+@functools.cache
+def suite_task(name: str) -> SuiteTask:
+    """A task by its name.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none.
+    """
+    if name not in TASKS:
+        raise UnknownNameError("task", name, "the suite", TASKS)
+    return TASKS[name]()
