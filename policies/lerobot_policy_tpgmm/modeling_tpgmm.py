@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.constants import CONFIG_NAME
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import (
@@ -34,7 +35,13 @@ from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_f
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import Controller, TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
-from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.exceptions import (
+    DataError,
+    ModelFileError,
+    NotFittedError,
+    PlausibilityWarning,
+    ShapeError,
+)
 from tpgmm_torch.hub import describe, model_card, upload
 from tpgmm_torch.operators.base import frame_names
 
@@ -217,7 +224,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         state_names, action_names, environment_names : sequence of str, optional
             Names of the entries of ``observation.state``, ``action`` and
             ``observation.environment_state``; by default states and actions are the model's
-            joints in its order.
+            joints in its order, and the environment holds its frames in the order of
+            ``model.frame_names_``, with a warning if there are several.
         frames : mapping of str to sequence, optional
             As in :class:`TPGMMConfig`.
         **options
@@ -251,6 +259,17 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.describe(kinematics, model.operators_)
         told = observed_frames(config, model.frame_names_)
         poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
+        given = frames or {}
+        order = [name for name in poses.in_environment if name not in given]
+        if len(order) > 1 and not environment_names:
+            warnings.warn(
+                f"nothing says which entries of {OBS_ENV_STATE} belong to which object: they "
+                f"are read as the poses of {order}, in the order in which the operators name "
+                "them. Say it by environment_names, the names of the entries in the data set "
+                "('bottle.x', ..., 'bottle.qz'), or by frames",
+                PlausibilityWarning,
+                stacklevel=2,
+            )
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
         policy = cls(config)

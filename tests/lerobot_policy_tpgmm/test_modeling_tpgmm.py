@@ -36,7 +36,14 @@ from tests.support.skills import (
     waves,
 )
 from tpgmm_torch import Canonical, Frame, RelativePosition, Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.data.pose_names import POSE_PARTS
+from tpgmm_torch.exceptions import (
+    DataError,
+    ModelFileError,
+    NotFittedError,
+    PlausibilityWarning,
+    ShapeError,
+)
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
 RATE = 20.0
@@ -210,7 +217,11 @@ def test_parts_with_operators_of_their_own_are_played(tmp_path):
     cup, tray = RelativePosition("hand", "cup"), RelativePosition("hand", "tray")
     lists = [[cup, Canonical()], [cup, tray, Canonical()]]
     model = TaskParameterizedGMM(8, lists, HAND, parts=[3.0], blend=0.0).fit(errands())
-    TPGMMPolicy.from_estimator(model, **OPEN).save_pretrained(tmp_path)
+    with pytest.warns(PlausibilityWarning, match="in the order in which the operators name"):
+        TPGMMPolicy.from_estimator(model, **OPEN)
+    names = [f"{name}.{part}" for name in ("cup", "tray") for part in POSE_PARTS]
+    named = TPGMMPolicy.from_estimator(model, environment_names=names, **OPEN)
+    named.save_pretrained(tmp_path)
     new = errands(1, seed=8)[0]
     poses = [pose(new.frames[name]) for name in ("cup", "tray")]
     observed = {STATE: new.joints[:1].float(), ENVIRONMENT: torch.cat(poses)[None].float()}

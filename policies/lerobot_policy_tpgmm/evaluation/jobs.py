@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from lerobot.envs.factory import make_env_config
 from lerobot.processor import make_default_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results, write_json
 from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES, Training, train
@@ -25,7 +26,7 @@ from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
-from tpgmm_datasets import load_lerobot
+from tpgmm_datasets import describe_lerobot, load_lerobot
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.atomic import replacing
@@ -152,11 +153,21 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         benchmark.robot,
         random_state=cell.seed,
     )
-    policy = TPGMMPolicy.from_estimator(model.fit(demonstrations), fps=benchmark.rate)
+    policy = TPGMMPolicy.from_estimator(
+        model.fit(demonstrations),
+        fps=benchmark.rate,
+        environment_names=_environment_names(episodes / "training"),
+    )
     recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"
     return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)
+
+
+def _environment_names(path: Path) -> list[str]:
+    """Which entry of the observation is what: operators may name objects in another order."""
+    columns = {column.key: column.names for column in describe_lerobot(path).columns}
+    return list(columns[OBS_ENV_STATE] or ())
 
 
 def _at_first(demonstration: Demonstration) -> Demonstration:

@@ -14,7 +14,9 @@ from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.carrying import slid
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.data.pose_names import POSE_PARTS
 
+NAMES = [f"{name}.{part}" for name in ("bottle", "tray") for part in POSE_PARTS]
 KINEMATIC = {"mode": "kinematic"}
 DEMONSTRATIONS = 7
 
@@ -84,7 +86,8 @@ def test_what_is_held_is_put_exactly_however_it_slid():
     ).fit(demonstrations)
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("bottle", "l_hand")
-    policy, env = TPGMMPolicy.from_estimator(model), CarryAndPutEnv(fps=benchmark.rate)
+    policy = TPGMMPolicy.from_estimator(model, environment_names=NAMES)
+    env = CarryAndPutEnv(fps=benchmark.rate)
     slides = []
     for seed in (10_000, 10_003):
         policy.reset()
@@ -97,3 +100,21 @@ def test_what_is_held_is_put_exactly_however_it_slid():
         # 0.5 mm; more where hands that open, just above the tray, let it land on its edge
         assert info["put_mm"] < 3 < min(slides) and info["put_deg"] < 1
         assert info["is_success"]
+
+
+def test_objects_are_told_apart_by_their_names(folder, settings, monkeypatch):
+    """Operators name objects in an order of their own."""
+    usual = CarryBenchmark.operators
+    monkeypatch.setattr(
+        CarryBenchmark,
+        "operators",
+        lambda self, orientation, held=True: usual(self, orientation, held)[::-1],
+    )
+    trained = jobs._tpgmm(
+        folder / "episodes", settings, Cell("carry_and_put", "tpgmm", DEMONSTRATIONS, 0)
+    )
+    assert trained.policy.frames.frame_names == ("tray", "bottle")
+    assert trained.policy.frames.in_environment == {
+        "bottle": [*range(7)],
+        "tray": [*range(7, 14)],
+    }
