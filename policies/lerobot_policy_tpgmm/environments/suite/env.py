@@ -157,8 +157,11 @@ class SuiteEnv(ControlledEnv):
         )
         self._scene.reset(drawn, joints, float(drawn[task.objects[0]][2]) - task.foot)
         self._judge, self._noted = task.judge(), 0.0
-        self._closing = {hold: Closing(reach=REACH) for hold in task.holds}
+        self._watch_hands()
         return start
+
+    def _watch_hands(self) -> None:
+        self._closing = {hold: Closing(reach=REACH) for hold in self._task.holds}
 
     def _act(self, stopped: bool) -> None:
         scene = self._scene
@@ -188,12 +191,13 @@ class SuiteEnv(ControlledEnv):
         return self._start.poses[self._task.objects[0]]
 
     def _remembered(self) -> Any:
-        return self._scene.snapshot(), copy.deepcopy((self._judge, self._closing))
+        return self._scene.snapshot(), copy.deepcopy(self._judge)
 
     def _restore(self, before: Any) -> None:
-        snapshot, hands = before
+        snapshot, judge = before
         self._scene.restore(snapshot)
-        self._judge, self._closing = copy.deepcopy(hands)
+        self._judge = copy.deepcopy(judge)
+        self._watch_hands()  # their patience begins anew
 
     def _put_on_path(self, instant: float) -> None:
         raise NotImplementedError("no disturbance of these tasks puts the robot ahead")

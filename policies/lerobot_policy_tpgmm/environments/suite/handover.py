@@ -24,6 +24,7 @@ from lerobot_policy_tpgmm.environments.suite.task import (
     Pose,
     Style,
     SuiteTask,
+    stands_in,
     upright_pose,
 )
 from tpgmm_datasets.bottle.skill import attached
@@ -126,7 +127,7 @@ class Handover(SuiteTask):
 
     def usual(self, pose: Pose) -> bool:
         """Whether it stands in its box."""
-        return bool(np.all((pose[:3] >= LOWEST) & (pose[:3] <= HIGHEST)))
+        return stands_in(pose, LOWEST, HIGHEST, YAW)
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style

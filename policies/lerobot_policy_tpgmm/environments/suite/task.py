@@ -27,7 +27,7 @@ from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
 from tpgmm_torch import Demonstration, Frame, Operator, Robot
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["Judge", "Leg", "Style", "SuiteTask", "hands_along", "upright_pose"]
+__all__ = ["Judge", "Leg", "Style", "SuiteTask", "hands_along", "stands_in", "upright_pose"]
 
 Pose = NDArray[np.float64]
 #: Durations differ by up to this share.
@@ -296,10 +296,6 @@ class SuiteTask(ABC):
         ]
 
 
-def _events(phases: Mapping[str, float], ends: Tensor) -> dict[str, float]:
-    return dict(zip(phases, ends.tolist(), strict=True))
-
-
 def hands_along(
     starts: Mapping[str, Frame],
     legs: Mapping[str, Sequence[Leg]],
@@ -344,3 +340,15 @@ def upright_pose(
     position = rng.uniform(lowest, highest)
     half = math.radians(rng.uniform(-yaw, yaw)) / 2
     return np.concatenate((position, (math.cos(half), 0.0, 0.0, math.sin(half))))
+
+
+def stands_in(
+    pose: Pose, lowest: Sequence[float], highest: Sequence[float], yaw: float
+) -> bool:
+    """Whether :func:`upright_pose` may give a pose (7,), but for rounding."""
+    inside = np.all(
+        (np.subtract(lowest, 1e-9) <= pose[:3]) & (pose[:3] <= np.add(highest, 1e-9))
+    )
+    w, x, y, z = pose[3:]
+    turn = (math.degrees(2 * math.atan2(z, w)) + 180) % 360 - 180
+    return bool(inside) and math.hypot(x, y) < 1e-6 and abs(turn) < yaw + 1e-6
