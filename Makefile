@@ -14,10 +14,12 @@ PACKAGES_compare := .[cli] ./policies[evaluation]
 PACKAGES_mutation := .[mutation]
 PACKAGES_test := .[test] ./policies[test]
 
-COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --workers 2 --budget 5 --out out/compare
+COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare
+# Processes of one thread each that `make evidence` runs at a time.
+WORKERS ?= 2
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare conditions bench test fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare evidence conditions bench test fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -26,13 +28,17 @@ help: ## List the targets
 demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 	OMP_NUM_THREADS=1 $(BIN)/tpgmm demo --out out/demo
 
-compare: $(VENV)/.installed-compare ## Compare TP-GMM with ACT, Diffusion and a naive floor; out/compare
-	$(COMPARE) --demonstrations 5,10
-	$(COMPARE) --demonstrations 10 --policies tpgmm --conditions pushes,noise,pushes+noise
+compare: $(VENV)/.installed-compare ## Look at all tasks for half an hour: TP-GMM and quick baselines; out/compare
+	$(COMPARE) --env suite --demonstrations 3,10 --policies quick --episodes 10 --workers 2 --out out/compare
+
+evidence: $(VENV)/.installed-compare ## Measure everything, for days: WORKERS=8; out/evidence
+	$(COMPARE) --env all --demonstrations 3,10 --seeds 0,1,2 --policies all --episodes 100 --budget 30 \
+	    --workers $(WORKERS) --out out/evidence
+	$(COMPARE) --env all --demonstrations 10 --seeds 0,1,2 --policies tpgmm --conditions all --episodes 100 \
+	    --budget 30 --workers $(WORKERS) --out out/evidence
 
 conditions: $(VENV)/.installed-compare ## Try TP-GMM where things go wrong, beside an open loop; out/conditions
-	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare --demonstrations 10 --policies tpgmm \
-	    --conditions all --out out/conditions
+	$(COMPARE) --demonstrations 10 --policies tpgmm --conditions all --out out/conditions
 
 bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_ARGS="--only step"; out/bench
 	$(BENCH) --out out/bench $(BENCH_ARGS)

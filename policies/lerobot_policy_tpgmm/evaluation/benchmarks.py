@@ -110,6 +110,8 @@ class Benchmark(ABC):
         ----------
         training, validation : int
             How many episodes.
+        seed : int
+            Of the draw. Those of two seeds have no episode in common.
 
         Returns
         -------
@@ -341,6 +343,8 @@ class AlohaBenchmark(Benchmark):
         "max_reward": ("stage, 0 to 4", 0),
         "lift_mm": ("lift [mm]", 0),
     }
+    #: Between the first episodes of two seeds, which have none in common.
+    SPACING = 1_000
     #: Added to the seed of the first validation episode; evaluation begins further on.
     VALIDATION = 50_000
 
@@ -357,8 +361,8 @@ class AlohaBenchmark(Benchmark):
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
         """Let the expert solve the task, which it does or raises."""
         for name, first, n in (
-            ("training", seed, training),
-            ("validation", seed + self.VALIDATION, validation),
+            ("training", self.SPACING * seed, training),
+            ("validation", self.SPACING * seed + self.VALIDATION, validation),
         ):
             record_aloha(folder / name, n, seed=first, fps=self.rate, **self.options)
         return [True] * training

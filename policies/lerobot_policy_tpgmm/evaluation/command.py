@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -17,11 +18,11 @@ app = typer.Typer(add_completion=False)
 
 EXAMPLES = """Examples:
 
-tpgmm compare --demonstrations 5,10 --workers 2 --out out/compare (the reduced grid, as
-'make compare')
+tpgmm compare --env suite --demonstrations 3,10 --policies quick --episodes 10 --workers 2
+--out out/compare (a quick look, as 'make compare')
 
-tpgmm compare --demonstrations 5,10,25,50 --seeds 0,1,2 --episodes 100 --budget 30
---workers 8 --out out/full (the full grid)
+tpgmm compare --env all --demonstrations 3,10 --seeds 0,1,2 --episodes 100 --conditions all
+--budget 30 --workers 8 --out out/evidence (everything)
 
 tpgmm compare --demonstrations 10 --policies tpgmm --conditions all --out out/conditions
 (every condition, beside the open loop of 0.1.0, as 'make conditions')
@@ -29,7 +30,9 @@ tpgmm compare --demonstrations 10 --policies tpgmm --conditions all --out out/co
 tpgmm compare --policies "tpgmm,tpgmm --policy.feedback=observation"
 --conditions pushes,stopped-3,moved+pose-noise --out out/disturbed
 
-tpgmm compare --env aloha_state --demonstrations 25 --out out/aloha
+tpgmm compare --env aloha_state,carry_and_put --demonstrations 25 --out out/two
+
+tpgmm compare --report-only --out out/two
 """
 
 
@@ -38,8 +41,9 @@ def compare(
     env: Annotated[
         str,
         typer.Option(
-            help="bottle_shaking, carry_and_put, aloha_state (cube transfer) or "
-            "aloha_insertion."
+            metavar="NAME,...",
+            help="Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), "
+            "aloha_insertion, ... (a wrong name lists them); suite: all but gym-aloha's; all.",
         ),
     ] = "bottle_shaking",
     policies: Annotated[
@@ -48,15 +52,29 @@ def compare(
             metavar="NAME,...",
             help="Among tpgmm, tpgmm-open-loop (by the clock, as in 0.1.0), tpgmm-places "
             "(objects are where they were at first), tpgmm-position-only, act, act-phase, "
-            "diffusion, diffusion-phase, nearest; or all but the second and third. A tpgmm may "
-            "have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the open loop is "
-            "always there.",
+            "diffusion, diffusion-phase, nearest, ... (a wrong name lists them); all, but for "
+            "the second and third; or quick: of these, all that are no networks of LeRobot. A "
+            "tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the "
+            "open loop is always there.",
         ),
     ] = "all",
     demonstrations: Annotated[
         str, typer.Option(metavar="N,...", help="Numbers of demonstrations to learn from.")
     ] = "5,10",
-    seeds: Annotated[str, typer.Option(metavar="N,...", help="Of the training.")] = "0",
+    seeds: Annotated[
+        str,
+        typer.Option(
+            metavar="N,...", help="Of the training and of the demonstrations it learns from."
+        ),
+    ] = "0",
+    demonstration_seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="The same demonstrations for all seeds, as in 0.1.0 (there: 0); the intervals "
+            "then do not tell how much others would change.",
+        ),
+    ] = None,
     conditions: Annotated[
         str,
         typer.Option(
@@ -81,6 +99,12 @@ def compare(
     out: Annotated[
         Path, typer.Option(metavar="DIR", help="Where everything goes, and is found again.")
     ] = Path("out/compare"),
+    report_only: Annotated[
+        bool,
+        typer.Option(
+            "--report-only", help="Write the report again from what is in --out; run nothing."
+        ),
+    ] = False,
 ) -> None:
     """Compare TP-GMM with ACT, Diffusion Policy and a naive floor in simulation.
 
@@ -88,24 +112,30 @@ def compare(
     LeRobot's own rollout. ACT and Diffusion are LeRobot's, plain and informed of the time
     ('-phase'), and trained until their error on held-out episodes has stopped falling.
 
-    The folder gets the episodes (LeRobot data sets), the trained policies (for lerobot-eval
-    --policy.path), tables, figures and report.md. What is finished there is not run again, so a
-    run that was stopped goes on, and a grid can grow.
+    The folder gets report.md, which begins with where TP-GMM loses, figures, results.parquet
+    with a row for each episode, and for each environment a folder with its episodes (LeRobot
+    data sets), trained policies (for lerobot-eval --policy.path), and a page of its own. What
+    is finished there is not run again, so a run that was stopped goes on, and a grid can grow.
     """
     from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
-    from lerobot_policy_tpgmm.evaluation.compare import compare as run
-    from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
+    from lerobot_policy_tpgmm.evaluation import compare as module
     from lerobot_policy_tpgmm.evaluation.settings import Settings
     from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP
 
-    settings = Settings(env, episodes=episodes, budget=60 * budget)
-    usual = [policy for policy in POLICIES if policy != "tpgmm-places"]
-    chosen = usual if policies == "all" else policies.split(",")
-    every = settings.benchmark().all_conditions
-    tried = list(every) if conditions == "all" else conditions.split(",")
+    if report_only:
+        typer.echo(module.rewrite_report(out, typer.echo))
+        return
+    settings = [
+        Settings(
+            name, episodes=episodes, budget=60 * budget, demonstration_seed=demonstration_seed
+        )
+        for name in _environments(env)
+    ]
+    chosen = _policies(policies)
+    tried = conditions.split(",")
     if "tpgmm" in chosen and OPEN_LOOP not in chosen and tried != [NOMINAL]:
         chosen.insert(chosen.index("tpgmm") + 1, OPEN_LOOP)
-    result = run(
+    result = module.compare(
         settings,
         out,
         chosen,
@@ -119,6 +149,32 @@ def compare(
     if result.failures:
         typer.echo(f"{len(result.failures)} cells failed", err=True)
         raise typer.Exit(1)
+
+
+def _environments(text: str) -> list[str]:
+    """The names that are meant, each once."""
+    from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS
+
+    groups = {
+        "all": list(BENCHMARKS),
+        "suite": [name for name in BENCHMARKS if not name.startswith("aloha")],
+    }
+    return _named(text, groups)
+
+
+def _policies(text: str) -> list[str]:
+    """The policies that are meant, each once."""
+    from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
+    from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES
+
+    usual = [name for name in POLICIES if name != "tpgmm-places"]
+    groups = {"all": usual, "quick": [name for name in usual if name not in RECIPES]}
+    return _named(text, groups)
+
+
+def _named(text: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
+    parts = (groups.get(part, [part]) for part in text.split(","))
+    return list(dict.fromkeys(name for names in parts for name in names))
 
 
 def _numbers(text: str, option: str) -> list[int]:

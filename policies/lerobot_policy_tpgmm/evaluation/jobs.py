@@ -39,9 +39,9 @@ RECORD = "training.json"
 PACKAGES = ("tpgmm-torch", "lerobot", "torch", "numpy", "gymnasium", "mujoco", "diffusers")
 
 
-def record(folder: Path, settings: Settings, n: int) -> None:
-    """Record the episodes that all policies learn from, unless ``n`` of them are there."""
-    place = folder / "episodes"
+def record(folder: Path, settings: Settings, n: int, seed: int = 0) -> None:
+    """Record what trainings with a seed learn from, unless ``n`` episodes are there."""
+    place = settings.episodes_in(folder, seed)
     summary = place / "summary.json"
     if summary.exists():
         recorded = json.loads(summary.read_text(encoding="utf-8"))["successes"]
@@ -49,7 +49,7 @@ def record(folder: Path, settings: Settings, n: int) -> None:
             return
     shutil.rmtree(place, ignore_errors=True)
     benchmark = settings.benchmark()
-    successes = benchmark.record(place, n, settings.validation, settings.demonstration_seed)
+    successes = benchmark.record(place, n, settings.validation, settings.drawn(seed))
     write_json(summary, {"successes": successes})
 
 
@@ -65,15 +65,17 @@ def run(folder: Path, settings: Settings, cells: Sequence[Cell]) -> None:
         runner = Runner.load(directory, cell.variant.arguments)
         options = settings.disturbed(cell.condition)
         config = make_env_config(settings.benchmark().env, fps=training["fps"], **options)
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         rows = evaluate(runner, config, settings.seeds)
-        seconds = time.perf_counter() - began
+        seconds, used = time.perf_counter() - began, time.process_time() - used
+        drawn = {"options": options, "demonstration_seed": settings.drawn(cell.seed)}
         results.write(
             cell,
             {
-                "settings": {**asdict(settings), "options": options},
+                "settings": {**asdict(settings), **drawn},
                 "training": training,
                 "evaluation_seconds": seconds,
+                "evaluation_cpu_seconds": used,
                 "latency": latency(runner, config),
                 "episodes": rows,
                 "versions": {name: version(name) for name in PACKAGES},
@@ -97,7 +99,8 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
     """Write the pretrained directory in one step."""
     began = time.process_time()
     train_it = {"nearest": _nearest} | dict.fromkeys(RECIPES, _baseline)
-    trained = train_it.get(cell.variant.base, _tpgmm)(folder / "episodes", settings, cell)
+    episodes = settings.episodes_in(folder, cell.seed)
+    trained = train_it.get(cell.variant.base, _tpgmm)(episodes, settings, cell)
     seconds = time.process_time() - began
     with replacing(directory) as new:
         for part in (trained.policy, *trained.processors):

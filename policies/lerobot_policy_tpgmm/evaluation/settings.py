@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL, parse_condition
 from lerobot_policy_tpgmm.evaluation.benchmarks import Benchmark, benchmark
@@ -37,8 +37,12 @@ class Settings:
         Held-out episodes on which baselines are validated; no policy learns from them.
     n_components : int, optional
         K of TP-GMM; the default is the environment's.
-    demonstration_seed, evaluation_seed : int
-        Of the demonstrations, and of the first evaluation episode.
+    demonstration_seed : int, optional
+        Of the demonstrations, if all trainings learn from the same ones. The default is the
+        seed of the training: each learns from another draw of demonstrations, which matters
+        more than the start of the learning.
+    evaluation_seed : int
+        Of the first evaluation episode.
     """
 
     env: str = "bottle_shaking"
@@ -48,13 +52,21 @@ class Settings:
     budget: float = 600.0
     validation: int = 10
     n_components: int | None = None
-    demonstration_seed: int = 0
+    demonstration_seed: int | None = None
     evaluation_seed: int = 100_000
 
     @property
     def seeds(self) -> range:
         """Of the evaluation episodes."""
         return range(self.evaluation_seed, self.evaluation_seed + self.episodes)
+
+    def drawn(self, seed: int) -> int:
+        """The seed of the demonstrations from which the training with a seed learns."""
+        return seed if self.demonstration_seed is None else self.demonstration_seed
+
+    def episodes_in(self, folder: Path, seed: int) -> Path:
+        """Where in the folder of an environment the training with a seed finds episodes."""
+        return folder / "episodes" / f"s{self.drawn(seed)}"
 
     def benchmark(self) -> Benchmark:
         """The environment that is meant."""
@@ -89,10 +101,7 @@ class Settings:
         if not path.exists():
             write_json(path, now)
             return
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise DataError(f"{path} is not JSON: {error}") from error
+        before = _content(path)
         changes = [
             f"{key} was {before.get(key)!r}, now {now.get(key)!r}"
             for key in {**now, **before}
@@ -103,6 +112,33 @@ class Settings:
                 f"{path.parent} holds results with other settings: {'; '.join(changes)}. Take "
                 "another folder, or the settings of before"
             )
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """What :meth:`keep` wrote.
+
+        Raises
+        ------
+        DataError
+            If the file is missing, or holds no settings.
+        """
+        content = _content(path)
+        try:
+            return cls(**content)
+        except TypeError as error:
+            raise DataError(f"{path} holds no settings of a comparison: {error}") from error
+
+
+def _content(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error}") from error
+    except ValueError as error:
+        raise DataError(f"{path} is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} holds no settings of a comparison but {content!r}")
+    return content
 
 
 def _parses(name: str) -> bool:

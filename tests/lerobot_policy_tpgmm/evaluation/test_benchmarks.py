@@ -46,7 +46,9 @@ def motions():
 
 @pytest.fixture(scope="module")
 def recorded(folder, settings):
-    return load_lerobot(folder / "episodes" / "training", robot=settings.benchmark().robot)
+    return load_lerobot(
+        folder / "episodes" / "s0" / "training", robot=settings.benchmark().robot
+    )
 
 
 def test_episodes_hold_what_was_seen_of_the_objects(recorded, motions):
@@ -62,7 +64,9 @@ def test_episodes_hold_what_was_seen_of_the_objects(recorded, motions):
 
 
 def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
-    assert (folder / "episodes" / "summary.json").read_text().count("true") == DEMONSTRATIONS
+    assert (folder / "episodes" / "s0" / "summary.json").read_text().count(
+        "true"
+    ) == DEMONSTRATIONS
     assert np.ptp([slid(motion)[0] for motion in motions[:DEMONSTRATIONS]]) > 0.01
 
 

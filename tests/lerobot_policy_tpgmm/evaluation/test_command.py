@@ -3,7 +3,7 @@
 import pytest
 
 from lerobot_policy_tpgmm.evaluation import compare as module
-from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark
+from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS
 from lerobot_policy_tpgmm.evaluation.cells import Cell
 from lerobot_policy_tpgmm.evaluation.compare import Comparison
 from tests.support.command_line import output, refusal, run
@@ -11,7 +11,7 @@ from tests.support.command_line import output, refusal, run
 
 def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
     text = output("compare", "--help")
-    for word in ("--budget", "--conditions", "full grid", "lerobot-eval", "diffusion-phase"):
+    for word in ("--budget", "--conditions", "everything", "lerobot-eval", "diffusion-phase"):
         assert word in " ".join(text.split())
     out = ("--out", tmp_path / "out")
     assert "policy 'bc' is not in the comparison" in refusal(
@@ -19,6 +19,10 @@ def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
     )
     assert "numbers like 5,10,25" in refusal("compare", "--demonstrations", "5;6", *out)
     assert "disturbance 'rain'" in refusal("compare", "--conditions", "rain", *out)
+    assert "environment 'moon' is not in the comparison; it has ['aloha_ins" in refusal(
+        "compare", "--env", "carry_and_put,moon", *out
+    )
+    assert "holds no comparison" in refusal("compare", "--report-only", *out)
     result = run("compare", "--demonstrations", "101", *out)
     assert result.exit_code == 2
     assert "offers 100 demonstrations" in result.stderr
@@ -36,7 +40,7 @@ def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
         (
             ["--policies", "act", "--conditions", "all"],
             ["act"],
-            list(BottleBenchmark.conditions),
+            ["all"],
         ),
     ],
 )
@@ -49,8 +53,29 @@ def test_disturbed_policies_stand_beside_the_open_loop(
     )
     assert run("compare", *arguments, "--out", tmp_path).exit_code == 0
     assert called[2] == policies
-    assert called[5][: len(conditions)] == conditions
-    assert set(called[5]) - set(conditions) in (set(), {"pushes", "noise"})
+    assert called[5] == conditions
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("carry_and_put", ["carry_and_put"]),
+        ("carry_and_put,aloha_state,carry_and_put", ["carry_and_put", "aloha_state"]),
+        ("suite", [name for name in BENCHMARKS if "aloha" not in name]),
+        ("aloha_state,all", ["aloha_state", *(n for n in BENCHMARKS if n != "aloha_state")]),
+    ],
+)
+def test_environments_have_names_together(given, meant, tmp_path, monkeypatch):
+    called = []
+    monkeypatch.setattr(
+        module, "compare", lambda *given: called.extend(given) or Comparison(0, {})
+    )
+    arguments = ("--env", given, "--policies", "quick", "--demonstration-seed", 4)
+    assert run("compare", *arguments, "--out", tmp_path).exit_code == 0
+    assert [settings.env for settings in called[0]] == meant
+    assert {settings.demonstration_seed for settings in called[0]} == {4}
+    assert {"tpgmm", "nearest"} <= set(called[2])
+    assert not {"act", "diffusion", "tpgmm-places"} & set(called[2])
 
 
 def test_a_failing_cell_gives_exit_code_1(tmp_path, monkeypatch):

@@ -13,9 +13,26 @@ def test_a_folder_keeps_its_settings(tmp_path):
     settings.keep(path)
     with pytest.raises(DataError, match="episodes was 7, now 8"):
         Settings(episodes=8).keep(path)
+    assert Settings.read(path) == settings
+    with pytest.raises(DataError, match="demonstration_seed was None, now 0"):
+        Settings(episodes=7, demonstration_seed=0).keep(path)
     path.write_text("{")
     with pytest.raises(DataError, match="not JSON"):
         settings.keep(path)
+    for content in ("[1]", '{"moons": 2}'):
+        path.write_text(content)
+        with pytest.raises(DataError, match="no settings of a comparison"):
+            Settings.read(path)
+    with pytest.raises(DataError, match="cannot be read"):
+        Settings.read(tmp_path / "none.json")
+
+
+def test_each_seed_draws_demonstrations_unless_they_are_fixed(tmp_path):
+    assert [Settings().drawn(seed) for seed in (0, 3)] == [0, 3]
+    fixed = Settings(demonstration_seed=7)
+    assert [fixed.drawn(seed) for seed in (0, 3)] == [7, 7]
+    assert Settings().episodes_in(tmp_path, 3) == tmp_path / "episodes" / "s3"
+    assert fixed.episodes_in(tmp_path, 3) == tmp_path / "episodes" / "s7"
 
 
 def test_conditions_become_options_of_the_environment():

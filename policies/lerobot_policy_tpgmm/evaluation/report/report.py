@@ -1,10 +1,10 @@
-"""The report of a comparison, for a reader who did not run it."""
+"""The report of a comparison in one environment, for a reader who did not run it."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,9 @@ import pandas as pd
 
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL, parse_condition
 from lerobot_policy_tpgmm.evaluation.cells import Cell
+from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
+from lerobot_policy_tpgmm.evaluation.report import markdown
+from lerobot_policy_tpgmm.evaluation.report.failures import criterion, evaluation_command
 from lerobot_policy_tpgmm.evaluation.report.figures import (
     draw_curves,
     draw_errors,
@@ -19,15 +22,15 @@ from lerobot_policy_tpgmm.evaluation.report.figures import (
 )
 from lerobot_policy_tpgmm.evaluation.report.tables import (
     cell_table,
+    demonstration_table,
     episode_table,
     wilson,
-    write_table,
 )
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP, Variant
 from tpgmm_torch.atomic import replacing
 
-__all__ = ["write_report"]
+__all__ = ["ordered", "write_report"]
 
 #: What each policy is, in the order of the report.
 DESCRIPTIONS = {
@@ -51,20 +54,17 @@ def write_report(
     settings: Settings,
     results: Sequence[Mapping[str, Any]],
     failures: Mapping[Cell, str],
-    command: str,
 ) -> Path:
     """Write tables, figures and ``report.md``.
 
     Parameters
     ----------
     out : Path
-        The folder.
+        The folder of the environment.
     results : sequence of mapping
         Of all finished cells.
     failures : mapping
         Cells that failed, with the reason.
-    command : str
-        What was called; the report lists it after those of earlier calls.
 
     Returns
     -------
@@ -75,28 +75,14 @@ def write_report(
     paragraphs = [f"# What demonstrations buy: {settings.env}"]
     if results:
         cells, episodes = cell_table(results), episode_table(results)
-        write_table(cells, out / "cells")
-        write_table(episodes, out / "episodes_evaluated")
         paragraphs += _Sections(out, settings, results, cells, episodes)
     if failures:
         reasons = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
         paragraphs += ["## Cells that failed", "\n".join(reasons)]
-    commands = _commands(out / "commands.txt", command)
-    if commands:
-        paragraphs += ["## Commands", "\n".join(("```", *commands, "```"))]
     path = out / "report.md"
     with replacing(path) as file:
         file.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
     return path
-
-
-def _commands(path: Path, command: str) -> list[str]:
-    """All that were called, this one last."""
-    commands = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
-    if command and command not in commands:
-        commands.append(command)
-        path.write_text("\n".join(commands) + "\n", encoding="utf-8")
-    return commands
 
 
 class _Sections:
@@ -124,7 +110,7 @@ class _Sections:
         self.cells, self.episodes = cells, episodes
         self.nominal = episodes[episodes.condition == NOMINAL]
         self.benchmark = settings.benchmark()
-        self.policies = sorted(set(cells.policy), key=_place)
+        self.policies = ordered(cells.policy)
         self.counts = sorted(set(cells.demonstrations))
         self.trainings = {
             (r["cell"]["policy"], r["cell"]["demonstrations"], r["cell"]["seed"]): r["training"]
@@ -145,29 +131,36 @@ class _Sections:
         yield from self._settings()
 
     def _introduction(self) -> Iterator[str]:
-        seeds, counts = self.settings.seeds, _listed(self.counts)
+        seeds, counts = self.settings.seeds, markdown.listed(self.counts)
         yield (
             f"Every policy learned from the same first {counts} recorded episodes of "
-            f"`{self.benchmark.env}` (the LeRobot data set `episodes/training`) and was rolled "
-            f"out, through LeRobot's own rollout, in the same {len(seeds)} situations that no "
-            f"episode shows (seeds {seeds[0]} to {seeds[-1]})."
+            f"`{self.benchmark.env}` ({self._drawn()}) and was rolled out, through LeRobot's "
+            f"own rollout, in the same {len(seeds)} situations that no episode shows (seeds "
+            f"{seeds[0]} to {seeds[-1]})."
         )
         yield "\n".join(f"- **{name}**: {_description(name)}" for name in self.policies)
+
+    def _drawn(self) -> str:
+        """Which demonstrations they are."""
+        seed = self.settings.demonstration_seed
+        if seed is not None:
+            return f"the LeRobot data set `episodes/s{seed}/training`"
+        return "the LeRobot data sets `episodes/sS/training`, another draw for each seed S"
 
     def _success(self) -> Iterator[str]:
         yield "## Success"
         yield "Successful episodes, and the 95 % interval of their share (Wilson)."
         # policies down, numbers of demonstrations across
-        yield _table(
+        yield markdown.table(
             ["policy", *(f"{count} demonstrations" for count in self.counts)],
             [
-                [policy, *(_rate(rows[rows.demonstrations == n]) for n in self.counts)]
+                [policy, *(markdown.rate(rows[rows.demonstrations == n]) for n in self.counts)]
                 for policy, rows in self._by_policy(self.nominal)
             ],
         )
         if self.nominal.policy.nunique() > 1:
-            draw_success(self.nominal, self._picture("success_nominal.png"))
-            yield "![Success over demonstrations](figures/success_nominal.png)"
+            draw_success(self.nominal, self._picture("success_nominal"))
+            yield "![Success over demonstrations](figures/success_nominal.webp)"
 
     def _conditions(self) -> Iterator[str]:
         """Everything beside the nominal condition, in one table for each number."""
@@ -192,9 +185,11 @@ class _Sections:
             for condition in conditions:
                 chosen = part[part.condition == condition]
                 for policy, rows in self._by_policy(chosen):
-                    spreads = [_spread(rows[k], digits) for k, (_, digits) in figures.items()]
-                    table.append([condition, policy, _rate(rows), *spreads])
-            yield _table(headings, table)
+                    spreads = [
+                        markdown.spread(rows[k], digits) for k, (_, digits) in figures.items()
+                    ]
+                    table.append([condition, policy, markdown.rate(rows), *spreads])
+            yield markdown.table(headings, table)
 
     def _described(self, condition: str) -> str:
         """What goes wrong, in the words of those who make it go wrong."""
@@ -221,12 +216,9 @@ class _Sections:
         for policy, rows in self._by_policy(self.nominal[self.nominal.demonstrations == most]):
             met = [rows[key].between(*bounds).mean() for key, bounds in criteria.items()]
             table.append([policy, *(f"{100 * share:.0f} %" for share in met)])
-        yield _table(["policy", *map(self._criterion, criteria)], table)
-
-    def _criterion(self, key: str) -> str:
-        heading, _ = self.benchmark.figures[key]
-        low, high = self.benchmark.criteria[key]
-        return f"{heading} ≤ {high:g}" if math.isfinite(high) else f"{heading} ≥ {low:g}"
+        yield markdown.table(
+            ["policy", *(criterion(self.benchmark, key) for key in criteria)], table
+        )
 
     def _errors(self) -> Iterator[str]:
         figures = {k: v for k, v in self.benchmark.figures.items() if k in self.nominal}
@@ -235,13 +227,15 @@ class _Sections:
         table = []
         for count, part in self.nominal.groupby("demonstrations"):
             for policy, rows in self._by_policy(part):
-                spreads = [_spread(rows[key], digits) for key, (_, digits) in figures.items()]
+                spreads = [
+                    markdown.spread(rows[key], digits) for key, (_, digits) in figures.items()
+                ]
                 table.append([count, policy, *spreads])
         headings = (heading for heading, _ in figures.values())
-        yield _table(["demonstrations", "policy", *headings], table)
-        draw_errors(self.nominal, figures, self.benchmark.criteria, self._picture("errors.png"))
+        yield markdown.table(["demonstrations", "policy", *headings], table)
+        draw_errors(self.nominal, figures, self.benchmark.criteria, self._picture("errors"))
         yield "Dotted: what a success allows."
-        yield "![Median and quartiles of the errors](figures/errors.png)"
+        yield "![Median and quartiles of the errors](figures/errors.webp)"
 
     def _baselines(self) -> Iterator[str]:
         trained = {key: item for key, item in self.trainings.items() if item["curve"]}
@@ -267,15 +261,15 @@ class _Sections:
             steps, at = curve[-1]["step"], best["step"]
             rows.append([*key, steps, f"{minutes:.1f}", f"{error:.2f}", at, item["outcome"]])
         columns = ("steps", "minutes", "least error [mrad]", "at step", "why it ended")
-        yield _table(["policy", "demonstrations", "seed", *columns], rows)
+        yield markdown.table(["policy", "demonstrations", "seed", *columns], rows)
         draw_curves(
             [
                 {"policy": p, "demonstrations": n, "seed": s, "curve": item["curve"]}
                 for (p, n, s), item in trained.items()
             ],
-            self._picture("learning_curves.png"),
+            self._picture("learning_curves"),
         )
-        yield "![Learning curves](figures/learning_curves.png)"
+        yield "![Learning curves](figures/learning_curves.webp)"
         yield "Recipes:"
         yield "\n".join(f"- {name}: `{json.dumps(item)}`" for name, item in recipes.items())
 
@@ -295,9 +289,10 @@ class _Sections:
             "step, median / 99 % [ms]",
             "steps per chunk",
             "chunk, median / 99 % [ms]",
+            "evaluation, CPU [s/episode]",
         )
         rows = self.cells.sort_values("demonstrations").groupby("policy").tail(1)
-        yield _table(
+        yield markdown.table(
             columns,
             [
                 [
@@ -309,6 +304,7 @@ class _Sections:
                     f"{row.step_median_ms:.2f} / {row.step_p99_ms:.2f}",
                     f"{row.chunk_size:.0f}",
                     f"{row.chunk_median_ms:.2f} / {row.chunk_p99_ms:.2f}",
+                    f"{row.evaluation_cpu_seconds / row.episodes:.2f}",
                 ]
                 for _, part in self._by_policy(rows)
                 for row in part.itertuples()
@@ -317,12 +313,10 @@ class _Sections:
 
     def _remarks(self) -> Iterator[str]:
         """What the data say about themselves."""
-        summary = self.out / "episodes" / "summary.json"
-        if summary.exists():
-            successes = json.loads(summary.read_text(encoding="utf-8"))["successes"]
+        for row in demonstration_table(self.out).itertuples():
             yield (
-                f"By the environment's own criteria {sum(successes)} of the {len(successes)} "
-                "recorded demonstrations succeed."
+                f"By the environment's own criteria {row.succeed} of the {row.recorded} "
+                f"recorded demonstrations of seed {row.seed} succeed."
             )
         trials = self.settings.episodes
         low, high = wilson(trials // 2, trials)
@@ -334,14 +328,15 @@ class _Sections:
         if seeds == 1:
             yield (
                 "Each policy was trained with one seed: the intervals say how much the choice "
-                "of situations matters, not how much another training would differ."
+                "of situations matters, not how much other demonstrations or another training "
+                "would change."
             )
         else:
             yield (
                 f"Episodes of {seeds} training seeds are taken together; the intervals treat "
-                "them as independent."
+                "them as independent, which episodes of one training are not quite: look at "
+                "the dots of the figure too."
             )
-        yield from self._rivals()
         ended = [
             f"{policy} ({count}: the error fell by {100 * _late_gain(item['curve']):.0f} %)"
             for (policy, count, _), item in self.trainings.items()
@@ -355,51 +350,28 @@ class _Sections:
         processors = {result["machine"]["processors"] for result in self.results}
         yield (
             "Latencies were measured while other cells ran beside, on a machine of "
-            f"{_listed(processors)} processors; compare them with one another, not with a "
-            "robot's computer."
+            f"{markdown.listed(processors)} processors; compare them with one another, not "
+            "with a robot's computer."
         )
-
-    def _rivals(self) -> Iterator[str]:
-        """TP-GMM and the best of the others, for each number of demonstrations."""
-        for count, rows in self.nominal.groupby("demonstrations"):
-            rates = rows.groupby("policy").success.agg(["sum", "count", "mean"])
-            others = rates[~rates.index.str.startswith("tpgmm")]
-            if "tpgmm" not in rates.index or others.empty:
-                continue
-            best = str(others["mean"].idxmax())
-            ours, theirs = (
-                wilson(int(rates["sum"][name]), int(rates["count"][name]))
-                for name in ("tpgmm", best)
-            )
-            disjoint = ours[0] > theirs[1] or theirs[0] > ours[1]
-            yield (
-                f"From {count} demonstrations tpgmm succeeds in "
-                f"{100 * rates['mean']['tpgmm']:.0f} % and {best}, the best of the others, in "
-                f"{100 * rates['mean'][best]:.0f} %; their intervals "
-                f"{'do not overlap' if disjoint else 'overlap'}."
-            )
 
     def _settings(self) -> Iterator[str]:
         yield "## Settings"
-        settings = {**self.results[0]["settings"], "options": dict(self.settings.options)}
+        settings = asdict(self.settings)
         rows = [[key.replace("_", " "), f"`{json.dumps(v)}`"] for key, v in settings.items()]
-        rows.append(["training seeds", _listed(set(self.cells.seed))])
+        rows.append(["training seeds", markdown.listed(set(self.cells.seed))])
         for name in ("versions", "machine"):
             distinct = sorted({json.dumps(item[name]) for item in self.results})
             rows += [[name, f"`{text}`"] for text in distinct]
-        yield _table(["setting", "value"], rows)
+        yield markdown.table(["setting", "value"], rows)
         yield (
-            "`cells.csv` has a row for each cell, `episodes_evaluated.csv` one for each "
-            "episode (both also as parquet). `policies/` holds what was trained; all but "
-            "`nearest` run in LeRobot's own evaluation, at the rate of the table above:"
+            "`policies/` holds what was trained; all but `nearest` run in LeRobot's own "
+            "evaluation, at the rate of the table above:"
         )
-        trials = self.settings.episodes
-        yield (
-            "```\nlerobot-eval --policy.path=policies/NAME --policy.device=cpu "
-            f"--env.type={self.benchmark.env} --env.fps=RATE "
-            f"--eval.n_episodes={trials} --eval.batch_size={trials} "
-            f"--eval.use_async_envs=false --seed={self.settings.seeds[0]}\n```"
+        trials, first = self.settings.episodes, self.settings.seeds[0]
+        command = evaluation_command(
+            self.settings, NOMINAL, "policies/NAME", "RATE", first, trials
         )
+        yield f"```\n{command}\n```"
 
     def _by_policy(self, table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         """The rows of each policy that has some, in the order of the report."""
@@ -414,9 +386,14 @@ class _Sections:
         return folder / name
 
 
+def ordered(policies: Iterable[str]) -> list[str]:
+    """Each policy once, in the order of the report."""
+    return sorted(set(policies), key=_place)
+
+
 def _place(policy: str) -> tuple[int, str]:
     """The order of the report: variants behind what they vary."""
-    names = list(DESCRIPTIONS)
+    names = [*DESCRIPTIONS, *(name for name in POLICIES if name not in DESCRIPTIONS)]
     base = policy if policy in names else Variant.parse(policy).base
     return names.index(base), "" if policy in names else policy
 
@@ -425,36 +402,12 @@ def _description(policy: str) -> str:
     if policy in DESCRIPTIONS:
         return DESCRIPTIONS[policy]
     variant = Variant.parse(policy)
+    if not variant.overrides:
+        return f"`{policy}`"
     return f"{variant.base} with {', '.join(f'`{item}`' for item in variant.overrides)}"
-
-
-def _rate(rows: pd.DataFrame) -> str:
-    """Successes with their interval; a dash where there are no episodes."""
-    successes, trials = int(rows.success.sum()), len(rows)
-    if not trials:
-        return "-"
-    low, high = wilson(successes, trials)
-    share = 100 * successes / trials
-    return f"{successes}/{trials} = {share:.0f} % ({100 * low:.0f} to {100 * high:.0f} %)"
-
-
-def _spread(values: pd.Series[Any], digits: int) -> str:
-    # not interpolated: a figure may be infinite
-    late = values.quantile(0.95, interpolation="higher")
-    return f"{values.median():.{digits}f} / {late:.{digits}f}"
 
 
 def _late_gain(curve: Sequence[Mapping[str, float]]) -> float:
     """By which share the least error fell in the last third of a training."""
     errors = [point["validation_error"] for point in curve]
     return 1 - min(errors) / min(errors[: max(1, 2 * len(errors) // 3)])
-
-
-def _listed(values: Iterable[int]) -> str:
-    return ", ".join(map(str, sorted(values)))
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A table in Markdown."""
-    lines = (head, ["---"] * len(head), *rows)
-    return "\n".join(f"| {' | '.join(map(str, cells))} |" for cells in lines)

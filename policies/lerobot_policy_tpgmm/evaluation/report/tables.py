@@ -14,7 +14,7 @@ from scipy.stats import binomtest
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["cell_table", "episode_table", "wilson", "write_table"]
+__all__ = ["cell_table", "demonstration_table", "episode_table", "wilson", "write_table"]
 
 #: What identifies a cell, in the order of the columns.
 KEYS = ("env", "policy", "demonstrations", "seed", "condition")
@@ -68,6 +68,8 @@ def _row(result: Mapping[str, Any]) -> dict[str, Any]:
     row |= {f"training_{key}": training[key] for key in ("seconds", "outcome")}
     row |= {key: training[key] for key in ("fps", "parameters", "bytes")}
     row["evaluation_seconds"] = result["evaluation_seconds"]
+    # 0.1.0 did not take it
+    row["evaluation_cpu_seconds"] = result.get("evaluation_cpu_seconds", float("nan"))
     row["first_evaluation_seed"] = episodes[0]["seed"]
     for key in ("options", "demonstration_seed"):
         row[key] = _text(result["settings"][key])
@@ -81,19 +83,50 @@ def _text(value: Any) -> Any:
 def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
     """One row for each evaluation episode, from what :class:`Results` holds.
 
-    It has what identifies the cell (the seed of its training as ``training_seed``), and what
-    the episode gave.
+    It has what identifies the cell (the seed of its training as ``training_seed``), the seed of
+    its demonstrations, the seed of the episode (``evaluation_seed``), what the episode gave,
+    and the versions of the packages as JSON. Environments have figures of their own; those of
+    the others are NaN.
     """
     rows = []
     for result in results:
         cell = {key: result["cell"][key] for key in KEYS}
         cell["training_seed"] = cell.pop("seed")
-        rows += [{**cell, **episode} for episode in result["episodes"]]
-    return pd.DataFrame(rows)
+        cell["demonstration_seed"] = result["settings"]["demonstration_seed"]
+        versions = _text(result["versions"])
+        for episode in result["episodes"]:
+            given = {key: value for key, value in episode.items() if key != "seed"}
+            row = {**cell, "evaluation_seed": episode["seed"], **given}
+            rows.append({**row, "versions": versions})
+    table = pd.DataFrame(rows)
+    # figures that came later stand before the versions all the same
+    return table[[key for key in table if key != "versions"] + ["versions"] * bool(rows)]
+
+
+def demonstration_table(folder: Path) -> pd.DataFrame:
+    """How many demonstrations of an environment succeed by its own criteria.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the environment.
+
+    Returns
+    -------
+    DataFrame
+        ``seed`` of the demonstrations, how many were ``recorded``, how many ``succeed``.
+    """
+    rows = []
+    for summary in (folder / "episodes").glob("s*/summary.json"):
+        successes = json.loads(summary.read_text(encoding="utf-8"))["successes"]
+        seed = int(summary.parent.name.removeprefix("s"))
+        rows.append({"seed": seed, "recorded": len(successes), "succeed": sum(successes)})
+    table = pd.DataFrame(rows, columns=["seed", "recorded", "succeed"])
+    return table.sort_values("seed", ignore_index=True)
 
 
 def write_table(table: pd.DataFrame, path: Path) -> None:
     """Write a table as ``PATH.parquet`` and ``PATH.csv``, each in one step."""
     for suffix, write in ((".parquet", table.to_parquet), (".csv", table.to_csv)):
-        with replacing(path.with_suffix(suffix)) as file:
+        with replacing(path.with_name(path.name + suffix)) as file:
             write(file, index=False)

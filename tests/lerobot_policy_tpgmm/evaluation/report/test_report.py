@@ -1,6 +1,5 @@
 """The report and its pictures, from given results."""
 
-import pandas as pd
 import pytest
 
 from lerobot_policy_tpgmm.evaluation.cells import Cell
@@ -15,14 +14,13 @@ SETTINGS = Settings(episodes=20, budget=120.0)
 def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     failures = {Cell("bottle_shaking", "diffusion", 5, 0): "bad luck"}
-    write_report(folder, SETTINGS, RESULTS + DISTURBED, failures, "tpgmm compare --out x")
+    write_report(folder, SETTINGS, RESULTS + DISTURBED, failures)
     text = (folder / "report.md").read_text()
     pictures = [line.partition("(")[2][:-1] for line in text.splitlines() if line[:2] == "!["]
     assert len(pictures) == 3
-    assert all((folder / picture).stat().st_size > 10_000 for picture in pictures)
-    pd.testing.assert_frame_equal(
-        pd.read_parquet(folder / "cells.parquet"), pd.read_csv(folder / "cells.csv")
-    )
+    for picture in pictures:
+        assert (folder / picture).stat().st_size > 10_000
+        assert (folder / picture).with_suffix(".pdf").stat().st_size > 5_000
     return text
 
 
@@ -48,13 +46,10 @@ def report(tmp_path_factory):
         "| act | 5 | 0 | 600 | 0.5 | 20.00 | 400 | it stopped falling |",
         "| act | 12 | 1 234 567 | 5.0 | 10 | 0.50 / 0.50 | 8 | 0.50 / 0.50 |",
         # remarks
-        "- From 5 demonstrations tpgmm succeeds in 100 % and ",
-        "in 0 %; their intervals do not overlap.",
-        "and act, the best of the others, in 90 %; their intervals overlap.",
         "- The budget ended the training of act (10: the error fell by 67 %); in brackets",
         "- Each policy was trained with one seed",
         "- `bottle_shaking-diffusion-n5-s0-nominal`: bad luck",
-        "tpgmm compare --out x",
+        "lerobot-eval --policy.path=policies/NAME --policy.device=cpu --env.type=bottle_",
     ],
 )
 def test_the_report_says(report, line):
@@ -63,14 +58,14 @@ def test_the_report_says(report, line):
 
 def test_several_seeds_are_taken_together(tmp_path):
     results = [result("tpgmm", 5, 20), result("tpgmm", 5, 10, seed=1)]
-    text = write_report(tmp_path, SETTINGS, results, {}, "").read_text()
+    text = write_report(tmp_path, SETTINGS, results, {}).read_text()
     assert "| tpgmm | 30/40 = 75 % (" in text
     assert "Episodes of 2 training seeds are taken together" in text
 
 
 def test_a_report_names_the_cells_that_failed(tmp_path):
     failed = Cell("bottle_shaking", "tpgmm", 3, 0)
-    path = write_report(tmp_path, SETTINGS, [], {failed: "bad luck"}, "")
+    path = write_report(tmp_path, SETTINGS, [], {failed: "bad luck"})
     assert f"- `{failed.key}`: bad luck" in path.read_text()
 
 

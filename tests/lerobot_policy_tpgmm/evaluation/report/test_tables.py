@@ -3,10 +3,17 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from lerobot_policy_tpgmm.evaluation.report.tables import cell_table, episode_table, wilson
-from tests.support.comparison import RESULTS
+from lerobot_policy_tpgmm.evaluation.report.tables import (
+    cell_table,
+    demonstration_table,
+    episode_table,
+    wilson,
+    write_table,
+)
+from tests.support.comparison import RESULTS, result
 from tpgmm_torch.exceptions import DataError
 
 
@@ -45,4 +52,31 @@ def test_tables_have_a_row_for_each_cell_and_each_episode():
     assert row.grasp_mm_median == 1.0
     assert row.grasp_mm_p95 == np.inf
     assert json.loads(row.versions) == {"torch": "1"}
-    assert {"seed", "training_seed", "condition", "lift_mm"} <= set(episodes.columns)
+    assert {"evaluation_seed", "training_seed", "condition", "lift_mm"} <= set(episodes.columns)
+
+
+def test_results_go_through_a_file_as_they_are(tmp_path):
+    other = result("tpgmm", 5, 4, env="carry_and_put")
+    other["episodes"] = [{"seed": 9, "success": True, "put_mm": 0.5}]
+    episodes = episode_table([*RESULTS, other])
+    write_table(episodes, tmp_path / "results")
+    read = pd.read_parquet(tmp_path / "results.parquet")
+    pd.testing.assert_frame_equal(read, episodes)
+    last = read.iloc[-1]
+    assert (last.env, last.put_mm, last.evaluation_seed) == ("carry_and_put", 0.5, 9)
+    assert np.isnan(last.grasp_mm) and np.isinf(read.grasp_mm).any()
+    assert json.loads(last.versions) == {"torch": "1"}
+    assert list(read)[:6] == [
+        *("env", "policy", "demonstrations"),
+        *("condition", "training_seed", "demonstration_seed"),
+    ]
+
+
+def test_demonstrations_are_counted_by_seed(tmp_path):
+    for seed, successes in ((10, [True, False]), (2, [True])):
+        folder = tmp_path / "episodes" / f"s{seed}"
+        folder.mkdir(parents=True)
+        (folder / "summary.json").write_text(json.dumps({"successes": successes}))
+    table = demonstration_table(tmp_path)
+    assert table.to_dict("list") == {"seed": [2, 10], "recorded": [1, 2], "succeed": [1, 1]}
+    assert demonstration_table(tmp_path / "none").empty
