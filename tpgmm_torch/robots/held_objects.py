@@ -37,17 +37,20 @@ def held_objects(
         With the objects that were held, wherever they were: what an operator refers to as a
         thing.
     frames : dict of str to Frame
-        While an object is held, its frame is where it was last free: a place.
+        While an object is held, its frame is where it was last free: a place. It is free
+        neither while one link hands it on to another.
     """
     places = dict(frames)
     for name in dict.fromkeys(hold.frame for hold in holds):
         recorded, pose = bool(frames[name].batch_shape), frames[name].expand(time.shape)
-        last_free = torch.arange(len(time), device=time.device)
+        last_free, free = torch.arange(len(time), device=time.device), -1
         for hold in holds:
             # the first instants that are not before
             begin, end = (int((time < at).sum()) for at in (hold.begin, hold.end))
             if hold.frame == name and begin < end:
-                last_free[begin:end] = begin
+                # from hand to hand it is not free between
+                last_free[begin:end] = last_free[begin - 1] if begin == free else begin
+                free = end
                 pose = pose if recorded else _carried(state, pose, hold.link, begin, end)
         state = state.with_link(name, None, pose)
         places[name] = pose[last_free]

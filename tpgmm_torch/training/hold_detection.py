@@ -294,6 +294,12 @@ def _agreed(shown: Sequence[list[Hold]], agreement: float) -> Iterator[Hold]:
         if count < agreement * len(shown):
             return
         alike = [holds for holds in shown if tuple(hold.link for hold in holds) == order]
-        for holds in zip(*alike, strict=True):
-            begin, end = median(h.begin for h in holds), median(h.end for h in holds)
+        columns = list(zip(*alike, strict=True))
+        begins = [median(hold.begin for hold in holds) for holds in columns]
+        for holds, begin, following in zip(
+            columns, begins, [*begins[1:], math.inf], strict=True
+        ):
+            end = median(hold.end for hold in holds)
+            if following - end < WINDOW:  # as in one demonstration: from hand to hand
+                end = following
             yield Hold(holds[0].frame, holds[0].link, begin, end, count / len(shown))

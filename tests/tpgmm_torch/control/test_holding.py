@@ -17,7 +17,7 @@ from tests.support.carrying import (
     scenes,
 )
 from tests.support.worlds import LEFT, RIGHT, upper_body
-from tpgmm_torch import Frame, Hold, Situation
+from tpgmm_torch import Frame, Hold, RelativeOrientation, RelativePosition, Situation
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
@@ -141,6 +141,89 @@ def test_after_the_release_it_stays_where_it_was_let_go():
     as_a_thing = there.state(upper_body().state(joints))
     assert as_a_thing.carrier("bottle") == -1
     assert_at(as_a_thing.pose("bottle"), there.frames["bottle"])
+
+
+HANDED = 3.5
+HANDS = Hold("bottle", LEFT, HELD.begin, HANDED), Hold("bottle", RIGHT, HANDED, HELD.end)
+#: All that can be said of an object that goes from hand to hand: as a place, and as a thing.
+PASSING = [
+    kind(link, frame, held=held)
+    for link, frame, held in (
+        (LEFT, "bottle", False),
+        (LEFT, "bottle", True),
+        (RIGHT, "bottle", True),
+        ("bottle", "tray", False),
+        (RIGHT, LEFT, False),
+    )
+    for kind in (RelativePosition, RelativeOrientation)
+]
+
+
+def test_from_hand_to_hand_what_is_learned_is_what_is_seen_in_control():
+    # the left hand passes the bottle in the air, to a right hand that keeps it from then on
+    robot, shown = upper_body(), carries()[0]
+    state, time = robot.state(shown.joints), shown.time
+    handed = int((time < HANDED).sum())
+    grasp = shown.frames["bottle"][handed].seen_from(state.pose(RIGHT)[handed])
+    kept = state.pose(RIGHT).compose(grasp)
+    until = int((time < HELD.end).sum())
+    bottle = Frame.stack(
+        [
+            shown.frames["bottle"][i] if i < handed else kept[min(i, until)]
+            for i in range(len(shown))
+        ]
+    )
+    passed = replace(shown, frames={**shown.frames, "bottle": bottle})
+    first = {name: f[0] if f.batch_shape else f for name, f in passed.frames.items()}
+    holding = Holding.start(robot, PASSING, HANDS, first)
+    learned = [operator.local(passed, robot, HANDS) for operator in PASSING]
+    for i, now in enumerate(time.tolist()):
+        joints = shown.joints[i]
+        holding = holding.advance(now, joints, {"bottle": bottle[i]})
+        at = holding.state(robot.state(joints))
+        for operator, local in zip(PASSING, learned, strict=True):
+            here = operator.coordinates(at, holding.frames)
+            if isinstance(operator, RelativeOrientation):
+                here = here * torch.sign((here * local[i]).sum())
+            torch.testing.assert_close(here, local[i], rtol=0, atol=1e-9)
+
+
+def test_from_hand_to_hand_each_row_is_the_derivative_of_what_it_measures():
+    robot, (holding, start) = upper_body(), begun(holds=HANDS)
+    # in the left hand, in the right one after the left hand passed it, put down
+    for now, silent in ((3.0, LEFT), (HANDED, RIGHT), (HELD.end, None)):
+        joints = start + 0.05 * (now - HELD.begin) * torch.sin(torch.arange(17.0))
+        holding = holding.advance(HELD.begin, start) if now == 3.0 else holding
+        holding = holding.advance(now, joints)
+        at_first = holding
+
+        def measured(q, operator, now=now, before=at_first):
+            return operator.coordinates(before.state(robot.state(q)), before.frames)
+
+        for operator in PASSING:
+            if not isinstance(operator, RelativePosition):
+                continue
+            steps = 1e-6 * torch.eye(17, dtype=joints.dtype)
+            differences = torch.stack(
+                [
+                    (measured(joints + s, operator) - measured(joints - s, operator)) / 2e-6
+                    for s in steps
+                ],
+                -1,
+            )
+            at = operator.linearize(holding.state(robot.state(joints)), holding.frames)
+            if operator.held and operator.link == silent:
+                assert not at.jacobian.any() and not at.matrix.any()
+                torch.testing.assert_close(
+                    differences, torch.zeros_like(differences), rtol=0, atol=1e-8
+                )
+            else:  # J dq = M dmu
+                wanted = at.matrix @ differences
+                torch.testing.assert_close(at.jacobian, wanted, rtol=0, atol=1e-7)
+        # as a place it is where it was before the left hand took it, until it is put down
+        if silent is not None:
+            first = scenes(1, 3)[0].frames["bottle"]
+            assert torch.equal(holding.frames["bottle"].position, first.position)
 
 
 def test_robots_at_their_own_times_are_each_as_if_alone():

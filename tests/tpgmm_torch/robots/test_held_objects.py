@@ -58,6 +58,22 @@ def test_holds_one_after_the_other_and_beyond_the_recording():
     assert (always["bottle"].position == SHOWN.frames["bottle"].position[0]).all()
 
 
+@pytest.mark.parametrize("frames", [SHOWN.frames, at_first(SHOWN).frames])
+def test_from_hand_to_hand_it_is_not_free_between(frames):
+    first, second = Hold("bottle", HAND, HELD.begin, 3.5), Hold("bottle", RIGHT, 3.5, 4.5)
+    handed = int((SHOWN.time < 3.5).sum())
+    state, places = held_objects(STATE, SHOWN.time, frames, [first, second])
+    end = int((SHOWN.time < 4.5).sum())
+    bottle, place = state.pose("bottle"), places["bottle"].position
+    assert torch.equal(place[BEGIN:end], bottle.position[BEGIN].expand(end - BEGIN, 3))
+    assert torch.equal(place[end:], bottle.position[end:])
+    # put down meanwhile, the next hand takes it from there
+    pause = Hold("bottle", HAND, HELD.begin, 3.4)
+    _, places = held_objects(STATE, SHOWN.time, SHOWN.frames, [pause, second])
+    recorded = SHOWN.frames["bottle"].position
+    assert torch.equal(places["bottle"].position[handed:end], recorded[handed].expand(20, 3))
+
+
 def test_local_data_follow_the_same_rule():
     place, thing = RelativePosition(HAND, "bottle"), RelativePosition(HAND, "bottle", held=True)
     robot = upper_body()

@@ -112,6 +112,25 @@ def test_one_after_the_other():
     assert 3 <= second.begin <= 4 and 5 <= second.end <= 5.3
 
 
+def test_from_hand_to_hand_leaves_no_gap():
+    brought, taken, several = 0.3 * ramp(1, 2), 0.3 * ramp(4, 5), []
+    # the right hand comes, the left one leaves; in the last one it lets go before
+    for come, gone in ((2.5, 3.4), (2.6, 3.4), (2.7, 3.5), (2.8, 3.5), (2.9, 2.3)):
+        left = along(brought - 0.2 * (1 - ramp(0, 0.5)) - 0.4 * ramp(gone, gone + 0.4), 0.1)
+        right = along(0.3 + taken + 0.4 * (1 - ramp(come - 0.4, come)), -0.1)
+        several.append(shown({"left": left, "right": right}, cup=along(brought + taken)))
+    poses = several[0][1]
+    for one, _ in several[:4]:
+        first, second = find_holds([one], poses)
+        assert first.end == second.begin
+    first, second = find_holds([several[4][0]], poses)
+    assert first.end < second.begin - 0.2
+    first, second = find_holds([one for one, _ in several], poses)
+    assert (first.link, second.link) == ("left", "right")
+    assert first.end == second.begin == pytest.approx(2.7, abs=0.1)
+    assert second.end == np.inf
+
+
 def test_a_hand_may_shift_what_it_closes_around():
     path = 0.4 * ramp(3, 4)
     hand = along(path - 0.2 * (1 - ramp(0, 1)))
