@@ -171,19 +171,17 @@ class Handover(SuiteTask):
         return _Judge()
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
-        """Hands seen from baton and stand, and from each other; the joints."""
+        """The left hand seen from where the baton was, the hands from each other, the joints.
+
+        With what is held, the baton from the stand; otherwise the right hand.
+        """
         kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
 
         def seen(what: str, frame: str) -> Stack:
             return Stack(*(kind(what, frame) for kind in kinds))
 
         last = seen("baton" if held else "r_hand", "stand")
-        return [
-            seen("l_hand", "baton"),
-            seen("r_hand", "baton"),
-            last,
-            Canonical(),
-        ]
+        return [seen("l_hand", "baton"), seen("r_hand", "l_hand"), last, Canonical()]
 
 
 class _Judge(Judge):
