@@ -29,6 +29,7 @@ CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 #: The command line has a page of its own, of its help.
 NOT_CODE = (
     "tpgmm_torch.cli",
+    "tpgmm_datasets.app.command",
     "tpgmm_datasets.commands.dataset",
     "tpgmm_datasets.commands.demo",
     "lerobot_policy_tpgmm.evaluation.command",

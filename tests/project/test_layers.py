@@ -47,6 +47,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("episode_batches", "signals"),
         ("bottle",),
         ("commands",),
+        ("app",),
     ),
     "lerobot_policy_tpgmm": (
         ("configuration_tpgmm", "control_rate"),
@@ -62,6 +63,8 @@ MOST_FILES_IN_A_ROOM = 11
 
 # Loaded inside the functions that need them, so that `import tpgmm_torch` needs none.
 LATE = {
+    "collada",
+    "gradio",
     "huggingface_hub",
     "lerobot",
     "matplotlib",

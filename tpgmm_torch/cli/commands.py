@@ -18,7 +18,7 @@ from tpgmm_torch.cli.plugins import COMMANDS, registered
 __all__ = ["explain"]
 
 #: What ``--help`` lists first, in this order; other plugins' commands follow.
-ORDER = ("demo", "fit", "correct", "reproduce", "plot", "view", "dataset")
+ORDER = ("demo", "fit", "correct", "reproduce", "plot", "view", "app", "dataset")
 #: Plugins of this distribution are quick to import: ``--help`` shows what theirs are for.
 DISTRIBUTION = "tpgmm-torch"
 #: Packages that come with the extra ``cli``.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -87,6 +87,8 @@ class Shown:
     frames : mapping of str to ShownFrame
     novelty : Novelty, optional
         Tells how new a situation is; None in what versions before this one kept.
+    events : mapping of str to float
+        When what all demonstrations name happens, the median, as shares of the duration.
     """
 
     n_demonstrations: int
@@ -96,6 +98,7 @@ class Shown:
     compared: Sequence[bool]
     frames: Mapping[str, ShownFrame]
     novelty: Novelty | None = None
+    events: Mapping[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Shown({self.n_demonstrations} demonstrations, frames={sorted(self.frames)})"
@@ -148,6 +151,11 @@ class Shown:
             compared.tolist(),
             frames,
             Novelty.of(starts, compared, first_poses, moving),
+            {
+                name: float(np.median([e.events[name] for e in episodes]))
+                for name in episodes[0].events
+                if all(name in e.events for e in episodes)
+            },
         )
 
     def and_also(self, other: Shown) -> Shown:
@@ -209,6 +217,7 @@ class Shown:
                 and np.shape(f.orientation) == (4,)
                 for f in shown.frames.values()
             )
+            fits = fits and all(0 <= at <= 1 for at in shown.events.values())
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"this does not describe what was shown: {error!r}") from error
         if not fits:

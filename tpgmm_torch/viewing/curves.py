@@ -1,4 +1,7 @@
-"""Curves beside the scene: how stiff the joints are asked to be, and which operator decides."""
+"""Curves beside the scene: how stiff the joints are asked to be, and which operator decides.
+
+And the marks in them: where parts begin, and events.
+"""
 
 from __future__ import annotations
 
@@ -16,12 +19,14 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Curve", "Panel", "as_html", "motion_panels"]
+__all__ = ["Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels"]
 
 #: Of stiffness: the ellipsoids' colour, as both show the covariance.
 STIFFNESS = "#1f77b4"
 #: Of the operators; none is the reproduced path's or the ellipsoids'.
 OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
+#: Instants so near each other are one, in durations of the skill; a reason that says nothing.
+SAME, GIVEN = 1e-3, "given"
 
 # The time line's position is in the page's first input; without one there is no marker. On a
 # narrow page the curves would hide the robot: there they begin folded.
@@ -83,6 +88,47 @@ class Panel:
     top: float
 
 
+@dataclass(frozen=True)
+class Mark:
+    """An instant with a name.
+
+    Parameters
+    ----------
+    time : float
+        Since the start of the motion [s].
+    label : str
+        What happens, or begins, then.
+    """
+
+    time: float
+    label: str
+
+
+def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Mark]:
+    """Where parts begin, and events of the demonstrations, within a motion, by time.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Fitted. The events are those that all of its demonstrations name.
+    trajectory : Trajectory
+        What it reproduced.
+    """
+    begin, end = float(model.time_[0]), float(model.time_[-1])
+    shown = {} if model.shown_ is None else model.shown_.events
+    events = {name: begin + share * (end - begin) for name, share in shown.items()}
+    named = []
+    for number, part in enumerate(model.parts_[1:], start=2):
+        # one that begins at an event was cut there, and is named after it
+        here = [n for n, at in events.items() if abs(at - part.begin) < SAME * (end - begin)]
+        reason = ", ".join(here) or ("" if part.reason == GIVEN else part.reason)
+        named.append((part.begin, f"part {number}: {reason}" if reason else f"part {number}"))
+        events = {name: at for name, at in events.items() if name not in here}
+    named += [(at, name) for name, at in events.items()]
+    first, last = float(trajectory.time[0]), float(trajectory.time[-1])
+    return [Mark(at - first, label) for at, label in sorted(named) if first <= at <= last]
+
+
 def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Panel]:
     """Stiffness and the operators' shares, over time.
 
@@ -136,13 +182,25 @@ def _turning(kinematics: Kinematics) -> list[int]:
     return [joint for joint in range(kinematics.n_joints) if joint not in others]
 
 
-def as_html(panels: Sequence[Panel]) -> str:
+def as_html(panels: Sequence[Panel], marks: Sequence[Mark] = ()) -> str:
     """The panels as a part of a page, to be folded away; a marker follows the time line.
 
     Drawings have seconds and the curves' own units for coordinates, upwards.
+
+    Parameters
+    ----------
+    panels : sequence of Panel
+        One below the other.
+    marks : sequence of Mark
+        Dashed lines through all of them, named below.
     """
     end = panels[0].time[-1]
-    drawn = "".join(map(_figure, panels))
+    drawn = "".join(_figure(panel, marks) for panel in panels)
+    drawn += "".join(
+        f'<div class="row"><span>&#9478; {html.escape(mark.label)}</span>'
+        f"<span>{mark.time:.1f} s</span></div>"
+        for mark in marks
+    )
     return (
         '<details id="curves" open><summary>curves over time</summary>'
         f'{drawn}<div class="row"><span>0 s</span><span>{end:.1f} s</span></div></details>'
@@ -150,8 +208,13 @@ def as_html(panels: Sequence[Panel]) -> str:
     )
 
 
-def _figure(panel: Panel) -> str:
+def _figure(panel: Panel, marks: Sequence[Mark]) -> str:
     end, top = max(float(panel.time[-1]), 1e-3), panel.top
+    marked = "".join(
+        f'<line class="mark" x1="{mark.time:.6g}" x2="{mark.time:.6g}" y2="{top:.6g}">'
+        f"<title>{html.escape(mark.label)}</title></line>"
+        for mark in marks
+    )
     lines = "".join(
         f'<polyline stroke="{curve.color}" points="{_points(panel.time, curve.values)}"/>'
         for curve in panel.curves
@@ -165,7 +228,7 @@ def _figure(panel: Panel) -> str:
     return (
         f'<div class="row"><span>{html.escape(panel.title)}</span><span>{top:.0f}</span></div>'
         f'<svg viewBox="0 0 {end:.6g} {top:.6g}" preserveAspectRatio="none">'
-        f'<g transform="translate(0 {top:.6g}) scale(1 -1)">{lines}'
+        f'<g transform="translate(0 {top:.6g}) scale(1 -1)">{lines}{marked}'
         f'<line class="now" y2="{top:.6g}" visibility="hidden"/></g></svg>{names}'
     )
 

@@ -18,7 +18,7 @@ from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.viewing.curves import Panel, motion_panels
+from tpgmm_torch.viewing.curves import Panel, motion_marks, motion_panels
 from tpgmm_torch.viewing.recording import viser_server
 from tpgmm_torch.viewing.scene import MotionScene
 from tpgmm_torch.viewing.visuals import Shape
@@ -66,6 +66,8 @@ class LiveView:
         What the controller sent last, if one leads.
     plots : list of viser.GuiUplotHandle
         Stiffness and shares, :func:`~tpgmm_torch.viewing.curves.motion_panels`.
+    marks : viser.GuiMarkdownHandle
+        Below the time line: :func:`~tpgmm_torch.viewing.curves.motion_marks`.
     clock : float
         The instant that is shown, from the start of the motion [s].
 
@@ -182,6 +184,8 @@ class LiveView:
             self.situation = situation
             self.trajectory = self.scene.show(situation)
             self._plot(motion_panels(self._model, self.trajectory))
+            marks = motion_marks(self._model, self.trajectory)
+            self.marks.content = "  \n".join(f"{m.time:.1f} s: {m.label}" for m in marks)
             self._slider.max = max(float(np.ptp(self.scene.time)), 0.01)
             if self._controller is None:
                 self._move_to(self.clock)
@@ -211,6 +215,7 @@ class LiveView:
         self._play = gui.add_checkbox("play", True)
         self._speed = gui.add_dropdown("speed", SPEEDS, initial_value="1")
         self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+        self.marks = gui.add_markdown("")
 
         self._run = gui.add_checkbox("controller", False)
         self._hold = gui.add_checkbox("hold the robot", False)

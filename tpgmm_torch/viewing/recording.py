@@ -16,7 +16,7 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.viewing.curves import as_html, motion_panels
+from tpgmm_torch.viewing.curves import as_html, motion_marks, motion_panels
 from tpgmm_torch.viewing.scene import COLORS, STANDARD_DEVIATIONS, MotionScene
 from tpgmm_torch.viewing.visuals import Shape
 
@@ -40,6 +40,7 @@ font:14px sans-serif;color:#333}
 border-bottom:1px solid currentColor}
 #curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
 #curves line{stroke:currentColor;stroke-width:1}
+#curves .mark{stroke-dasharray:3 3;opacity:.6}
 """
 
 
@@ -56,7 +57,8 @@ def write_motion(
 ) -> Trajectory:
     """Write a reproduction as an HTML file with a time line, which needs nothing else.
 
-    Beside the scene are the stiffness that is asked for and each operator's share over time.
+    Beside the scene are the stiffness that is asked for and each operator's share over time,
+    and in them where parts begin and when what the demonstrations name happens.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def write_motion(
                 scene.move_to(min(int(picture), len(scene.time) - 1))
             recording.insert_sleep(float(pause))
         page = recording.as_html()
-    curves = as_html(motion_panels(model, trajectory))
+    curves = as_html(motion_panels(model, trajectory), motion_marks(model, trajectory))
     legend = _legend(title, bool(demonstrations), curves)
     with replacing(path) as new:
         new.write_text(_entitled(page, title, legend), encoding="utf-8")

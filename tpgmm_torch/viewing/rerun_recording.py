@@ -15,7 +15,7 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
-from tpgmm_torch.viewing.curves import motion_panels
+from tpgmm_torch.viewing.curves import motion_marks, motion_panels
 from tpgmm_torch.viewing.scene import MotionScene
 from tpgmm_torch.viewing.visuals import Shape
 
@@ -23,6 +23,8 @@ __all__ = ["write_rerun"]
 
 #: Of the time line.
 TIME = "time"
+#: Where what happens, or begins, is logged.
+MARKS = "marks"
 
 
 def write_rerun(
@@ -83,6 +85,9 @@ def write_rerun(
                 times = rerun.TimeColumn(TIME, duration=panel.time)
                 values = rerun.Scalars.columns(scalars=curve.values)
                 recording.send_columns(entity, [times], values)
+        for mark in motion_marks(model, trajectory):
+            recording.set_time(TIME, duration=mark.time)
+            recording.log(MARKS, rerun.TextLog(mark.label))
         recording.flush()
         recording.disconnect()
     return trajectory

@@ -20,7 +20,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.viewing.visuals import OBJECT_COLOR, OBJECT_OPACITY, Shape, whole_body
 
@@ -416,10 +416,16 @@ def _unit_sphere() -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 
 
 def _mesh(shape: Shape) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Vertices (V, 3) [m] and triangles (F, 3); of the formats COLLADA alone tells its unit."""
     import trimesh
 
     try:
         mesh = trimesh.load_mesh(shape.file)
-        return np.asarray(mesh.vertices) * shape.size, np.asarray(mesh.faces)
+        unit = trimesh.units.unit_conversion(mesh.units, "meters") if mesh.units else 1.0
+        return np.asarray(mesh.vertices) * unit * shape.size, np.asarray(mesh.faces)
+    except ImportError as error:
+        raise DependencyError(
+            f"the mesh {shape.file} needs pycollada: pip install 'tpgmm-torch[collada]'"
+        ) from error
     except Exception as error:  # whatever a reader of one of many formats raises
         raise DataError(f"the mesh {shape.file} cannot be read: {error}") from error

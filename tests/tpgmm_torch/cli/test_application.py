@@ -15,13 +15,15 @@ def test_version_and_help_need_no_command():
     for arguments in ((), ("--help",)):
         text = output(*arguments)
         listed = re.findall(r"^│ (\w+)", text.partition("Commands")[2], re.MULTILINE)
-        assert listed[:7] == ["demo", "fit", "correct", "reproduce", "plot", "view", "dataset"]
+        assert listed[:8] == [
+            "demo", "fit", "correct", "reproduce", "plot", "view", "app", "dataset"
+        ]  # fmt: skip
         assert "Run the paper's experiment" in text
 
 
 @pytest.mark.parametrize(
     "command",
-    ["demo", "fit", "correct", "reproduce", "plot", "view"]
+    ["demo", "fit", "correct", "reproduce", "plot", "view", "app"]
     + [f"dataset {name}" for name in ("info", "check", "plot", "generate", "convert")],
 )
 def test_the_help_of_every_command_has_an_example(command):

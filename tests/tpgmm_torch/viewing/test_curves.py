@@ -5,11 +5,12 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from tests.support import skills
-from tpgmm_torch import Hold, Impedance, Robot, Situation
-from tpgmm_torch.viewing.curves import motion_panels
+from tpgmm_torch import Hold, Impedance, Robot, Situation, TaskParameterizedGMM
+from tpgmm_torch.viewing.curves import Mark, as_html, motion_marks, motion_panels
 
 #: The joints of :func:`skills.waves`, of which the first slides.
 SLIDING_ARM = (
@@ -89,3 +90,35 @@ def test_joints_that_slide_do_not_count_among_newton_metres_per_radian():
     [stiffness, _] = motion_panels(model, trajectory)
     [expected] = Impedance(robot).joints.matrix(variances[1:2].diag()).flatten()
     np.testing.assert_allclose(stiffness.curves[0].values, expected)
+
+
+def test_events_of_the_demonstrations_and_parts_are_marked_where_they_are(tmp_path):
+    shown = [
+        replace(one, events={"grasp & lift": at, **more})
+        for one, at, more in zip(
+            skills.waves(), (0.9, 1.0, 1.1, 1.0), ({"slip": 0.5}, {}, {}, {}), strict=True
+        )
+    ]
+    model = skills.canonical(n_components=4).fit(shown)
+    [trajectory] = model.predict([Situation.of(shown[0])])
+    [mark] = motion_marks(model, trajectory)  # not all have slipped
+    assert (mark.time, mark.label) == (pytest.approx(1.0), "grasp & lift")
+    model.save(tmp_path / "model")
+    assert motion_marks(TaskParameterizedGMM.load(tmp_path / "model"), trajectory) == [mark]
+    parted = skills.canonical(n_components=4, parts=[1.5]).fit(shown)
+    assert motion_marks(parted, trajectory)[1] == Mark(1.5, "part 2")
+    named = skills.canonical(n_components=4, parts=["grasp*"]).fit(shown)
+    assert [one.label for one in motion_marks(named, trajectory)] == ["part 2: grasp & lift"]
+    late = replace(trajectory, time=trajectory.time + 0.5)
+    assert motion_marks(model, late)[0].time == pytest.approx(0.5)
+
+
+def test_marks_are_lines_in_every_panel_and_named_below():
+    model = skills.hands()
+    [trajectory] = model.predict([skills.new_handling()[0]])
+    panels = motion_panels(model, trajectory)
+    assert 'class="mark"' not in as_html(panels)
+    page = as_html(panels, [Mark(0.25, "grasp & lift")])
+    lines = re.findall(r'<line class="mark" x1="(\S+)" x2="(\S+)"', page)
+    assert lines == [("0.25", "0.25")] * len(panels)
+    assert "&#9478; grasp &amp; lift</span><span>0.2 s<" in page

@@ -1,5 +1,6 @@
 """A motion in the browser while the program runs."""
 
+import copy
 import re
 import time
 from dataclasses import replace
@@ -14,7 +15,9 @@ from tpgmm_torch.viewing import LiveView
 
 
 def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
-    model, [situation, other] = skills.hands(), [skills.new_handling(seed=s)[0] for s in (7, 8)]
+    model = copy.copy(skills.hands())
+    model.shown_ = replace(model.shown_, events={"touch": 0.5})
+    situation, other = (skills.new_handling(seed=s)[0] for s in (7, 8))
     with LiveView(model, [situation, other], skills.handlings(), port=0) as view:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+", view.url)
         [expected] = model.predict([situation])
@@ -23,6 +26,7 @@ def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
         view.move_frame("cup", cup)
         [expected] = model.predict([replace(situation, frames={"cup": cup})])
         torch.testing.assert_close(view.trajectory.joints, expected.joints)
+        assert re.fullmatch(r"\d\.\d s: touch", view.marks.content)
         [plot] = view.plots
         for line, candidate in zip(plot.data[1:], expected.candidates, strict=True):
             np.testing.assert_allclose(line, 100 * candidate.share.mean(-1))

@@ -1,7 +1,9 @@
 """A Rerun recording holds what the page shows, read back by Rerun's own reader."""
 
+import copy
 import sys
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +13,13 @@ from tests.support.worlds import upper_body
 from tpgmm_torch import Situation
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.viewing import parse_shape, write_rerun
-from tpgmm_torch.viewing.curves import motion_panels
+from tpgmm_torch.viewing.curves import motion_marks, motion_panels
+
+
+def with_an_event():
+    model = copy.copy(skills.small_bottle())
+    model.shown_ = replace(model.shown_, events={"grasp": 0.4})
+    return model
 
 
 @pytest.fixture(scope="module")
@@ -24,9 +32,7 @@ def recorded(tmp_path_factory):
     shown = skills.few_bottles()
     situation = Situation(shown[1].joints[0], shown[1].frames)
     objects = {"bottle": parse_shape("cylinder:0.05,0.2")}
-    trajectory = write_rerun(
-        file, skills.small_bottle(), situation, shown, objects=objects, fps=2
-    )
+    trajectory = write_rerun(file, with_an_event(), situation, shown, objects=objects, fps=2)
     assert [one.name for one in file.parent.iterdir()] == [file.name]
     found: dict[str, dict[str, list]] = defaultdict(lambda: defaultdict(list))
     for chunk in RrdReader(file).stream():
@@ -48,6 +54,17 @@ def test_links_are_where_the_joints_put_them(recorded):
     for now, [position] in moved["Transform3D:translation"]:
         step = int(np.abs(instants - now.total_seconds()).argmin())
         np.testing.assert_allclose(position, hand[step], atol=2e-5)
+
+
+def test_events_are_logged_when_they_are(recorded):
+    found, trajectory = recorded
+    expected = [(m.time, m.label) for m in motion_marks(with_an_event(), trajectory)]
+    logged = [
+        (pytest.approx(now.total_seconds(), abs=1e-6), text)
+        for now, [text] in found["/marks"]["TextLog:text"]
+    ]
+    assert [label for _, label in expected] == ["grasp"]
+    assert expected == logged
 
 
 def test_paths_objects_and_uncertainty_are_there(recorded):

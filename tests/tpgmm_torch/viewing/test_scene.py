@@ -12,7 +12,7 @@ from tests.support import skills
 from tests.support.recordings import FPS, Recording
 from tests.support.worlds import upper_body
 from tpgmm_torch import Frame, Hold, Robot, Situation, quaternions
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.urdf import read_urdf
 from tpgmm_torch.viewing import ellipsoids, parse_shape, write_motion
 
@@ -178,3 +178,56 @@ def test_joints_alone_have_nothing_to_show(tmp_path):
     with pytest.raises(DataError, match=r"joints only.*--link NAME"):
         write_motion(tmp_path / "m.html", model, Situation([0.0, 0.0, 0.0]))
     assert list(tmp_path.iterdir()) == []
+
+
+#: A triangle in millimetres, 100 of them up.
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><created>2026-01-01T00:00:00Z</created><modified>2026-01-01T00:00:00Z</modified>
+<unit name="millimeter" meter="0.001"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p">
+<float_array id="a" count="9">0 0 0 10 0 0 0 20 0</float_array>
+<technique_common><accessor source="#a" count="3" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
+</source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><translate>0 0 100</translate>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+@pytest.fixture
+def collada(tmp_path):
+    """The demonstrations, a model of them whose arm has a mesh in COLLADA, and its folder."""
+    (tmp_path / "arm.dae").write_text(DAE)
+    urdf = """<robot name="r"><link name="base"/><link name="arm"><visual><geometry>
+<mesh filename="package://r/arm.dae" scale="1 2 1"/></geometry></visual></link>""" + "".join(
+        f"""<link name="{n}_"/><joint name="{n}" type="revolute"><parent link="{up}"/>
+<child link="{"arm" if n == "a" else n + "_"}"/><axis xyz="0 0 1"/>
+<limit lower="-9" upper="9" velocity="9" effort="9"/></joint>"""
+        for n, up in (("a", "base"), ("b", "arm"), ("c", "b_"))
+    ).replace('<link name="a_"/>', "")
+    shown = skills.waves()
+    robot = Robot.from_urdf(urdf + "</robot>", links=["arm"])
+    return shown, skills.canonical(n_components=2, robot=robot).fit(shown), tmp_path
+
+
+def test_meshes_in_collada_are_drawn_in_their_unit(collada):
+    shown, model, folder = collada
+    write_motion(folder / "m.html", model, Situation.of(shown[0]), meshes=folder, fps=FPS)
+    vertices = Recording(folder / "m.html").props("/robot/arm/0")["vertices"].reshape(-1, 3)
+    expected = [(0, 0, 0.1), (0.01, 0, 0.1), (0, 0.04, 0.1)]
+    np.testing.assert_allclose(vertices, expected, atol=1e-7)
+
+
+def test_without_pycollada_it_says_what_to_install(collada, monkeypatch):
+    import trimesh
+
+    def missing(file):
+        raise ImportError("missing `pip install pycollada`")
+
+    shown, model, folder = collada
+    monkeypatch.setattr(trimesh, "load_mesh", missing)
+    with pytest.raises(DependencyError, match=r"arm\.dae needs .*tpgmm-torch\[collada\]"):
+        write_motion(folder / "m.html", model, Situation.of(shown[0]), meshes=folder, fps=FPS)

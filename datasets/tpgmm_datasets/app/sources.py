@@ -1,0 +1,101 @@
+"""Where the page gets demonstrations from: the generated skill, or files that are uploaded."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tpgmm_datasets.bottle.skill import BottleShaking, upper_body
+from tpgmm_datasets.commands.recordings import Recordings
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.tables import demonstrations_from_frame, read_table
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["Shown", "generated_bottle", "uploaded"]
+
+#: Demonstrations, and the robot that gave them if it is known.
+Shown = tuple[list[Demonstration], Kinematics | None]
+
+TABLES = (".csv", ".parquet")
+#: A LeRobot data set's description, in its folder.
+DESCRIPTION = "meta/info.json"
+#: Of an archive, unpacked [bytes]: a small one can hold more than a disk does.
+MOST_BYTES = 2 * 1024**3
+
+
+@cache
+def generated_bottle(n_demonstrations: int = 5, rate: int = 25) -> Shown:
+    """Demonstrations of shaking a bottle with two hands; made once, as that takes a while.
+
+    Parameters
+    ----------
+    n_demonstrations : int, default=5
+        How many.
+    rate : int, default=25
+        Time steps per second.
+    """
+    return BottleShaking(rate=rate).demonstrations(n_demonstrations, 0), upper_body()
+
+
+def uploaded(
+    files: Sequence[str | Path], robot: Kinematics | None = None, frames: Sequence[str] = ()
+) -> list[Demonstration]:
+    """The demonstrations in files that somebody sent.
+
+    Parameters
+    ----------
+    files : sequence of str or Path
+        One ``.zip`` of the folder of a LeRobot data set; or tables, ``.csv`` or ``.parquet``,
+        as :func:`~tpgmm_torch.data.tables.demonstrations_from_frame` reads them. A table
+        without the column ``episode`` is one demonstration.
+    robot : Kinematics, optional
+        Gives the order of the joints.
+    frames : sequence of str
+        Poses in a LeRobot data set, as ``tpgmm fit --frame`` takes them.
+
+    Raises
+    ------
+    DataError
+        If these are no such files.
+    """
+    paths = [Path(file) for file in files]
+    kinds = {path.suffix.lower() for path in paths}
+    if kinds == {".zip"} and len(paths) == 1:
+        with TemporaryDirectory() as place:
+            folder = _unpacked(paths[0], Path(place))
+            given = Recordings(str(folder), robot, frames or None, None, None, None, None)
+            return given.demonstrations()
+    if not paths or not kinds <= set(TABLES):
+        raise DataError(
+            "give one .zip of a LeRobot data set's folder, or tables (.csv, .parquet); got "
+            f"{', '.join(path.name for path in paths) or 'no file'}"
+        )
+    tables = [demonstrations_from_frame(read_table(path)) for path in sorted(paths)]
+    return [one for table in tables for one in table]
+
+
+def _unpacked(archive: Path, place: Path) -> Path:
+    """The folder of the one data set in a zip archive."""
+    try:
+        with zipfile.ZipFile(archive) as opened:
+            size = sum(entry.file_size for entry in opened.infolist())
+            if size > MOST_BYTES:
+                raise DataError(
+                    f"{archive.name} unpacks to {size / 1e9:.1f} GB; at most "
+                    f"{MOST_BYTES / 1e9:.1f} GB are taken. Leave its videos out: they are not "
+                    "read, or give the folder: tpgmm app FOLDER"
+                )
+            opened.extractall(place)  # keeps names with ".." inside the folder
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, OSError) as error:
+        raise DataError(f"{archive.name} cannot be unpacked: {error}") from error
+    found = sorted(path.parents[1] for path in place.rglob(DESCRIPTION))
+    if len(found) != 1:
+        raise DataError(
+            f"{archive.name} holds {len(found) or 'no'} LeRobot data sets, not one: there are "
+            f"{len(found)} files {DESCRIPTION}"
+        )
+    return found[0]
