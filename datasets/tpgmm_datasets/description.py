@@ -16,7 +16,7 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import BOOKKEEPING, Feature, open_layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.units import guess_unit, with_pose_units
-from tpgmm_torch.plausibility.joints import is_gripper
+from tpgmm_torch.data.pose_names import is_gripper
 
 __all__ = ["ColumnInfo", "DatasetInfo", "describe_lerobot"]
 

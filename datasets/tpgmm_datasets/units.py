@@ -12,7 +12,8 @@ import numpy as np
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.plausibility.joints import LARGEST_ANGLE, is_gripper
+from tpgmm_torch.data.pose_names import is_gripper
+from tpgmm_torch.plausibility.joints import LARGEST_ANGLE
 
 __all__ = [
     "POSE_UNITS",

@@ -578,7 +578,10 @@ class LocalizingProgress(WaitingProgress):
         since = self.since + passed
         due = since > (1 - 1e-6) * self.localizer.step
         new["since"] = np.where(due, 0.0, since)
-        left = np.abs(measured - self.rest).max(-1) > STILL
+        away = np.abs(measured - self.rest)
+        if observation.joints is not None:  # what is not known does not leave
+            away = np.where(np.isnan(_array(observation.joints)), 0.0, away)
+        left = away.max(-1) > STILL
         no = np.zeros_like(self.moved)
         stood: dict[str, Any] = {
             "rest": np.where(left[..., None], measured, self.rest),

@@ -133,6 +133,7 @@ class Controller:
         self.command: Command | None = None
         self._regression, self._end, self._blend = regression, end, blend
         self._measured_feedback, self._impedance = feedback == "measured", impedance
+        self._gripping = kinematics.gripping()
         self._frames = self._converted(frames or {})
         self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
         self._trust, self._watch = trust, HoldWatch(kinematics)
@@ -333,7 +334,23 @@ class Controller:
         frames: Mapping[str, Any] | None,
         ages: Mapping[str, float] | None,
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Measured joints, and robots that are halted; frames are kept."""
+        """Measured joints, and robots that are halted; frames are kept.
+
+        Of joints that grip it is as if they were not measured: what they hold keeps them from
+        their references.
+        """
+        measured, halted = self._told(dt, joints, frames, ages)
+        if measured is not None and self._gripping is not None:
+            measured = torch.where(self._gripping, torch.nan, measured)
+        return measured, halted
+
+    def _told(
+        self,
+        dt: float,
+        joints: Any,
+        frames: Mapping[str, Any] | None,
+        ages: Mapping[str, float] | None,
+    ) -> tuple[Tensor | None, Tensor | None]:
         if self._inputs is None:
             if frames is not None:
                 self._frames = self._converted(frames)

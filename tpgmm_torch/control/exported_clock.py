@@ -217,6 +217,9 @@ class _Localizing(_Waiting):
         n = kinematics.n_joints
         super().__init__(clock, n, begin, end)
         self._seen, self._estimated = seen, estimated
+        gripping = kinematics.gripping()
+        arms = torch.ones(n, dtype=torch.bool) if gripping is None else ~gripping
+        self._arms = arms.nonzero().squeeze(-1)
         self._look: torch.nn.Module | None = None
         localizer = Localizer(regression, begin, end)
         self._instants, self._step = torch.from_numpy(localizer.instants), localizer.step
@@ -280,7 +283,7 @@ class _Localizing(_Waiting):
         astray = error > clock.tolerance
         since = known["since"] + dt
         due = since > (1 - 1e-6) * self._step
-        left = (measured - known["rest"]).abs().amax() > STILL
+        left = (measured - known["rest"]).abs()[self._arms].amax() > STILL
         late = now > known["rested"] + PAUSE
         told = (reference - known["told"]).abs().amax()
         stopped = late & (told > clock.tolerance * clock.floor)

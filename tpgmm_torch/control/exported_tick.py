@@ -81,6 +81,7 @@ class ExportedTick(torch.nn.Module):
         self._tick, self._like = Tick(regression, names), regression.kinematics.lower
         assert isinstance(regression.kinematics, Robot)
         self._robot, self._names = regression.kinematics, tuple(names)
+        self._gripping = self._robot.gripping()
         self._begin, self._end, self._blend = begin, end, blend
         self._brakes = BrakingLaw(bounds)
         self._all = regression._components
@@ -137,6 +138,8 @@ class ExportedTick(torch.nn.Module):
         rows = torch.where(begun, rows, _standing(measured))
         before = torch.where(begun, before, self._begin)
         memory = torch.where(begun, memory, self._clock.start(measured))
+        if self._gripping is not None:  # what it holds keeps a gripper from its reference
+            measured = torch.where(self._gripping, rows[0], measured)
         unit = torch.eye(7, dtype=frames.dtype, device=frames.device)[3]
         poses = torch.where(heard, frames / torch.cat((norms.new_ones(1, 3).expand(
             len(frames), 3), norms.expand(-1, 4)), 1), unit)  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = ["POSE_PARTS", "pose_groups", "quaternion_groups", "words"]
+__all__ = ["POSE_PARTS", "is_gripper", "pose_groups", "quaternion_groups", "words"]
 
 #: How the parts of a pose are called after its own name: metres, and (w, x, y, z).
 POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -20,6 +20,18 @@ def words(name: str) -> tuple[str, ...]:
     spelled = [word.lower() for word in _WORDS.findall(name)]
     spoken = tuple(_SIDES.get(word, word) for word in spelled if word not in _SILENT)
     return spoken or tuple(spelled)
+
+
+def is_gripper(name: str) -> bool:
+    """Whether a joint's name tells of a gripper, which may have any unit.
+
+    Parameters
+    ----------
+    name : str
+        Of a joint or of a value of a data set.
+    """
+    words = "grip|finger|thumb|hand_?(pinky|ring|middle|index)|jaw|claw|suction"
+    return re.search(words, name, re.IGNORECASE) is not None
 
 
 def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:

@@ -18,10 +18,10 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.events.detection import LEAST_CONFIDENCE
 from tpgmm_torch.events.movement import ObjectMoves
 from tpgmm_torch.events.signals import SPIKE, gripper_groups, level_changes
-from tpgmm_torch.plausibility.joints import is_gripper
 from tpgmm_torch.training.hold_detection import find_holds
 
 __all__ = ["Boundary", "find_boundaries", "find_contacts", "find_gripper_changes", "find_stops"]

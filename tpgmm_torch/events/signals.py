@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.pose_names import pose_groups, words
+from tpgmm_torch.data.pose_names import is_gripper, pose_groups, words
 from tpgmm_torch.events.detection import (
     LEAST_CONFIDENCE,
     NOTHING,
@@ -23,7 +23,6 @@ from tpgmm_torch.events.detection import (
     uniqueness,
 )
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.plausibility.joints import is_gripper
 
 __all__ = ["SignalEvent", "gripper_groups", "gripper_signals", "level_changes"]
 

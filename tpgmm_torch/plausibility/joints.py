@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -11,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.summaries import EpisodeSummary, quaternion_columns
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.tracked_poses import Poses
 
-__all__ = ["LARGEST_ANGLE", "check_joints", "is_gripper"]
+__all__ = ["LARGEST_ANGLE", "check_joints"]
 
 #: Without limits, hardly a joint is turned further [rad], and hardly a recording in degrees
 #: stays below.
@@ -30,18 +30,6 @@ IMPOSSIBLE = 2 * math.pi
 FAST, FASTEST = 1.2, 3.0
 #: No hand is so far from the base of its robot [m].
 FAR = 10.0
-
-
-def is_gripper(name: str) -> bool:
-    """Whether a joint's name tells of a gripper, which may have any unit.
-
-    Parameters
-    ----------
-    name : str
-        Of a joint or of a value of a data set.
-    """
-    words = "grip|finger|thumb|hand_?(pinky|ring|middle|index)|jaw|claw|suction"
-    return re.search(words, name, re.IGNORECASE) is not None
 
 
 def check_joints(

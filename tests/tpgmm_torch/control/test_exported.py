@@ -39,6 +39,7 @@ from tpgmm_torch.exceptions import (
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.sensing.trust import Trust
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:the (first tick|situation):tpgmm_torch.exceptions.PlausibilityWarning"
@@ -297,6 +298,64 @@ def test_clocks_are_those_of_the_controller(waving, clock, robot):
         assert moved == 1  # let go it goes on from where it was held, or pushed back to
         back = times[149] - min(times[155:275])
         assert abs(back) < 0.1 if robot == "held" else back > 0.3
+
+
+@pytest.fixture(scope="module")
+def grasping():
+    """The same with a gripper that closes on something after 1.5 s."""
+    robot = Robot.from_urdf(
+        URDF, ["hand"], coordinates=["gripper"], tools={"hand": ("lower", [0.2, 0, 0])}
+    )
+    time = torch.linspace(0, 4, 100, dtype=torch.float64)[:, None]
+    went, wave = minimum_jerk(time / 4), 0.3 * torch.sin(time)
+    closed = minimum_jerk(((time - 1.5) / 0.5).clamp(0, 1))
+    demonstrations = [
+        Demonstration(
+            time[:, 0],
+            torch.cat((1.2 * went - 0.6 + gap * (1 - went), 0.5 + wave, 1 - closed), 1),
+            CUP,
+        )
+        for gap in torch.linspace(-0.2, 0.2, 5, dtype=torch.float64)
+    ]
+    task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
+    return TaskParameterizedGMM(8, [Stack(*task), Canonical()], robot, blend=0.3).fit(
+        demonstrations
+    )
+
+
+@pytest.mark.parametrize("trust", [None, Trust()], ids=["believing", "wary"])
+@pytest.mark.parametrize("clock", ["waiting", "localizing", "waiting:arrivals=1.8"])
+def test_a_gripper_that_holds_something_is_not_waited_for(grasping, clock, trust):
+    """What it holds keeps it open: it is as if it were not measured."""
+    bounds = grasping.motion_bounds()
+    stands = torch.tensor([-0.6, 0.5, 1.0], dtype=torch.float64)
+    controller = grasping.controller(stands, CUP, clock=clock, trust=trust, smoothing=None)
+    tick, state = graph(grasping, clock, bounds), None
+    for now in range(440):
+        command = controller.step(DT, joints=stands)
+        if trust is None:
+            state, reference, *_ = tick(torch.zeros(tick.size) if now == 0 else state, stands)
+            torch.testing.assert_close(reference, command.reference, rtol=0, atol=1e-8)
+        assert float(command.time) == pytest.approx(min(now * DT, 4.0), abs=1e-6)
+        stands = command.reference.clone()
+        stands[2] = stands[2].clamp(min=0.6)
+    assert command.status is Status.FINISHED
+    assert float(command.reference[2]) < 0.1  # it still presses
+
+
+def test_an_arm_that_is_held_is_waited_for_while_its_gripper_moves(grasping):
+    stands = torch.tensor([-0.6, 0.5, 1.0], dtype=torch.float64)
+    controller = grasping.controller(stands, CUP, clock="localizing", smoothing=None)
+    for now in range(500):
+        command = controller.step(DT, joints=stands)
+        held = stands[:2]
+        stands = command.reference.clone()
+        if 160 <= now < 360:
+            stands[:2] = held
+        stands[2] = stands[2].clamp(min=0.6)
+        if now == 355:
+            assert float(command.time) < 2.4
+            assert float(command.reference[2]) < 0.75  # and is not opened meanwhile
 
 
 @pytest.mark.parametrize("clock", ["even", "localizing"])

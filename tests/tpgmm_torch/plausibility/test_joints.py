@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from tpgmm_torch import Demonstration
+from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.plausibility.check import summarize
-from tpgmm_torch.plausibility.joints import check_joints, is_gripper
+from tpgmm_torch.plausibility.joints import check_joints
 from tpgmm_torch.robots.joint_space import JointSpace
 
 TIME = np.arange(100) / 50
