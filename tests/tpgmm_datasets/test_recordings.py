@@ -192,6 +192,19 @@ def test_the_example_prints_its_table(example, capsys):
     assert methods == ["TP-GMM", "TP-GMM, cup unknown", "mean", "nearest"]
 
 
+def test_intervals_of_the_median_end_at_the_episodes_that_the_sign_test_says(example):
+    columns = len(example.COLUMNS)
+
+    def told(n):
+        values = np.tile(np.arange(1.0, n + 1)[:, None], (1, columns))
+        return example.intervals({"model": values}).splitlines()[1].split("model")[1].split()
+
+    # P(at most 5 of 20 heads) = 0.0207, 6 of 20: 0.0577; P(at most 1 of 9) = 0.0195
+    assert told(20)[:3] == ["6.0", "to", "15.0"]
+    assert told(9)[:3] == ["2.0", "to", "8.0"]
+    assert told(5) == ["-"] * columns
+
+
 @needs_recordings
 def test_so101_in_degrees_is_read_aligned_and_reproduced():
     arm = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
