@@ -46,6 +46,16 @@ bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_A
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
+oldest: ## Run the tests of the core with the oldest versions promised, in .venv-oldest
+	$(firstword $(wildcard $(BIN)/python) python3) -m venv .venv-oldest
+	.venv-oldest/bin/python -m pip install --disable-pip-version-check \
+	    --constraint constraints-oldest.txt '.[cli,view,hub,simulation]' \
+	    'pytest>=8.2' 'hypothesis>=6.100' 'gmr>=2.0' 'packaging>=24.2' 'pytorch-kinematics>=0.10' pin==2.7.0
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_datasets \
+	    --continue-on-collection-errors -o filterwarnings=default \
+	    --ignore tests/tpgmm_torch/viewing/test_rerun_recording.py --ignore tests/tpgmm_datasets/app \
+	    --ignore tests/tpgmm_datasets/lerobot/test_calibration.py $(PYTEST_ARGS)
+
 fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
 	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
 	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py \

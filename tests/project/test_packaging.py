@@ -14,6 +14,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 ROOT = Path(__file__).parents[2]
 #: The folder of each distribution, and its packages.
@@ -151,15 +152,15 @@ def requirements(*extras: str) -> list[Requirement]:
     return found
 
 
-def constraints() -> dict[str, str]:
+def constraints(file: str = "constraints.txt") -> dict[str, str]:
     """Versions by canonical name, from lines of the form ``name==version``."""
     versions = {}
-    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+    for line in (ROOT / file).read_text(encoding="utf-8").splitlines():
         if not line.startswith("#"):
             match = re.fullmatch(r"([\w.-]+)==([\w.!+]+)", line)
-            assert match, f"constraints.txt has a line that is not name==version: {line!r}"
+            assert match, f"{file} has a line that is not name==version: {line!r}"
             name = canonicalize_name(match[1])
-            assert name not in versions, f"constraints.txt names {name} twice"
+            assert name not in versions, f"{file} names {name} twice"
             versions[name] = match[2]
     return versions
 
@@ -187,6 +188,17 @@ def test_everything_that_the_tests_need_is_installed():
 def test_the_build_back_end_and_its_tools_are_among_the_test_requirements():
     needed = {canonicalize_name(requirement.name) for requirement in requirements("test")}
     assert {"build", "hatchling", "packaging"} <= needed
+
+
+def test_the_oldest_versions_are_those_that_are_promised():
+    """Extras that need newer ones of what others need too are not among them."""
+    promised = {}
+    for requirement in requirements("cli", "view", "hub", "simulation"):
+        for bound in requirement.specifier:
+            if bound.operator == ">=":
+                promised[canonicalize_name(requirement.name)] = Version(bound.version)
+    oldest = constraints("constraints-oldest.txt")
+    assert {name: Version(version) for name, version in oldest.items()} == promised
 
 
 # The hosted workflow

@@ -36,7 +36,9 @@ def random_local(rng: np.random.Generator, n_components: int, centre: Array) -> 
     means[:, 1:] += centre
     factors = rng.standard_normal((n_components, size, size)) / np.sqrt(size)
     scale = np.diag([0.4] + [0.2] * (size - 1))
-    return oracles.Local(means, scale @ (factors @ factors.mT + 0.2 * np.eye(size)) @ scale)
+    return oracles.Local(
+        means, scale @ (factors @ factors.swapaxes(-1, -2) + 0.2 * np.eye(size)) @ scale
+    )
 
 
 def conditionals_of(local: oracles.Local) -> Conditionals:

@@ -115,7 +115,7 @@ def test_gradients_of_an_orientation_stay_on_the_unit_sphere():
     assert abs(float(gradient @ given.detach())) < 1e-15
 
 
-ROTATIONS = Rotation.random(6, rng=np.random.default_rng(3))
+ROTATIONS = Rotation.random(6, np.random.default_rng(3))
 POSITIONS = np.random.default_rng(4).standard_normal((6, 3))
 
 
