@@ -8,4 +8,9 @@ from types import MappingProxyType
 __all__ = ["SUITE"]
 
 #: What is observed in each task, in that order.
-SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType({"handover": ("baton", "stand")})
+SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "handover": ("baton", "stand"),
+        "pour": ("cup", "jug"),
+    }
+)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 
 from lerobot_policy_tpgmm.environments.suite.handover import Handover
+from lerobot_policy_tpgmm.environments.suite.pour import Pour
 from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["TASKS", "suite_task"]
 
-TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover,)}
+TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover, Pour)}
 
 
 @functools.cache

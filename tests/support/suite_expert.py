@@ -1,0 +1,42 @@
+"""The experts of the suite in their environments."""
+
+import numpy as np
+import torch
+
+from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
+
+
+def start_of(motion):
+    """The options with which an episode begins as a demonstration does."""
+    poses = {
+        name: torch.cat((frame.position, frame.orientation)).numpy()
+        for name, frame in motion.frames.items()
+    }
+    return {**poses, "joints": motion.joints[0].numpy()}
+
+
+def replay(env: SuiteEnv, motion, references=None, seed=0, seconds=None, **start):
+    """Send a demonstration's joints as references, and hold the last; the last ``info``.
+
+    Parameters
+    ----------
+    motion : Demonstration
+        At the environment's rate.
+    references : ndarray of shape (T, 17), optional
+        To send others.
+    seconds : float, optional
+        To stop before the end of the episode.
+    **start
+        Poses of objects that are not those of the demonstration.
+    """
+    references = motion.joints.numpy() if references is None else references
+    env.reset(seed=seed, options={**start_of(motion), **start})
+    ticks = env.episode_length if seconds is None else round(seconds * env.fps)
+    for k in range(1, ticks + 1):
+        *_, info = env.step(references[min(k, len(references) - 1)])
+    return info
+
+
+def tick(motion, event):
+    """The time step at which a phase ends."""
+    return int(np.searchsorted(motion.time.numpy(), motion.events[event]))
