@@ -27,7 +27,7 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demo
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import ModelFileError, NotFittedError, ShapeError
+from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.novelty import ALIKE
 from tpgmm_torch.persistence import MODES
 from tpgmm_torch.storage import Folder
@@ -223,7 +223,11 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ]
 
     def predict(
-        self, X: Situation | Sequence[Situation], *, candidates: bool = True
+        self,
+        X: Situation | Sequence[Situation],
+        *,
+        candidates: bool = True,
+        choices: Sequence[ModeChoice] | None = None,
     ) -> list[Trajectory]:
         """Reproduce the skill, in each situation by the mode that suits it.
 
@@ -232,17 +236,24 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         X : sequence of Situation or Demonstration
         candidates : bool, default=True
             As for :meth:`TaskParameterizedGMM.predict`.
+        choices : sequence of ModeChoice, optional
+            One per situation, as :meth:`choose` returned them for these, so that they are not
+            found a second time; by default they are found.
 
         Raises
         ------
         DataError, ShapeError, UnknownNameError, NotFittedError
-            If a situation does not fit the model.
+            If a situation does not fit the model, or ``choices`` do not fit both.
         """
         self._check_fitted()
+        given = [X] if isinstance(X, Situation | Demonstration) else list(X)
+        if choices is not None:
+            self._check_choices(choices, len(given))
         if self.n_modes_ == 1:
             return self.models_[0].predict(X, candidates=candidates)
-        given = [X] if isinstance(X, Situation | Demonstration) else list(X)
-        modes = np.array([choice.mode for choice in self.choose(given)])
+        if choices is None:
+            choices = self.choose(given)
+        modes = np.array([choice.mode for choice in choices])
         found: dict[int, Trajectory] = {}
         for mode in np.unique(modes):
             members = np.flatnonzero(modes == mode)
@@ -373,6 +384,19 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             numbers[name].numpy() for name in ("weights", "limits", "labels")
         )
         return multimodal
+
+    def _check_choices(self, choices: Sequence[ModeChoice], n_situations: int) -> None:
+        if len(choices) != n_situations:
+            raise DataError(
+                f"got {len(choices)} choices for {n_situations} situations: give what "
+                "choose(situations) returned for them"
+            )
+        unknown = sorted({one.mode for one in choices} - set(range(self.n_modes_)))
+        if unknown:
+            raise DataError(
+                f"choices name the modes {unknown}, but there are {self.n_modes_}, counted "
+                "from 0: give what choose(situations) of this model returned"
+            )
 
     def _selection(self, model: TaskParameterizedGMM) -> ModeSelection:
         """What finds the modes, in the coordinates that the model looks at."""

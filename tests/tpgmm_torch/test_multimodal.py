@@ -17,7 +17,13 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.exceptions import ModelFileError, NotFittedError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    ModelFileError,
+    NotFittedError,
+    ShapeError,
+    UnknownNameError,
+)
 
 FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
 
@@ -114,6 +120,25 @@ def test_the_mode_is_one_that_was_shown_in_situations_like_this():
         novelty = replace(novelty, places=elsewhere)
         moved.models_[mode].shown_ = replace(shown_by_it, novelty=novelty)
         assert moved.choose(situation)[0].mode == 1 - mode
+
+
+def test_what_was_chosen_is_reproduced_without_choosing_again():
+    model, situations = fitted(Handles), Handles().situations(2, 1)
+    choices = model.choose(situations)
+    for a, b in zip(
+        model.predict(situations), model.predict(situations, choices=choices), strict=True
+    ):
+        assert torch.equal(a.joints, b.joints)
+    other = [replace(choice, mode=1 - choice.mode) for choice in choices]
+    for situation, choice, done in zip(
+        situations, other, model.predict(situations, choices=other), strict=True
+    ):
+        [alone] = model.models_[choice.mode].predict(situation)
+        torch.testing.assert_close(done.joints, alone.joints)
+    with pytest.raises(DataError, match="1 choices for 2 situations"):
+        model.predict(situations, choices=choices[:1])
+    with pytest.raises(DataError, match=r"the modes \[2\], but there are 2"):
+        model.predict(situations[0], choices=[replace(choices[0], mode=2)])
 
 
 def test_a_saved_model_is_the_same(tmp_path):

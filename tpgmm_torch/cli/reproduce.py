@@ -74,7 +74,7 @@ def reproduce(
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
-    from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
+    from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
     from tpgmm_torch.persistence import MODES
 
     if out.suffix not in FORMATS:
@@ -101,13 +101,17 @@ def reproduce(
         wanted = read_situations(situations, kinematics.joint_names)
     if via:
         fitted = one.with_via_points(via, fade)
-    trajectories = fitted.predict(wanted, candidates=False)
+    choices: list[ModeChoice] = []
+    if isinstance(fitted, MultimodalTaskParameterizedGMM):
+        choices = fitted.choose(wanted)
+        trajectories = fitted.predict(wanted, candidates=False, choices=choices)
+    else:
+        trajectories = fitted.predict(wanted, candidates=False)
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
-    if isinstance(fitted, MultimodalTaskParameterizedGMM):
-        for number, choice in enumerate(fitted.choose(wanted)):
-            typer.echo(f"{number:>4}  {choice}")
+    for number, choice in enumerate(choices):
+        typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
 
 

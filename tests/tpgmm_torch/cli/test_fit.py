@@ -6,7 +6,13 @@ import numpy as np
 
 from tests.support.command_line import UPPER_BODY, output, refusal
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import Demonstration, Hold, Poses, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    Hold,
+    MultimodalTaskParameterizedGMM,
+    Poses,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.cli.fit import fit as fit_command
 from tpgmm_torch.operators.text import default_operators, format_operator
 
@@ -166,7 +172,7 @@ def test_what_is_no_number_of_components_is_refused(dataset, tmp_path):
     assert "'some' is neither a positive integer nor 'auto'" in line
 
 
-def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
+def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses_once(tmp_path, monkeypatch):
     rng, time, shown = np.random.default_rng(0), np.linspace(0, 1.95, 40), []
     for side in np.resize([1, -1], 8):
         bump = 0.3 * side * np.sin(np.pi * time / 2) + 0.01 * rng.normal()
@@ -179,11 +185,18 @@ def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
     assert {path.name for path in (tmp_path / "model").iterdir()} == {
         "modes", "mode_0", "mode_1",
     }  # fmt: skip
+    choose, calls = MultimodalTaskParameterizedGMM.choose, []
+    monkeypatch.setattr(
+        MultimodalTaskParameterizedGMM,
+        "choose",
+        lambda model, situations: calls.append(situations) or choose(model, situations),
+    )
     text = output(
         "reproduce", tmp_path / "model", "--dataset", tmp_path / "set", "--episodes", "0",
         "--out", tmp_path / "new.csv",
     )  # fmt: skip
     assert "(mode 0: p = " in text
+    assert len(calls) == 1
     line = refusal(
         "plot", tmp_path / "model", "--dataset", tmp_path / "set", "--out", tmp_path / "plots"
     )
