@@ -152,7 +152,9 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
     return found
 
 
-def find_stops(demonstration: Demonstration, robot: Any = None) -> list[Boundary]:
+def find_stops(
+    demonstration: Demonstration, robot: Any = None, *, dwell: float = DWELL
+) -> list[Boundary]:
     """When the whole robot comes to rest between two motions; rhythms go on.
 
     A rhythm has no speed where it turns back either, but does not stay there: how long there is
@@ -164,6 +166,10 @@ def find_stops(demonstration: Demonstration, robot: Any = None) -> list[Boundary
         Of at least five time steps.
     robot : Kinematics, optional
         Its links are what rests; without it, the joints but for grippers.
+
+    dwell : float, default=0.35
+        Where the robot rests for this share of the time in which it does not move, at least,
+        it stops; 0 also finds where rhythms turn back.
 
     References
     ----------
@@ -189,7 +195,7 @@ def find_stops(demonstration: Demonstration, robot: Any = None) -> list[Boundary
         end = _crossing(time, speed, last, 1, REST * least)
         still = _crossing(time, speed, comes - 1, 1, MOTION * least)
         still -= _crossing(time, speed, leaves + 1, -1, MOTION * least)
-        if end - begin >= DWELL * still:
+        if end - begin >= dwell * still:
             found.append(Boundary((begin + end) / 2, "stop", begin, end))
     return found
 

@@ -50,9 +50,10 @@ def follow_poses(
         Where the joints are at first.
     rate : float
         Poses per second; joints keep within their limits of position and speed.
-    posture : array-like of shape (n_joints,), optional
+    posture : array-like of shape (n_joints,) or (T, n_joints), optional
         What joints seek where the poses leave them free, at one radian per second and radian
-        from it; by default the start.
+        from it; by default the start. Of T postures each goes with a pose, and is sought at
+        once.
     orientations : bool, default=True
         False lets links turn as they like.
 
@@ -63,8 +64,8 @@ def follow_poses(
     UnknownNameError
         If the robot has no such link.
     DataError, ShapeError
-        If the robot cannot be given to mink (joints that follow others), or the poses are not
-        T each.
+        If the robot cannot be given to mink (joints that follow others), or poses and postures
+        are not T each.
 
     Examples
     --------
@@ -83,9 +84,19 @@ def follow_poses(
         raise ShapeError(
             f"each link needs the same number of poses, got {[tuple(n) for n in lengths]}"
         )
-    solver = _Solver(robot, poses, start, posture, 1 / rate, orientations)
+    length = int(next(iter(lengths))[0])
+    ways = None if posture is None else robot.joint_tensor(posture)
+    if ways is None or ways.ndim == 1:
+        solver = _Solver(robot, poses, start, posture, 1 / rate, orientations)
+        ways = None
+    elif len(ways) == length:
+        solver = _Solver(robot, poses, start, ways[0], 1 / rate, orientations, gain=1.0)
+    else:
+        raise ShapeError(f"{length} poses need as many postures, or one; got {len(ways)}")
     joints = [solver.joints]
-    for step in range(1, int(next(iter(lengths))[0])):
+    for step in range(1, length):
+        if ways is not None:
+            solver.seek(ways[step])
         joints.append(solver.step({link: frame[step] for link, frame in poses.items()}))
     return torch.stack(joints)
 
@@ -168,6 +179,7 @@ class _Solver:
         posture: Any,
         period: float,
         orientations: bool,
+        gain: float | None = None,
     ) -> None:
         try:
             import mink
@@ -188,11 +200,16 @@ class _Solver:
         cost = 1.0 if orientations else 0.0
         self.tasks = {link: mink.FrameTask(link, "body", 1.0, cost) for link in poses}
         # a gain of one period: the posture is sought slowly, not within one step
-        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(period, 1.0))
-        self.posture.set_target(rest[self.columns].numpy())
+        gain = min(period, 1.0) if gain is None else gain
+        self.posture = mink.PostureTask(model, POSTURE_COST, gain=gain)
+        self.seek(rest)
         speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
         limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
+
+    def seek(self, posture: Tensor) -> None:
+        """Change what joints seek where the poses leave them free."""
+        self.posture.set_target(posture[self.columns].cpu().double().numpy())
 
     def step(self, poses: Mapping[str, Frame]) -> Tensor:
         """The joints one period later, on the way to the poses."""

@@ -50,10 +50,12 @@ def compare(
         str,
         typer.Option(
             metavar="NAME,...",
-            help="Among tpgmm, tpgmm-open-loop (by the clock, as in 0.1.0), tpgmm-places "
-            "(objects are where they were at first), tpgmm-position-only, act, act-phase, "
-            "diffusion, diffusion-phase, nearest, ... (a wrong name lists them); all, but for "
-            "the second and third; or quick: of these, all that are no networks of LeRobot. A "
+            help="Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, "
+            "as in 0.1.0), tpgmm-even-clock, tpgmm-places (objects are where they were at "
+            "first), tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, "
+            "key-poses-posture, dmp, promp; act, diffusion, mlp, knn, each also told the time, "
+            "-phase; nearest, mean; all, of tpgmm with all parts and without orientation; or "
+            "quick: of these, all that no gradient trains. A "
             "tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the "
             "open loop is always there.",
         ),
@@ -166,8 +168,10 @@ def _policies(text: str) -> list[str]:
     """The policies that are meant, each once."""
     from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
     from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES
+    from lerobot_policy_tpgmm.evaluation.trainings import ABLATIONS
 
-    usual = [name for name in POLICIES if name != "tpgmm-places"]
+    rare = {*ABLATIONS} - {"tpgmm-position-only"}
+    usual = [name for name in POLICIES if name not in rare]
     groups = {"all": usual, "quick": [name for name in usual if name not in RECIPES]}
     return _named(text, groups)
 

@@ -17,7 +17,7 @@ from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES
 from lerobot_policy_tpgmm.evaluation.processes import run_jobs
 from lerobot_policy_tpgmm.evaluation.report.summary import Task, write_summary
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP, Variant
+from lerobot_policy_tpgmm.evaluation.variants import NAMED, Variant
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["ALL_CONDITIONS", "Comparison", "compare", "rewrite_report"]
@@ -190,7 +190,7 @@ def _grids(
     """The cells of each environment."""
     for policy in policies:
         if Variant.parse(policy).base not in POLICIES:
-            known = (*POLICIES, OPEN_LOOP)
+            known = (*POLICIES, *NAMED)
             raise UnknownNameError("policy", policy, "the comparison", known)
     if not tasks or not policies or not seeds or not demonstrations or min(demonstrations) < 1:
         raise DataError(

@@ -8,35 +8,29 @@ import platform
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.envs.factory import make_env_config
-from lerobot.processor import make_default_pre_post_processors
-from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results, write_json
-from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES, Training, train
-from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
-from lerobot_policy_tpgmm.evaluation.policies.replay import NearestPolicy
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner, evaluate, latency
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
-from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
-from tpgmm_datasets import describe_lerobot, load_lerobot
-from tpgmm_torch import Demonstration, TaskParameterizedGMM
-from tpgmm_torch.alignment import DynamicTimeWarping
+from lerobot_policy_tpgmm.evaluation.trainings import TRAININGS
 from tpgmm_torch.atomic import replacing
 
 __all__ = ["POLICIES", "record", "run"]
 
 #: In the order of the report.
-POLICIES = ("tpgmm", "tpgmm-places", "tpgmm-position-only", *RECIPES, "nearest")
+POLICIES = tuple(TRAININGS)
 RECORD = "training.json"
-PACKAGES = ("tpgmm-torch", "lerobot", "torch", "numpy", "gymnasium", "mujoco", "diffusers")
+PACKAGES = (
+    *("tpgmm-torch", "lerobot", "torch", "numpy", "scikit-learn", "gymnasium", "mujoco"),
+    *("diffusers", "mink", "movement_primitives"),
+)
 
 
 def record(folder: Path, settings: Settings, n: int, seed: int = 0) -> None:
@@ -98,9 +92,8 @@ def machine() -> dict[str, Any]:
 def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> None:
     """Write the pretrained directory in one step."""
     began = time.process_time()
-    train_it = {"nearest": _nearest} | dict.fromkeys(RECIPES, _baseline)
     episodes = settings.episodes_in(folder, cell.seed)
-    trained = train_it.get(cell.variant.base, _tpgmm)(episodes, settings, cell)
+    trained = TRAININGS[cell.variant.base](episodes, settings, cell)
     seconds = time.process_time() - began
     with replacing(directory) as new:
         for part in (trained.policy, *trained.processors):
@@ -115,68 +108,3 @@ def _train(folder: Path, settings: Settings, cell: Cell, directory: Path) -> Non
             "curve": trained.curve,
         }
         write_json(new / RECORD, description)
-
-
-def _baseline(episodes: Path, settings: Settings, cell: Cell) -> Training:
-    training = Episodes.read(episodes / "training").first(cell.demonstrations)
-    validation = Episodes.read(episodes / "validation")
-    recipe = RECIPES[cell.variant.base]
-    if recipe.phase and not settings.benchmark().synchronous:
-        training, validation = training.on_common_clock(validation)
-    return train(recipe, training, validation, seed=cell.seed, budget=settings.budget)
-
-
-def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
-    kept = Episodes.read(episodes / "training").first(cell.demonstrations)
-    policy = NearestPolicy.fit(kept)
-    processors = make_default_pre_post_processors(policy.config)
-    return Training(policy, processors, kept.fps, outcome="kept as they are")
-
-
-def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
-    """Align the first episodes and learn their references."""
-    benchmark = settings.benchmark()
-    demonstrations = load_lerobot(
-        episodes / "training",
-        robot=benchmark.robot,
-        joints="action",
-        episodes=range(cell.demonstrations),
-    )
-    base = cell.variant.base
-    if base == "tpgmm-places":
-        demonstrations = [_at_first(demonstration) for demonstration in demonstrations]
-    if not benchmark.synchronous:
-        warping = DynamicTimeWarping(robot=benchmark.robot)
-        demonstrations = warping.fit_transform(demonstrations)
-    model = TaskParameterizedGMM(
-        settings.n_components or benchmark.n_components,
-        benchmark.operators(
-            orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
-        ),
-        benchmark.robot,
-        random_state=cell.seed,
-    )
-    policy = TPGMMPolicy.from_estimator(
-        model.fit(demonstrations),
-        fps=benchmark.rate,
-        environment_names=_environment_names(episodes / "training"),
-    )
-    recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
-    processors = make_tpgmm_pre_post_processors(policy.config)
-    outcome = "learned by expectation-maximisation"
-    return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)
-
-
-def _environment_names(path: Path) -> list[str]:
-    """Which entry of the observation is what: operators may name objects in another order."""
-    columns = {column.key: column.names for column in describe_lerobot(path).columns}
-    return list(columns[OBS_ENV_STATE] or ())
-
-
-def _at_first(demonstration: Demonstration) -> Demonstration:
-    """With all objects where they were at the beginning."""
-    frames = {
-        name: frame[0] if frame.batch_shape else frame
-        for name, frame in demonstration.frames.items()
-    }
-    return replace(demonstration, frames=frames)

@@ -17,10 +17,10 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
-from lerobot_policy_tpgmm.evaluation.policies.replay import NearestConfig, NearestPolicy
+from lerobot_policy_tpgmm.evaluation.policy_classes import policy_class
 
 __all__ = ["Runner", "evaluate", "latency"]
 
@@ -42,13 +42,8 @@ class Runner:
     def load(cls, directory: Path, overrides: Sequence[str] = ()) -> Runner:
         """Read a pretrained directory as LeRobot does, with ``--field=value`` on top."""
         config = PreTrainedConfig.from_pretrained(directory, cli_overrides=list(overrides))
-        kind = (
-            NearestPolicy
-            if isinstance(config, NearestConfig)
-            else get_policy_class(config.type)
-        )
         with contextlib.redirect_stdout(io.StringIO()):  # it says that it loads
-            policy = kind.from_pretrained(directory, config=config)
+            policy = policy_class(config).from_pretrained(directory, config=config)
         return cls(policy, *make_pre_post_processors(config, pretrained_path=str(directory)))
 
     def reset(self) -> None:

@@ -10,15 +10,18 @@ from typing import Self
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["NAMED", "OPEN_LOOP", "Variant"]
+__all__ = ["EVEN_CLOCK", "NAMED", "OPEN_LOOP", "Variant"]
 
 #: What 0.1.0 does by default: play the skill by the clock, with what is seen at the start.
 OPEN_LOOP = "tpgmm-open-loop"
+#: Sees and follows everything, but goes by the clock, however far the skill has come.
+EVEN_CLOCK = "tpgmm-even-clock"
 #: Variants with a name of their own. A gap at the start is no reason to give up here.
 NAMED: Mapping[str, str] = MappingProxyType(
     {
         OPEN_LOOP: "tpgmm --policy.closed_loop=false --policy.clock=even "
-        "--policy.follow_frames=false --policy.largest_start_gap=null"
+        "--policy.follow_frames=false --policy.largest_start_gap=null",
+        EVEN_CLOCK: "tpgmm --policy.clock=even",
     }
 )
 OPTION = "--policy."

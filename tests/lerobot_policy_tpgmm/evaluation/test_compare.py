@@ -6,7 +6,8 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
-from lerobot_policy_tpgmm.evaluation import jobs
+from lerobot_policy_tpgmm.evaluation import jobs, trainings
+from lerobot_policy_tpgmm.evaluation.benchmarks import benchmark
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.compare import (
     Comparison,
@@ -14,9 +15,11 @@ from lerobot_policy_tpgmm.evaluation.compare import (
     compare,
     rewrite_report,
 )
+from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES
 from lerobot_policy_tpgmm.evaluation.rollouts import Runner
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP
+from tpgmm_torch import Canonical
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 SETTINGS = Settings(
@@ -217,12 +220,12 @@ def test_conditions_are_tried_with_the_policy_that_is_there(whole, tmp_path):
     assert "figures/conditions.webp" in (out / "report.md").read_text()
 
 
-@pytest.mark.parametrize("policy", ["act", "diffusion-phase"])
+@pytest.mark.parametrize("policy", ["act", "diffusion-phase", "mlp-phase"])
 def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatch):
     shutil.copytree(folder / "episodes", tmp_path / "episodes")
-    recipe = replace(jobs.RECIPES[policy], check_every=5, batch_size=8)
-    monkeypatch.setitem(jobs.RECIPES, policy, recipe)
-    cell = Cell("bottle_shaking", policy, 2, 1)
+    recipe = replace(RECIPES[policy], check_every=5, batch_size=8)
+    monkeypatch.setitem(RECIPES, policy, recipe)
+    cell = Cell("bottle_shaking", policy, 2, 0)
     jobs.run(tmp_path, SETTINGS, [cell])
     result = Results(tmp_path / "cells").read(cell)
     [point] = result["training"]["curve"]
@@ -236,3 +239,32 @@ def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatc
     runner = Runner.load(tmp_path / "policies" / cell.training)
     width = runner.policy.config.env_state_feature.shape[0]
     assert width == (40 if "phase" in policy else 7)
+
+
+@pytest.mark.parametrize(
+    "policy",
+    ["key-poses-posture", "dmp", "promp", "knn", "knn-phase", "mean", "tpgmm-no-joints"],
+)
+def test_what_no_gradient_trains_goes_through_the_same_code(folder, tmp_path, policy):
+    shutil.copytree(folder / "episodes", tmp_path / "episodes")
+    cell = Cell("bottle_shaking", policy, 2, 0)
+    jobs.run(tmp_path, SETTINGS, [cell])
+    result = Results(tmp_path / "cells").read(cell)
+    assert result["training"]["curve"] == []
+    assert result["training"]["outcome"]
+    assert len(result["episodes"]) == SETTINGS.episodes
+    reached = max(episode["grasp_mm"] for episode in result["episodes"])
+    assert (reached < 10) == (
+        policy in ("key-poses-posture", "dmp", "promp", "tpgmm-no-joints")
+    )
+    runner = Runner.load(tmp_path / "policies" / cell.training)
+    assert type(runner.policy).__module__.startswith("lerobot_policy_tpgmm")
+
+
+def test_without_joints_grippers_keep_their_coordinate():
+    operators = trainings.operators_of("tpgmm-no-joints", benchmark("aloha_state"))
+    [joints] = [one for one in operators if isinstance(one, Canonical)]
+    assert joints.joints == ("left_arm_gripper", "right_arm_gripper")
+    bottle = trainings.operators_of("tpgmm-no-joints", benchmark("bottle_shaking"))
+    assert not [one for one in bottle if isinstance(one, Canonical)]
+    assert trainings.operators_of("tpgmm-auto", benchmark("bottle_shaking")) == "auto"

@@ -79,6 +79,20 @@ def test_a_way_is_followed_as_well_as_the_generator_of_the_skill_follows_it() ->
     assert jumps[0] < 2 * jumps[1]
 
 
+def test_postures_go_with_the_poses() -> None:
+    skill = BottleShaking(rate=25)
+    [shown] = (one.joints[:60] for one in skill.demonstrations(1, seed=0))
+    poses = poses_at(skill.robot, shown)
+    bent = shown[0] + 0.2 * torch.linspace(-1, 1, 17)
+    away = []
+    for posture in (shown, shown[0]):
+        joints = follow_poses(skill.robot, poses, shown[0], rate=25, posture=posture)
+        away.append(float((joints - shown).abs().max()))
+    assert away[0] < 0.02 < away[1]
+    with pytest.raises(ShapeError, match="60 poses need as many postures, or one; got 3"):
+        follow_poses(skill.robot, poses, shown[0], rate=25, posture=bent.expand(3, -1))
+
+
 class TestRefusing:
     robot = upper_body(joints="l_*")
     start = (0.5, 0.5, -0.3, -1.5, 0, 0, 0)

@@ -60,6 +60,10 @@ def test_a_rhythm_has_no_parts_whatever_its_period():
     for period in (0.8, 2.0, 4.0):
         swing = Demonstration(time, np.sin(2 * np.pi * time / period)[:, None])
         assert find_stops(swing) == []
+        turns = [stop.time for stop in find_stops(swing, dwell=0.0)]
+        wanted = np.arange(period / 4, 10, period / 2)
+        assert np.abs(np.array(turns)[:, None] - wanted).min(axis=1).max() < 0.03
+        assert len(wanted) - 2 <= len(turns) <= len(wanted)  # at the ends there is half a turn
 
 
 @pytest.mark.parametrize("rest", [0.0, 0.5, 2.0])

@@ -1,4 +1,4 @@
-"""LeRobot's own ACT and Diffusion Policy, trained from memory until they stop improving."""
+"""ACT, Diffusion Policy and a perceptron, trained from memory until they stop improving."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from typing import Any
 import torch
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.policies import ACTConfig, DiffusionConfig, PreTrainedPolicy
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.processor import make_default_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import state_features
-from lerobot_policy_tpgmm.evaluation.policies.elapsed_time import ElapsedTimeStep, time_features
-from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes, Windows
+from lerobot_policy_tpgmm.evaluation.policies.elapsed_time import tell_time
+from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes, Windows, policy_stride
+from lerobot_policy_tpgmm.evaluation.policies.perceptron import PerceptronConfig
+from lerobot_policy_tpgmm.evaluation.policy_classes import policy_class
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["RECIPES", "Recipe", "Training", "train"]
@@ -37,9 +39,9 @@ class Recipe:
     Parameters
     ----------
     config : type
-        LeRobot's configuration of the policy.
+        Configuration of the policy.
     options : mapping
-        Its fields that differ from LeRobot's defaults.
+        Its fields that differ from the defaults.
     normalization : str
         LeRobot's mode for states and actions.
     rate : int
@@ -106,9 +108,10 @@ DIFFUSION = Recipe(
     },
     "MIN_MAX",
 )
+PERCEPTRON = Recipe(PerceptronConfig, {}, "MEAN_STD")
 RECIPES = {
     name: recipe
-    for kind, plain in (("act", ACT), ("diffusion", DIFFUSION))
+    for kind, plain in (("act", ACT), ("diffusion", DIFFUSION), ("mlp", PERCEPTRON))
     for name, recipe in ((kind, plain), (f"{kind}-phase", replace(plain, phase=True)))
 }
 
@@ -172,17 +175,12 @@ def train(
         If the episodes' rate is no multiple of the recipe's, or training diverges.
     """
     torch.manual_seed(seed)
-    stride, rest = divmod(training.fps, recipe.rate)
-    if rest:
-        raise DataError(
-            f"the episodes have {training.fps} steps per second, which is no multiple of the "
-            f"policy's {recipe.rate}"
-        )
+    stride = policy_stride(training.fps, recipe.rate)
     if recipe.phase:
-        training, validation = (_with_time(episodes) for episodes in (training, validation))
+        training, validation = (episodes.with_time() for episodes in (training, validation))
     config = _configure(recipe, training)
-    policy = get_policy_class(config.type)(config)
-    processors = make_pre_post_processors(config, dataset_stats=_statistics(training))
+    policy = policy_class(config)(config)
+    processors = make_default_pre_post_processors(config, _statistics(training))
     preprocessor, postprocessor = processors
     result = Training(policy, processors, recipe.rate, recipe.describe())
     deltas = config.observation_delta_indices, config.action_delta_indices
@@ -194,8 +192,7 @@ def train(
     scale = _action_scale(postprocessor, config)
     _Learner(recipe, result, windows, held_out.at(rows), scale).run(budget, report)
     if recipe.phase:
-        # before device and normalisation, which know the time as a part of the environment
-        preprocessor.steps.insert(-2, ElapsedTimeStep(recipe.rate))
+        tell_time(preprocessor, recipe.rate)
     return result
 
 
@@ -285,13 +282,6 @@ class _Learner:
         valid = ~batch["action_is_pad"][:, steps]
         errors = (predicted - batch[ACTION][:, steps]).abs() * self.scale
         return float(loss), float(errors[valid].mean())
-
-
-def _with_time(episodes: Episodes) -> Episodes:
-    environment = episodes.columns[OBS_ENV_STATE], time_features(episodes.elapsed())
-    return replace(
-        episodes, columns={**episodes.columns, OBS_ENV_STATE: torch.cat(environment, dim=1)}
-    )
 
 
 def _normalized(episodes: Episodes, preprocessor: Any) -> dict[str, Tensor]:

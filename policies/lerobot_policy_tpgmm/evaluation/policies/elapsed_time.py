@@ -12,7 +12,7 @@ from lerobot.processor import ObservationProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-__all__ = ["ElapsedTimeStep", "time_features"]
+__all__ = ["ElapsedTimeStep", "tell_time", "time_features"]
 
 #: The Fourier series of an episode of this length [s], up to 1 Hz.
 LONGEST = 16.0
@@ -79,3 +79,9 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
         size = given.shape[-1] + len(time_features(torch.zeros(())))
         observed[OBS_ENV_STATE] = PolicyFeature(type=given.type, shape=(size,))
         return {**features, PipelineFeatureType.OBSERVATION: observed}
+
+
+def tell_time(preprocessor: Any, fps: float) -> None:
+    """Insert the step into a pipeline of LeRobot's, where a policy wants the time told."""
+    # before device and normalisation, which know the time as a part of the environment
+    preprocessor.steps.insert(-2, ElapsedTimeStep(fps))

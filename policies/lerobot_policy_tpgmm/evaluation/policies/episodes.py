@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from lerobot_policy_tpgmm.evaluation.policies.elapsed_time import time_features
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Episodes", "Windows"]
+__all__ = ["Episodes", "Windows", "policy_stride"]
 
 COLUMNS = (OBS_STATE, OBS_ENV_STATE, ACTION)
 
@@ -85,6 +86,13 @@ class Episodes:
         """Seconds since the beginning of its episode of every row, shape (N,)."""
         lengths = np.diff(self.bounds)
         return torch.cat([torch.arange(n) for n in lengths.tolist()]) / self.fps
+
+    def with_time(self) -> Episodes:
+        """With what :func:`time_features` makes of the time at the end of the environment."""
+        environment = self.columns[OBS_ENV_STATE], time_features(self.elapsed())
+        return replace(
+            self, columns={**self.columns, OBS_ENV_STATE: torch.cat(environment, dim=1)}
+        )
 
     def on_common_clock(self, *others: Episodes) -> tuple[Episodes, ...]:
         """These and other episodes, warped in time onto the most typical of these.
@@ -172,6 +180,23 @@ class Windows:
         batch[ACTION] = self.columns[ACTION][acted.clamp(first, last)]
         batch["action_is_pad"] = (acted < first) | (acted > last)
         return batch
+
+
+def policy_stride(fps: int, rate: int) -> int:
+    """How many rows of a recording a step of a policy takes.
+
+    Raises
+    ------
+    DataError
+        If the recording's rate is no multiple of the policy's.
+    """
+    stride, rest = divmod(fps, rate)
+    if rest:
+        raise DataError(
+            f"the episodes have {fps} steps per second, which is no multiple of the policy's "
+            f"{rate}"
+        )
+    return stride
 
 
 def _matrix(column: Any) -> Tensor:

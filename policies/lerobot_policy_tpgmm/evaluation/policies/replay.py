@@ -7,13 +7,12 @@ from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import SGDConfig
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import StatePolicyConfig, state_features
+from lerobot_policy_tpgmm.configuration_tpgmm import state_features
 from lerobot_policy_tpgmm.evaluation.policies.episodes import Episodes
+from lerobot_policy_tpgmm.evaluation.policies.planned import PlannedConfig, PlannedPolicy
 
 __all__ = ["NearestConfig", "NearestPolicy"]
 
@@ -24,7 +23,7 @@ POSE = 7
 
 @PreTrainedConfig.register_subclass("nearest_demonstration")
 @dataclass
-class NearestConfig(StatePolicyConfig):
+class NearestConfig(PlannedConfig):
     """Configuration of :class:`NearestPolicy`.
 
     Parameters
@@ -36,15 +35,8 @@ class NearestConfig(StatePolicyConfig):
     n_demonstrations: int = 1
     n_steps: int = 1
 
-    def validate_features(self) -> None:
-        """Nothing to check."""
 
-    def get_optimizer_preset(self) -> SGDConfig:
-        """Nothing is trained by gradient."""
-        return SGDConfig()
-
-
-class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
+class NearestPolicy(PlannedPolicy):
     """Replay, open loop, the demonstration whose object poses at the start are nearest.
 
     Parameters
@@ -58,7 +50,6 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def __init__(self, config: NearestConfig, **unused: Any) -> None:
         super().__init__(config)
-        self.config = config
         environment, action = config.env_state_feature.shape, config.action_feature.shape
         self.register_buffer("poses", torch.zeros(config.n_demonstrations, *environment))
         self.register_buffer(
@@ -85,19 +76,9 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
             policy.actions[index, : len(action)] = action
         return policy.eval()
 
-    def reset(self) -> None:
-        """Begin a new episode with the next observation."""
-        self._chosen: Tensor | None = None
-        self._step = 0
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next action of the demonstrations chosen at the first step; then the last one."""
-        if self._chosen is None:
-            self._chosen = self._distance(batch[OBS_ENV_STATE]).argmin(dim=1)
-        step = min(self._step, self.config.n_steps - 1)
-        self._step += 1
-        return self.actions[self._chosen, step]
+    def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
+        """The actions of the demonstrations that are nearest."""
+        return self.actions[self._distance(batch[OBS_ENV_STATE]).argmin(dim=1)]
 
     def _distance(self, poses: Tensor) -> Tensor:
         """Between each of these poses and each demonstration's, shape (B, n)."""
@@ -107,15 +88,3 @@ class NearestPolicy(PreTrainedPolicy):  # type: ignore[misc]
         cosine = (given[..., 3:] * kept[..., 3:]).sum(-1).abs().clamp(max=1)
         turn = METRES_PER_RADIAN * 2 * torch.arccos(cosine)
         return (squares + turn.square()).sum(-1)
-
-    def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """One action as a chunk."""
-        return self.select_action(batch)[:, None]
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """There is no loss."""
-        raise NotImplementedError("the nearest demonstration is kept, not trained")
-
-    def get_optim_params(self) -> Any:
-        """No parameters."""
-        return []

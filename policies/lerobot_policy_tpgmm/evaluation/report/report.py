@@ -27,7 +27,7 @@ from lerobot_policy_tpgmm.evaluation.report.tables import (
     wilson,
 )
 from lerobot_policy_tpgmm.evaluation.settings import Settings
-from lerobot_policy_tpgmm.evaluation.variants import OPEN_LOOP, Variant
+from lerobot_policy_tpgmm.evaluation.variants import EVEN_CLOCK, OPEN_LOOP, Variant
 from tpgmm_torch.atomic import replacing
 
 __all__ = ["ordered", "write_report"]
@@ -37,15 +37,30 @@ DESCRIPTIONS = {
     "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
     "and the joints",
     OPEN_LOOP: "the same, played by the clock with what is seen at the start, as in 0.1.0",
+    EVEN_CLOCK: "the same, watching the scene, but by the clock, wherever the robot is",
     "tpgmm-places": "the same, learned and played with all objects as places: where they were "
     "at the beginning, whoever holds them later",
     "tpgmm-position-only": "the same without the orientation of the hands",
+    "tpgmm-no-joints": "the same without the joints as a subspace: the hands' poses alone",
+    "tpgmm-auto": "the same with the subspaces chosen by itself, operators='auto'",
+    "key-poses": "inverse kinematics to the hands' key poses, each seen from where "
+    "demonstrations differ least, along minimum-jerk paths with the mean timing",
+    "key-poses-posture": "the same with the mean demonstrated posture in the null space",
+    "dmp": "dynamical movement primitives of the joints, one for each move, whose goals are "
+    "the key poses by inverse kinematics",
+    "promp": "a probabilistic movement primitive of the joints, conditioned on the present "
+    "posture and on the key poses by inverse kinematics",
     "act": "LeRobot's Action Chunking Transformer on joints and object poses",
     "act-phase": "the same, informed of the time and learning from episodes on a common clock",
     "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
     "diffusion-phase": "the same, informed of the time and learning from episodes on a common "
     "clock",
+    "mlp": "a perceptron on joints and object poses, which predicts the next actions",
+    "mlp-phase": "the same, informed of the time and learning from episodes on a common clock",
+    "knn": "nearest-neighbour regression on joints and object poses to the next actions",
+    "knn-phase": "the same, informed of the time and learning from episodes on a common clock",
     "nearest": "replays the demonstration whose objects stood nearest: the naive floor",
+    "mean": "replays the mean of the aligned demonstrations, wherever the objects are",
 }
 
 
@@ -125,6 +140,7 @@ class _Sections:
             yield from self._errors()
         yield from self._conditions()
         yield from self._baselines()
+        yield from self._recipes()
         yield from self._cost()
         yield "## What to keep in mind"
         yield "\n".join(f"- {text}" for text in self._remarks())
@@ -270,8 +286,14 @@ class _Sections:
             self._picture("learning_curves"),
         )
         yield "![Learning curves](figures/learning_curves.webp)"
-        yield "Recipes:"
-        yield "\n".join(f"- {name}: `{json.dumps(item)}`" for name, item in recipes.items())
+
+    def _recipes(self) -> Iterator[str]:
+        """Everything that was chosen for a policy, and what it found in the demonstrations."""
+        recipes = {p: item["recipe"] for (p, _, _), item in self.trainings.items()}
+        told = [f"- {p}: `{json.dumps(recipes[p])}`" for p in self.policies if recipes.get(p)]
+        if told:
+            yield "## Recipes"
+            yield "\n".join(told)
 
     def _cost(self) -> Iterator[str]:
         yield "## What it costs"

@@ -1,0 +1,112 @@
+"""Demonstrations on one clock: what the baselines learn from that replay or generalise them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_datasets import describe_lerobot, load_lerobot
+from tpgmm_torch import Demonstration, Kinematics
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.alignment.base import retime, seconds
+
+__all__ = ["Aligned"]
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """The references of demonstrations on their mean clock.
+
+    Parameters
+    ----------
+    robot : Kinematics
+    fps : int
+        Time steps per second.
+    demonstrations : sequence of Demonstration
+        Of one length, with the joint references in the robot's order.
+    starts : Tensor of shape (N, n_joints)
+        The measured postures in which they began.
+    state_names, action_names, environment_names : tuple of str
+        Of the entries of the data set's features.
+    """
+
+    robot: Kinematics
+    fps: int
+    demonstrations: tuple[Demonstration, ...]
+    starts: Tensor
+    state_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    environment_names: tuple[str, ...]
+
+    @classmethod
+    def read(cls, path: Path, robot: Kinematics, n: int, synchronous: bool = False) -> Aligned:
+        """The first ``n`` episodes of a LeRobot data set.
+
+        Parameters
+        ----------
+        path : Path
+        robot : Kinematics
+        n : int
+        synchronous : bool, default=False
+            Whether the episodes run on one clock as they are.
+        """
+        info = describe_lerobot(path)
+        names = {column.key: tuple(column.names or ()) for column in info.columns}
+        commanded, measured = (
+            load_lerobot(path, robot=robot, joints=joints, episodes=range(n))
+            for joints in ("action", "observation.state")
+        )
+        fps = round(info.fps)
+        aligned = _extended(commanded) if synchronous else _on_mean_clock(commanded, robot, fps)
+        return cls(
+            robot,
+            fps,
+            tuple(aligned),
+            torch.stack([demonstration.joints[0] for demonstration in measured]),
+            names["observation.state"],
+            names["action"],
+            names["observation.environment_state"],
+        )
+
+    @property
+    def mean(self) -> Tensor:
+        """The mean reference at each time step, shape (T, n_joints)."""
+        return torch.stack([d.joints for d in self.demonstrations]).mean(0)
+
+
+def _extended(demonstrations: Sequence[Demonstration]) -> list[Demonstration]:
+    """All as long as the longest, at whose end the others wait."""
+    longest = max(demonstrations, key=len)
+    every = []
+    for one in demonstrations:
+        rows = torch.arange(len(longest)).clamp(max=len(one) - 1)
+        frames = {n: f[rows] if f.batch_shape else f for n, f in one.frames.items()}
+        every.append(
+            Demonstration(longest.time, one.joints[rows], frames, one.joint_names, one.events)
+        )
+    return every
+
+
+def _on_mean_clock(
+    demonstrations: Sequence[Demonstration], robot: Kinematics, fps: int
+) -> list[Demonstration]:
+    """Warped onto one another, at the mean of the instants that correspond."""
+    if len(demonstrations) == 1:
+        return list(demonstrations)
+    warping = DynamicTimeWarping(robot=robot).fit(demonstrations)
+    clock = warping.time_.numpy()
+    paths = [path.numpy() for path in warping.paths_]
+    pairs = zip(paths, demonstrations, strict=True)
+    own = [np.interp(path, np.arange(len(one)), seconds(one)) for path, one in pairs]
+    mean = np.mean(own, axis=0)
+    grid = np.arange(np.floor((mean[-1] - mean[0]) * fps + 1e-6) + 1) / fps
+    at = np.interp(grid + mean[0], mean, clock)
+    return [
+        retime(one, torch.from_numpy(np.interp(at, clock, path)), torch.from_numpy(grid))
+        for path, one in zip(paths, demonstrations, strict=True)
+    ]
