@@ -12,5 +12,6 @@ SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "handover": ("baton", "stand"),
         "pour": ("cup", "jug"),
+        "wipe": ("board",),
     }
 )

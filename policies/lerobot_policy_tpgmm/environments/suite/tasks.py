@@ -7,11 +7,12 @@ import functools
 from lerobot_policy_tpgmm.environments.suite.handover import Handover
 from lerobot_policy_tpgmm.environments.suite.pour import Pour
 from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
+from lerobot_policy_tpgmm.environments.suite.wipe import Wipe
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["TASKS", "suite_task"]
 
-TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover, Pour)}
+TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover, Pour, Wipe)}
 
 
 @functools.cache
