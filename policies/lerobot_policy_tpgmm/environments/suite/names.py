@@ -11,6 +11,7 @@ __all__ = ["SUITE"]
 SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "handover": ("baton", "stand"),
+        "lid": ("box",),
         "peg_in_hole": ("peg", "block"),
         "pour": ("cup", "jug"),
         "wipe": ("board",),

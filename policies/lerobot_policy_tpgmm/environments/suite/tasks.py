@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 from lerobot_policy_tpgmm.environments.suite.handover import Handover
+from lerobot_policy_tpgmm.environments.suite.lid import Lid
 from lerobot_policy_tpgmm.environments.suite.peg_in_hole import PegInHole
 from lerobot_policy_tpgmm.environments.suite.pour import Pour
 from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
@@ -13,7 +14,9 @@ from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["TASKS", "suite_task"]
 
-TASKS: dict[str, type[SuiteTask]] = {task.name: task for task in (Handover, PegInHole, Pour, Wipe)}
+TASKS: dict[str, type[SuiteTask]] = {
+    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe)
+}
 
 
 @functools.cache
