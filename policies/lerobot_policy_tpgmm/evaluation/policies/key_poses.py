@@ -296,8 +296,8 @@ class _Shown:
 
     def _deviation(self, begin: int, steps: Sequence[int]) -> Array:
         """How far each demonstration is from the path through its own poses, in the mean."""
-        rows = np.arange(steps[-1] - begin + 1)
-        total = np.zeros(len(rows))
+        rows = np.arange(steps[-1] - begin + 1, dtype=np.float64)
+        total: Array = np.zeros(len(rows))
         for shown in self.links.values():
             for i in range(self.n):
                 poses = [shown[i, step] for step in steps]

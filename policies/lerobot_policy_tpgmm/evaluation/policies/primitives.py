@@ -203,7 +203,8 @@ class ProMPPolicy(_PrimitivePolicy):
 
     def _phase(self) -> Array:
         """Of each time step, in [0, 1]; anew, because the library writes into it."""
-        return np.linspace(0, 1, self.config.n_steps)
+        phase: Array = np.linspace(0, 1, self.config.n_steps)
+        return phase
 
     def references(
         self,

@@ -183,7 +183,7 @@ class MovesPolicy(SituatedPolicy):
     def posture_at(self, step: int, targets: Mapping[str, Frame]) -> Tensor:
         """The posture nearest to the mean one at a step in which links have poses."""
         near = self.mean[step].clamp(self.robot.lower, self.robot.upper)
-        here, rows = self.poses(near), np.arange(SOLVED + 10)
+        here, rows = self.poses(near), np.arange(SOLVED + 10, dtype=np.float64)
         paths = {
             link: minimum_jerk_path(here[link], [pose], [SOLVED], rows)
             for link, pose in targets.items()
@@ -229,7 +229,7 @@ class KeyPosesPolicy(MovesPolicy):
         move = self.move_at(step)
         fps, length = self.config.fps, move.arrive - move.begin
         start = joints.clamp(self.robot.lower, self.robot.upper)
-        rows = np.linspace(0, length, max(2, round(length * SOLVED / fps) + 1))
+        rows: Array = np.linspace(0, length, max(2, round(length * SOLVED / fps) + 1))
         here = self.poses(start)
         steps = [at - move.begin for at in move.steps]
         paths = {
