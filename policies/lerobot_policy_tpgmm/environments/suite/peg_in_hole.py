@@ -140,11 +140,11 @@ class PegInHole(SuiteTask):
             conaffinity=0,
             group=3,
         )
-        for position, size, orientation in _block():
+        for position, half, orientation in _block():
             _add_solid(
                 block,
                 mujoco.mjtGeom.mjGEOM_BOX,
-                size,
+                half,
                 pos=position,
                 quat=orientation,
                 mass=0,
@@ -279,7 +279,7 @@ def _block() -> list[tuple[Sequence[float], Sequence[float], Sequence[float]]]:
     top, bottom = HEIGHT - CHAMFER, HEIGHT - DEPTH
     none = (1.0, 0.0, 0.0, 0.0)
     floor = ((0.0, 0.0, (bottom - HEIGHT) / 2), (WIDTH, WIDTH, (bottom + HEIGHT) / 2), none)
-    boxes = [floor]
+    boxes: list[tuple[Sequence[float], Sequence[float], Sequence[float]]] = [floor]
     for inner, low, high in ((hole, bottom, top), (hole + CHAMFER, top, HEIGHT)):
         middle, thick = (inner + WIDTH) / 2, (WIDTH - inner) / 2
         z, tall = (low + high) / 2, (high - low) / 2

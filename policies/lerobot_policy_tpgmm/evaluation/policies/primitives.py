@@ -203,7 +203,7 @@ class ProMPPolicy(_PrimitivePolicy):
 
     def _phase(self) -> Array:
         """Of each time step, in [0, 1]; anew, because the library writes into it."""
-        phase: Array = np.linspace(0, 1, self.config.n_steps)
+        phase: Array = np.linspace(0, 1, self.config.n_steps).astype(np.float64)
         return phase
 
     def references(

@@ -20,7 +20,7 @@ from lerobot_policy_tpgmm.evaluation.policies.key_poses import (
 )
 from lerobot_policy_tpgmm.evaluation.policies.planned import SituatedConfig, SituatedPolicy
 from tpgmm_torch import Frame
-from tpgmm_torch.data.arrays import as_array
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.motion.inverse_kinematics import follow_poses
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.robots.robot import Robot
@@ -229,7 +229,8 @@ class KeyPosesPolicy(MovesPolicy):
         move = self.move_at(step)
         fps, length = self.config.fps, move.arrive - move.begin
         start = joints.clamp(self.robot.lower, self.robot.upper)
-        rows: Array = np.linspace(0, length, max(2, round(length * SOLVED / fps) + 1))
+        count = max(2, round(length * SOLVED / fps) + 1)
+        rows: Array = np.linspace(0, length, count).astype(np.float64)
         here = self.poses(start)
         steps = [at - move.begin for at in move.steps]
         paths = {
