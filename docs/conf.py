@@ -39,6 +39,7 @@ extensions = [
     "picturebook",
     "report",
     "sitelinks",
+    "suite",
     "thumbnails",
     "ties",
     "typelinks",
