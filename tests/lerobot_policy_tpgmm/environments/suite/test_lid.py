@@ -8,6 +8,7 @@ from lerobot_policy_tpgmm.environments.bottle.measures import successful
 from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
 from lerobot_policy_tpgmm.environments.suite.lid import HIGHEST, LOWEST, Lid
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
+from tests.support.suite_expert import replay
 from tpgmm_torch import Demonstration
 
 TASK = suite_task("lid")
@@ -21,15 +22,7 @@ def shown() -> list[Demonstration]:
 
 def done(motion: Demonstration, joints=None) -> dict[str, float]:
     """The figures of an episode that follows a motion, or other joints in its place."""
-    env = SuiteEnv("lid", fps=RATE)
-    box = motion.frames["box"]
-    start = {"box": torch.cat((box.position, box.orientation)).numpy()}
-    env.reset(seed=0, options={**start, "joints": motion.joints[0].numpy()})
-    path = motion.joints.numpy() if joints is None else joints
-    over, step = False, 0
-    while not over:
-        step += 1
-        *_, over, info = env.step(path[min(step, len(path) - 1)])
+    info = replay(SuiteEnv("lid", fps=RATE), motion, joints)
     assert info["is_success"] == successful(info, TASK.limits)
     return info
 
