@@ -11,15 +11,18 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint
 PACKAGES_bench := .[bench]
 PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
+PACKAGES_metaworld := . ./policies[metaworld]
 PACKAGES_mutation := .[mutation]
 PACKAGES_test := .[test] ./policies[test]
 
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare
 # Processes of one thread each that `make evidence` runs at a time.
 WORKERS ?= 2
+# Meta-World asks for another MuJoCo than the rest, and dm-control follows MuJoCo
+METAWORLD := .venv-metaworld
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare evidence conditions bench test fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare evidence conditions metaworld bench test fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -42,6 +45,10 @@ conditions: $(VENV)/.installed-compare ## Try TP-GMM where things go wrong, besi
 
 bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_ARGS="--only step"; out/bench
 	$(BENCH) --out out/bench $(BENCH_ARGS)
+
+metaworld: ## Try all tasks of Meta-World; ARGS="--tasks reach-v3 --demonstrations 1,3"; out/metaworld
+	$(MAKE) $(METAWORLD)/.installed-metaworld VENV=$(METAWORLD)
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(METAWORLD)/bin/python -m lerobot_policy_tpgmm.evaluation.metaworld $(ARGS)
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
@@ -92,6 +99,14 @@ clean: ## Remove results and caches; the environment stays
 # A stamp is older than the files below when they ask for other packages than are installed.
 $(VENV)/.installed-%: pyproject.toml policies/pyproject.toml constraints.txt | $(BIN)/pip
 	$(INSTALL) $(foreach package,$(PACKAGES_$*),--editable '$(package)')
+	@touch $@
+
+$(METAWORLD)/constraints.txt: constraints.txt | $(METAWORLD)/bin/pip
+	grep -v -i -E '^(mujoco|dm-control|metaworld)==' constraints.txt > $@
+
+$(METAWORLD)/.installed-metaworld: pyproject.toml policies/pyproject.toml $(METAWORLD)/constraints.txt
+	$(METAWORLD)/bin/python -m pip install --disable-pip-version-check \
+	    --constraint $(METAWORLD)/constraints.txt $(foreach package,$(PACKAGES_metaworld),--editable '$(package)')
 	@touch $@
 
 # pip is what venv writes last, so it stands for an environment that is complete. A pyenv

@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.control_rate import rate_processors
 from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
+from lerobot_policy_tpgmm.environments.metaworld.tasks import check_task
 from lerobot_policy_tpgmm.environments.suite.names import SUITE
 from tpgmm_torch.exceptions import UnknownNameError
 
@@ -23,6 +24,7 @@ __all__ = [
     "BottleShakingConfig",
     "BottleTorqueConfig",
     "CarryAndPutConfig",
+    "MetaworldStateConfig",
 ]
 
 _PACKAGE = "lerobot_policy_tpgmm"
@@ -46,6 +48,10 @@ gym.register(
 gym.register(
     id=f"{_PACKAGE}/AlohaState-v0",
     entry_point=f"{_PACKAGE}.environments.aloha.state:AlohaStateEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/MetaworldState-v0",
+    entry_point=f"{_PACKAGE}.environments.metaworld.state:MetaworldStateEnv",
 )
 
 
@@ -254,6 +260,46 @@ class AlohaStateConfig(_StateEnvConfig):
     def gym_id(self) -> str:
         """The one environment that has both tasks."""
         return f"{_PACKAGE}/AlohaState-v0"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        return {"task": self.task, **super().gym_kwargs}
+
+
+@EnvConfig.register_subclass("metaworld_state")
+@dataclass
+class MetaworldStateConfig(_StateEnvConfig):
+    """``--env.type=metaworld_state``: Meta-World's tasks, with states as observations.
+
+    Parameters
+    ----------
+    task : str, default="reach-v3"
+        One of :data:`~lerobot_policy_tpgmm.environments.metaworld.tasks.TASKS`.
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, episode_length, control, stop_at_success
+        Options of
+        :class:`~lerobot_policy_tpgmm.environments.metaworld.state.MetaworldStateEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "reach-v3"
+    fps: int = 80
+    episode_length: int | None = None
+    control: str = "reference"
+    stop_at_success: bool = True
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(4, 3))
+
+    def __post_init__(self) -> None:
+        check_task(str(self.task))
+
+    @property
+    def gym_id(self) -> str:
+        """The one environment that has all tasks."""
+        return f"{_PACKAGE}/MetaworldState-v0"
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""All tasks of Meta-World from few demonstrations: ``make metaworld``."""

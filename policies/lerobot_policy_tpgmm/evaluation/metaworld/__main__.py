@@ -1,0 +1,171 @@
+"""All tasks of Meta-World from few demonstrations: ``make metaworld``.
+
+What is done is kept, one file for each cell: a run that is broken off goes on where it was, and
+one with more episodes adds those that are new.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+
+from lerobot_policy_tpgmm.environments.metaworld.state import MetaworldStateEnv
+from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, check_task
+from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
+from lerobot_policy_tpgmm.evaluation.metaworld.learners import LEARNERS
+from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
+    evaluation_seeds,
+    recorded,
+    successes,
+)
+from lerobot_policy_tpgmm.evaluation.metaworld.summary import summary, task_table
+from lerobot_policy_tpgmm.evaluation.metaworld.trials import trials
+from lerobot_policy_tpgmm.evaluation.report.tables import episode_table, write_table
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False)
+
+#: Whose versions are written down with each cell.
+PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot")
+
+
+@app.command()
+def run(
+    tasks: Annotated[str, typer.Option(metavar="NAME,...", help="Or all.")] = "all",
+    demonstrations: Annotated[str, typer.Option(metavar="N,...")] = "1,3,5,10",
+    seeds: Annotated[
+        str, typer.Option(metavar="N,...", help="Each has demonstrations of its own.")
+    ] = "0",
+    episodes: Annotated[int, typer.Option(min=1, help="In each cell.")] = 50,
+    policies: Annotated[
+        str, typer.Option(metavar="NAME,...", help=f"Among {', '.join(LEARNERS)}.")
+    ] = ",".join(LEARNERS),
+    record: Annotated[
+        int, typer.Option(min=1, help="Episodes of the expert; its rate is of these.")
+    ] = 12,
+    tuning: Annotated[
+        bool, typer.Option(help="Try in other situations than those that are reported.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Where results are.")] = Path("out/metaworld"),
+) -> None:
+    """Record experts, learn from them, and try what was learned in unseen situations."""
+    torch.set_num_threads(1)
+    names = TASKS if tasks == "all" else [check_task(name) for name in tasks.split(",")]
+    chosen = policies.split(",")
+    for name in chosen:
+        if name not in LEARNERS:
+            raise UnknownNameError("policy", name, "the benchmark", LEARNERS)
+    results = Results(out / ("tuning" if tuning else "cells"))
+    situations = evaluation_seeds(episodes, tuning=tuning)
+    for task in names:
+        cells = [
+            Cell(task, policy, n, seed)
+            for seed in _integers("seeds", seeds)
+            for n in _integers("demonstrations", demonstrations)
+            for policy in chosen
+        ]
+        kept = {cell: _kept(results, cell, situations) for cell in cells}
+        missing = [cell for cell in cells if len(kept[cell]) < episodes]
+        if not missing:
+            continue
+        env = MetaworldStateEnv(task)
+        for cell in missing:
+            result = _measure(env, cell, out / "demonstrations", record, situations, kept[cell])
+            results.write(cell, result)
+            solved = sum(episode["success"] for episode in result["episodes"])
+            typer.echo(f"{cell.key}: {solved} of {episodes}")
+        env.close()
+    report(results, out)
+
+
+def _integers(option: str, text: str) -> list[int]:
+    try:
+        return [int(number) for number in text.split(",")]
+    except ValueError:
+        raise DataError(f"--{option} is integers joined by commas, got {text!r}") from None
+
+
+def _settings(policy: str) -> dict[str, Any]:
+    return asdict(LEARNERS[policy])
+
+
+def _kept(results: Results, cell: Cell, situations: Sequence[int]) -> list[dict[str, Any]]:
+    """Episodes of a cell in the first of these situations, if settings are as they were."""
+    found = results.read(cell)
+    if found is None or found["settings"] != _plain(_settings(cell.policy)):
+        return []
+    episodes = found["episodes"]
+    seeds = [episode["seed"] for episode in episodes]
+    if seeds[: len(situations)] != [*situations][: len(seeds)]:
+        return []
+    return list(episodes)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON makes of a value."""
+    if isinstance(value, dict):
+        return {key: _plain(inner) for key, inner in value.items()}
+    return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value
+
+
+def _measure(
+    env: MetaworldStateEnv,
+    cell: Cell,
+    folder: Path,
+    record: int,
+    situations: Sequence[int],
+    kept: list[dict[str, Any]],
+) -> dict[str, Any]:
+    shown = recorded(folder, cell.env, cell.seed, record)
+    chosen = successes(shown, cell.demonstrations, cell.env)
+    began = time.perf_counter()
+    actor = LEARNERS[cell.policy].fit(chosen, cell.seed)
+    trained = time.perf_counter()
+    episodes = [*kept, *trials(env, actor, situations[len(kept) :])]
+    return {
+        "episodes": episodes,
+        "settings": _plain(_settings(cell.policy)),
+        "expert": {"episodes": len(shown), "successes": sum(one.success for one in shown)},
+        "demonstration_seeds": [one.seed for one in chosen],
+        "training_seconds": trained - began,
+        "evaluation_seconds": time.perf_counter() - trained,
+        "versions": {name: version(name) for name in PACKAGES},
+    }
+
+
+def report(results: Results, out: Path) -> None:
+    """Write ``results.md`` and ``episodes.parquet`` of all cells that are there."""
+    found = results.read_all(typer.echo)
+    if not found:
+        return
+    experts = {(one["cell"]["env"], one["cell"]["seed"]): one["expert"] for one in found}
+    asked = sum(expert["episodes"] for expert in experts.values())
+    solved = sum(expert["successes"] for expert in experts.values())
+    text = "\n".join(
+        [
+            "# Meta-World: successes in per cent",
+            "",
+            f"The scripted experts solved {solved} of {asked} situations.",
+            "",
+            summary(found),
+            task_table(found),
+        ]
+    )
+    with replacing(out / "results.md") as file:
+        file.write_text(text, encoding="utf-8")
+    write_table(episode_table(found), out / "episodes")
+    typer.echo(summary(found))
+
+
+if __name__ == "__main__":
+    app()

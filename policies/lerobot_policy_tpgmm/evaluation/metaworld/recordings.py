@@ -1,0 +1,117 @@
+"""The experts' episodes in files, so that they are recorded once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_policy_tpgmm.environments.metaworld.demonstrations import (
+    Recorded,
+    record_metaworld,
+)
+from lerobot_policy_tpgmm.environments.metaworld.state import MetaworldStateEnv
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["demonstration_seeds", "evaluation_seeds", "read", "recorded", "successes", "write"]
+
+#: Demonstrations of training seed s are of the situations ``STRIDE * s`` and on.
+STRIDE = 1000
+#: Evaluations begin here, those for tuning there: no situation of one is one of another.
+EVALUATION, TUNING = 1_000_000, 2_000_000
+
+
+def demonstration_seeds(seed: int, n: int) -> range:
+    """The ``n`` situations that the expert is asked to solve for training seed ``seed``."""
+    if not (0 <= seed < EVALUATION // STRIDE and 0 < n <= STRIDE):
+        raise DataError(
+            f"training seeds are from 0 to {EVALUATION // STRIDE - 1}, with up to {STRIDE} "
+            f"episodes each; got {seed} and {n}"
+        )
+    return range(STRIDE * seed, STRIDE * seed + n)
+
+
+def evaluation_seeds(n: int, *, tuning: bool = False) -> range:
+    """The ``n`` situations that policies are tried in; others while ``tuning``."""
+    first = TUNING if tuning else EVALUATION
+    return range(first, first + n)
+
+
+def recorded(folder: Path, task: str, seed: int, n: int) -> list[Recorded]:
+    """The expert's episodes ``demonstration_seeds(seed, n)``, from a file if they are there.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the files are.
+    task : str
+    seed, n : int
+        As of :func:`demonstration_seeds`.
+    """
+    path, seeds = folder / f"{task}-s{seed}.npz", demonstration_seeds(seed, n)
+    episodes = read(path) if path.exists() else []
+    if [episode.seed for episode in episodes[:n]] != [*seeds]:
+        env = MetaworldStateEnv(task, control="displacement", stop_at_success=False)
+        episodes = record_metaworld(env, seeds)
+        env.close()
+        write(path, episodes)
+    return episodes[:n]
+
+
+def successes(episodes: Sequence[Recorded], n: int, task: str) -> list[Recorded]:
+    """The first ``n`` episodes that solve the task.
+
+    Raises
+    ------
+    DataError
+        If there are fewer.
+    """
+    solved = [episode for episode in episodes if episode.success]
+    if len(solved) < n:
+        raise DataError(
+            f"the expert of {task} solved {len(solved)} of {len(episodes)} situations; {n} "
+            "demonstrations need more of them, see --recorded"
+        )
+    return solved[:n]
+
+
+def write(path: Path, episodes: Sequence[Recorded]) -> None:
+    """Write episodes as ``npz`` to a path, in one step."""
+    ends = np.cumsum([len(episode.actions) for episode in episodes])
+    rows = {
+        name: np.concatenate([getattr(episode, name) for episode in episodes])
+        for name in ("observed", "references", "actions")
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as new, new.open("wb") as file:
+        np.savez_compressed(
+            file,
+            seeds=[episode.seed for episode in episodes],
+            success=[episode.success for episode in episodes],
+            ends=ends,
+            **rows,
+        )
+
+
+def read(path: Path) -> list[Recorded]:
+    """The episodes at a path that :func:`write` wrote.
+
+    Raises
+    ------
+    DataError
+        If the file is damaged, or another one.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {name: file[name] for name in file.files}
+        cuts = held["ends"][:-1]
+        rows = [np.split(held[name], cuts) for name in ("observed", "references", "actions")]
+        flags = zip(held["seeds"].tolist(), held["success"].tolist(), strict=True)
+        return [
+            Recorded(int(seed), *arrays, bool(success))
+            for (seed, success), *arrays in zip(flags, *rows, strict=True)
+        ]
+    except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
+        raise DataError(f"{path} holds no episodes: {error}; delete it") from error

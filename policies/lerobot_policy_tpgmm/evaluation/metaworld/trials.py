@@ -1,0 +1,55 @@
+"""Trying an actor in situations that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_policy_tpgmm.environments.metaworld.hand import FPS
+from lerobot_policy_tpgmm.environments.metaworld.state import MetaworldStateEnv
+from lerobot_policy_tpgmm.evaluation.metaworld.learners import Actor
+
+__all__ = ["trials"]
+
+#: Where neither hand nor objects move by more than this [m] for so many steps, nothing will
+#: happen any more: the rest of the episode is not simulated.
+STILL, STILL_STEPS = 1e-4, FPS // 2
+
+
+def trials(env: MetaworldStateEnv, actor: Actor, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """One episode in each situation, each until success, rest, or its end.
+
+    Parameters
+    ----------
+    env : MetaworldStateEnv
+        Its ``control`` becomes the actor's.
+    actor : Actor
+    seeds : sequence of int
+
+    Returns
+    -------
+    list of dict
+        ``seed``, ``success`` and ``steps``.
+    """
+    env.control = actor.control
+    actor.begin(np.array([_row(env.reset(seed=seed)[0]) for seed in seeds]))
+    episodes = []
+    for episode, seed in enumerate(seeds):
+        observed = _row(env.reset(seed=seed)[0])
+        before, steps, done, info = observed, 0, False, {"is_success": False}
+        while not done:
+            observation, _, ended, cut, info = env.step(actor.act(episode, steps, observed))
+            observed, steps = _row(observation), steps + 1
+            done = ended or cut
+            if steps % STILL_STEPS == 0:
+                done |= bool(np.abs(observed - before).max() < STILL)
+                before = observed
+        episodes.append({"seed": seed, "success": bool(info["is_success"]), "steps": steps})
+    return episodes
+
+
+def _row(observation: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    return np.concatenate([observation["agent_pos"], observation["environment_state"]])

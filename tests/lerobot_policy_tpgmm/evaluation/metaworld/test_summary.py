@@ -1,0 +1,159 @@
+"""Meta-World's tables, files of episodes, and the prior: without Meta-World."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
+from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
+from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
+    Perceptron,
+    TaskParameterized,
+    smoothed,
+    switches,
+)
+from lerobot_policy_tpgmm.evaluation.metaworld.nearness import Nearness
+from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
+    demonstration_seeds,
+    evaluation_seeds,
+    read,
+    successes,
+    write,
+)
+from lerobot_policy_tpgmm.evaluation.metaworld.summary import GROUPS, summary, task_table
+from tpgmm_torch.exceptions import DataError
+
+
+def cell(task, n, solved, of=4, seed=0, policy="tpgmm"):
+    names = {"env": task, "policy": policy, "demonstrations": n, "seed": seed}
+    episodes = [{"seed": i, "success": i < solved} for i in range(of)]
+    return {"cell": {**names, "condition": "nominal"}, "episodes": episodes}
+
+
+def reaching(seed, n_steps=60):
+    """An episode that goes straight to the goal and closes the hand half way."""
+    generator = np.random.default_rng(seed)
+    start = np.array([0.0, 0.6, 0.2])
+    goal = generator.uniform((-0.1, 0.8, 0.1), (0.1, 0.9, 0.3))
+    share = np.linspace(0, 1, n_steps)[:, None]
+    path = start + (3 * share**2 - 2 * share**3) * (goal - start)
+    grip = (share < 0.5).astype(float)
+    poses = np.zeros((3, 7))
+    poses[:, 3], poses[0, :3], poses[2, :3] = 1, generator.uniform(0.3, 0.5, 3), goal
+    observed = np.hstack((path, grip, np.tile(poses.ravel(), (n_steps, 1))))
+    actions = np.hstack((np.gradient(path, axis=0) / 0.01, 1 - 2 * grip))
+    return Recorded(seed, observed, np.hstack((path, grip)), actions, True)
+
+
+def test_groups_are_all_tasks_and_two_halves_that_share_none():
+    assert set(GROUPS["tuned half"]).isdisjoint(GROUPS["held half"])
+    assert sorted((*GROUPS["tuned half"], *GROUPS["held half"])) == list(TASKS)
+
+
+def test_the_summary_has_means_over_tasks_with_intervals_and_every_seed():
+    results = [cell("push-v3", 3, 4), cell("reach-v3", 3, 2), cell("push-v3", 3, 2, seed=1)]
+    rows = {row.split("|")[1].strip(): row for row in summary(results).splitlines()}
+    # push 6 of 8, reach 2 of 4: (75 + 50) / 2; the interval is that of 8 of 12
+    assert "| 62.5 (39 to 86) [75, 50] |" in rows["all (50)"]
+    assert "| 75.0 " in rows["hard (6)"]
+    assert "medium (11)" not in rows
+
+
+def test_tables_put_tpgmm_first_and_leave_room_where_nothing_was_measured():
+    results = [cell("push-v3", 1, 1, policy="perceptron"), cell("reach-v3", 3, 2)]
+    heading, _, push, reach = task_table(results).splitlines()
+    assert heading == "| task |  | tpgmm, 3 | perceptron, 1 |"
+    assert push.endswith("|  | 1/4 |")
+    assert reach.endswith("| 2/4 |  |")
+    assert ("tuned" in push) == ("push-v3" in TUNED)
+
+
+def test_situations_of_demonstrations_tuning_and_evaluation_are_different():
+    shown = {seed for s in (0, 1, 2, 999) for seed in demonstration_seeds(s, 1000)}
+    tried, tuned = set(evaluation_seeds(500)), set(evaluation_seeds(500, tuning=True))
+    assert len(shown) == 4000
+    assert shown.isdisjoint(tried | tuned) and tried.isdisjoint(tuned)
+    with pytest.raises(DataError, match="training seeds"):
+        demonstration_seeds(1000, 1)
+
+
+def test_episodes_are_read_back_as_they_were(tmp_path):
+    episodes = [reaching(1, 30), replace(reaching(2, 20), success=False)]
+    write(tmp_path / "a" / "push.npz", episodes)
+    for was, found in zip(episodes, read(tmp_path / "a" / "push.npz"), strict=True):
+        assert (found.seed, found.success) == (was.seed, was.success)
+        for name in ("observed", "references", "actions"):
+            assert np.array_equal(getattr(found, name), getattr(was, name))
+
+
+def test_a_damaged_file_says_so(tmp_path):
+    (tmp_path / "push.npz").write_bytes(b"nothing")
+    with pytest.raises(DataError, match="delete it"):
+        read(tmp_path / "push.npz")
+
+
+def test_too_few_successes_are_refused():
+    episodes = [reaching(1), replace(reaching(2), success=False)]
+    assert successes(episodes, 1, "push-v3") == episodes[:1]
+    with pytest.raises(DataError, match="solved 1 of 2"):
+        successes(episodes, 2, "push-v3")
+
+
+def test_smoothing_ends_swinging_and_keeps_lines_and_grippers():
+    steps = np.arange(90.0)
+    line = np.column_stack((steps, -steps, 0 * steps, steps > 40))
+    assert np.allclose(smoothed(line, 15)[7:-7], line[7:-7])
+    swinging = line.copy()
+    swinging[:, 0] += 20 * np.sin(2 * np.pi * steps / 15)
+    assert np.allclose(smoothed(swinging, 15)[7:-7], line[7:-7])
+
+
+def test_switches_are_where_the_gripper_jumps():
+    assert switches(reaching(0).references) == [30]
+
+
+def test_the_prior_is_what_its_formula_says():
+    prior = Nearness(ratio=0.1, floor=0.0001, power=1.0, reach=0.3, strength=2.0)
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(5, 4, 4, generator=generator, dtype=torch.float64)
+    before = root @ root.mT
+    deviation = prior.deviation(torch.full((5, 3), 0.2, dtype=torch.float64))
+    assert deviation[0, 0].item() == pytest.approx(0.0201)
+    after = prior.posterior(before, deviation, 3)
+    # the slope over time stays, and what is left given time is a mean of five
+    assert torch.allclose(after[:, 0], before[:, 0])
+    given = [torch.linalg.inv(torch.linalg.inv(c)[:, 1:, 1:]) for c in (before, after)]
+    expected = (3 * given[0] + 2 * (deviation**2).diag_embed()) / 5
+    assert torch.allclose(given[1], expected)
+
+
+def test_one_demonstration_is_enough_to_reach_another_goal():
+    """Nothing but the prior can say that the end belongs to the goal and not to the world."""
+    shown, new = reaching(1), reaching(2)
+    actor = TaskParameterized().fit([shown], 0)
+    actor.begin(new.observed[:1])
+    goal = new.references[-1, :3]
+    assert np.linalg.norm(actor.act(0, 10**6, new.observed[-1])[:3] - goal) < 0.02
+    blind = TaskParameterized(nearness=None).fit([shown], 0)
+    blind.begin(new.observed[:1])
+    assert np.linalg.norm(blind.act(0, 10**6, new.observed[-1])[:3] - goal) > 0.02
+
+
+def test_reading_the_hand_at_every_step_gives_the_same_references_if_it_follows():
+    shown, new = [reaching(i) for i in (1, 2, 3)], reaching(4)
+    plan = TaskParameterized().fit(shown, 0)
+    closed = TaskParameterized(clock="even").fit(shown, 0)
+    for actor in (plan, closed):
+        actor.begin(new.observed[:1])
+    for step in range(20):
+        wanted = plan.act(0, step, new.observed[step])
+        assert np.allclose(closed.act(0, step, new.observed[step]), wanted, atol=1e-4)
+
+
+def test_the_perceptron_learns_what_it_is_shown():
+    shown = [reaching(i) for i in range(5)]
+    actor = Perceptron(hidden=(64,), updates=600).fit(shown, 0)
+    given = np.array([actor.act(0, t, shown[0].observed[t]) for t in range(5, 55)])
+    assert np.abs(given - shown[0].actions[5:55]).mean() < 0.15
