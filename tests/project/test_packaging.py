@@ -116,7 +116,7 @@ def test_version_is_the_same_everywhere():
 def test_the_plugin_asks_for_the_core_of_its_own_version():
     lines = [*PLUGIN["dependencies"], *chain(*PLUGIN["optional-dependencies"].values())]
     asked = [r for r in map(Requirement, lines) if r.name == PROJECT["name"]]
-    assert len(asked) == 2
+    assert len(asked) == 3
     assert {str(r.specifier) for r in asked} == {f"=={PROJECT['version']}"}
     assert set().union(*(r.extras for r in asked)) <= EXTRAS.keys()
 

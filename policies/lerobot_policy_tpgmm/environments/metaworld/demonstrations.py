@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from lerobot_policy_tpgmm.environments.metaworld.hand import FPS, FRAMES, JOINTS, opening
@@ -51,8 +52,8 @@ class Recorded:
         """The references, in frames as they were at the start."""
         poses = self.observed[0, len(JOINTS) :].reshape(len(FRAMES), 7)
         frames = {n: Frame(pose[:3], pose[3:]) for n, pose in zip(FRAMES, poses, strict=True)}
-        time = np.arange(len(self.references)) / FPS
-        return Demonstration(time, self.references, frames, JOINTS)
+        time = torch.arange(len(self.references), dtype=torch.float64) / FPS
+        return Demonstration(time, torch.from_numpy(self.references), frames, JOINTS)
 
 
 def record_metaworld(env: MetaworldStateEnv, seeds: Sequence[int]) -> list[Recorded]:
@@ -88,7 +89,9 @@ def record_metaworld(env: MetaworldStateEnv, seeds: Sequence[int]) -> list[Recor
 
 def _episode(env: MetaworldStateEnv, expert: object, seed: int) -> Recorded:
     observation, info = env.reset(seed=seed)
-    observed, references, actions = [], [], []
+    observed: list[NDArray[np.float64]] = []
+    references: list[NDArray[np.float64]] = []
+    actions: list[NDArray[np.float64]] = []
     left = AFTER
     while left and len(actions) < env.episode_length:
         with warnings.catch_warnings():
@@ -99,5 +102,10 @@ def _episode(env: MetaworldStateEnv, expert: object, seed: int) -> Recorded:
         references.append(np.append(env.target, opening(action[3])))
         actions.append(np.asarray(action, dtype=np.float64))
         left -= bool(info["is_success"])
-    rows = (np.array(values) for values in (observed, references, actions))
-    return Recorded(seed, *rows, bool(info["is_success"]))
+    return Recorded(
+        seed,
+        np.array(observed),
+        np.array(references),
+        np.array(actions),
+        bool(info["is_success"]),
+    )

@@ -110,8 +110,8 @@ def read(path: Path) -> list[Recorded]:
         rows = [np.split(held[name], cuts) for name in ("observed", "references", "actions")]
         flags = zip(held["seeds"].tolist(), held["success"].tolist(), strict=True)
         return [
-            Recorded(int(seed), *arrays, bool(success))
-            for (seed, success), *arrays in zip(flags, *rows, strict=True)
+            Recorded(int(seed), observed, references, actions, bool(success))
+            for (seed, success), observed, references, actions in zip(flags, *rows, strict=True)
         ]
     except (OSError, ValueError, KeyError, EOFError, TypeError) as error:
         raise DataError(f"{path} holds no episodes: {error}; delete it") from error
