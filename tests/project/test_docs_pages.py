@@ -113,8 +113,9 @@ def run(command: str) -> None:
         run(shlex.join(arguments[arguments.index("--no-python") + 1 :]))
     elif program.startswith("lerobot-"):
         check_options(program, arguments)
-    elif program == "tpgmm" and arguments[0] in ("demo", "compare"):
-        # they take minutes, and other tests run them: here the options are only read
+    elif program == "tpgmm" and arguments[0] in ("demo", "compare", "app"):
+        # they take minutes, or serve until they are stopped, and other tests run them: here the
+        # options are only read
         group = typer.main.get_command(app)
         name, known, rest = group.resolve_command(typer.Context(group), arguments)
         known.make_context(name, rest)
