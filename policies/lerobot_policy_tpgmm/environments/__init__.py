@@ -4,7 +4,7 @@ They load late: importing this package needs neither MuJoCo nor gym-aloha.
 """
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
@@ -100,6 +100,22 @@ class _StateEnvConfig(EnvConfig):
         return rate_processors(self.fps)
 
 
+class _TaskEnvConfig(_StateEnvConfig):
+    """One environment of gymnasium's that has several tasks."""
+
+    environment: ClassVar[str]
+
+    @property
+    def gym_id(self) -> str:
+        """The environment, whatever the task."""
+        return f"{_PACKAGE}/{self.environment}"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        return {"task": self.task, **super().gym_kwargs}
+
+
 @EnvConfig.register_subclass("bottle_shaking")
 @dataclass
 class BottleShakingConfig(_StateEnvConfig):
@@ -185,7 +201,7 @@ class CarryAndPutConfig(_StateEnvConfig):
 
 @EnvConfig.register_subclass("bimanual")
 @dataclass
-class BimanualConfig(_StateEnvConfig):
+class BimanualConfig(_TaskEnvConfig):
     """``--env.type=bimanual``: the tasks of the suite.
 
     Parameters
@@ -201,6 +217,8 @@ class BimanualConfig(_StateEnvConfig):
         Of the videos.
     """
 
+    environment: ClassVar[str] = "Bimanual-v0"
+
     task: str | None = "handover"
     fps: int = 100
     episode_length: int | None = None
@@ -214,20 +232,10 @@ class BimanualConfig(_StateEnvConfig):
         if not self.features:
             self.features = _features(17, len(SUITE[self.task]))
 
-    @property
-    def gym_id(self) -> str:
-        """The one environment that has all tasks."""
-        return f"{_PACKAGE}/Bimanual-v0"
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
-        return {"task": self.task, **super().gym_kwargs}
-
 
 @EnvConfig.register_subclass("aloha_state")
 @dataclass
-class AlohaStateConfig(_StateEnvConfig):
+class AlohaStateConfig(_TaskEnvConfig):
     """``--env.type=aloha_state``.
 
     Parameters
@@ -243,6 +251,8 @@ class AlohaStateConfig(_StateEnvConfig):
         Of the videos.
     """
 
+    environment: ClassVar[str] = "AlohaState-v0"
+
     task: str | None = "transfer_cube"
     fps: int = 50
     episode_length: int | None = None
@@ -256,20 +266,10 @@ class AlohaStateConfig(_StateEnvConfig):
         if not self.features:
             self.features = _features(len(JOINTS), len(OBJECTS[self.task]))
 
-    @property
-    def gym_id(self) -> str:
-        """The one environment that has both tasks."""
-        return f"{_PACKAGE}/AlohaState-v0"
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
-        return {"task": self.task, **super().gym_kwargs}
-
 
 @EnvConfig.register_subclass("metaworld_state")
 @dataclass
-class MetaworldStateConfig(_StateEnvConfig):
+class MetaworldStateConfig(_TaskEnvConfig):
     """``--env.type=metaworld_state``: Meta-World's tasks, with states as observations.
 
     Parameters
@@ -286,6 +286,8 @@ class MetaworldStateConfig(_StateEnvConfig):
         Of the videos.
     """
 
+    environment: ClassVar[str] = "MetaworldState-v0"
+
     task: str | None = "reach-v3"
     fps: int = 80
     episode_length: int | None = None
@@ -295,13 +297,3 @@ class MetaworldStateConfig(_StateEnvConfig):
 
     def __post_init__(self) -> None:
         check_task(str(self.task))
-
-    @property
-    def gym_id(self) -> str:
-        """The one environment that has all tasks."""
-        return f"{_PACKAGE}/MetaworldState-v0"
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """The environment's options, without those that are left to it."""
-        return {"task": self.task, **super().gym_kwargs}
