@@ -142,8 +142,8 @@ class _HandlingBenchmark(Benchmark):
     POOL, RESERVED = 100, 10
 
     @abstractmethod
-    def motions(self, n: int, seed: int) -> list[Demonstration]:
-        """Generated demonstrations."""
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
+        """Those of the pool's demonstrations that have these numbers."""
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
         """Let the environment follow generated demonstrations."""
@@ -152,7 +152,6 @@ class _HandlingBenchmark(Benchmark):
                 f"{self.env} offers {self.POOL} demonstrations for training and "
                 f"{self.RESERVED} for validation, {training} and {validation} are asked for"
             )
-        pool = self.motions(self.POOL + self.RESERVED, seed)
         numbers = {
             "training": range(training),
             "validation": range(self.POOL, self.POOL + validation),
@@ -164,7 +163,7 @@ class _HandlingBenchmark(Benchmark):
         )
         successes = {}
         for name, chosen in numbers.items():
-            motions = [pool[number] for number in chosen]
+            motions = self.motions(chosen, seed)
             followed = [self._follow(env, *pair) for pair in zip(chosen, motions, strict=True)]
             save_lerobot(
                 [measured for measured, _ in followed],
@@ -236,9 +235,10 @@ class BottleBenchmark(_HandlingBenchmark):
         self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
         self.robot = self.skill.robot
 
-    def motions(self, n: int, seed: int) -> list[Demonstration]:
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
         """Of the skill's generator."""
-        return self.skill.demonstrations(n, seed)
+        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
+        return [pool[number] for number in numbers]
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle, and the joints."""
@@ -266,9 +266,10 @@ class CarryBenchmark(_HandlingBenchmark):
         self.skill = CarryAndPut(rate=self.rate)
         self.robot = self.skill.robot
 
-    def motions(self, n: int, seed: int) -> list[Demonstration]:
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
         """Of the skill's generator."""
-        return self.skill.demonstrations(n, seed)
+        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
+        return [pool[number] for number in numbers]
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle and the tray, and the joints.
@@ -311,9 +312,9 @@ class SuiteBenchmark(_HandlingBenchmark):
         self.task, self.criteria = self.skill.description, self.skill.limits
         self.figures = {**self.skill.headings, **PEAKS}
 
-    def motions(self, n: int, seed: int) -> list[Demonstration]:
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
         """Of the task's expert."""
-        return self.skill.demonstrations(n, seed, self.rate)
+        return self.skill.demonstrations(self.POOL + self.RESERVED, seed, self.rate, numbers)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """As the task says."""

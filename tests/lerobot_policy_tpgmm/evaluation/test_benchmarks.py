@@ -9,6 +9,7 @@ from lerobot_policy_tpgmm.evaluation import jobs
 from lerobot_policy_tpgmm.evaluation.benchmarks import CarryBenchmark
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_policy_tpgmm.evaluation.trainings import TRAININGS
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.carrying import slid
@@ -114,9 +115,8 @@ def test_objects_are_told_apart_by_their_names(folder, settings, monkeypatch):
         "operators",
         lambda self, orientation, held=True: usual(self, orientation, held)[::-1],
     )
-    trained = jobs._tpgmm(
-        folder / "episodes", settings, Cell("carry_and_put", "tpgmm", DEMONSTRATIONS, 0)
-    )
+    cell = Cell("carry_and_put", "tpgmm", DEMONSTRATIONS, 0)
+    trained = TRAININGS["tpgmm"](settings.episodes_in(folder, 0), settings, cell)
     assert trained.policy.frames.frame_names == ("tray", "bottle")
     assert trained.policy.frames.in_environment == {
         "bottle": [*range(7)],

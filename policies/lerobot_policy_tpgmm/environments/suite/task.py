@@ -71,6 +71,11 @@ class Style:
             torch.from_numpy(rng.uniform(-1, 1, (n, 3))),
         )
 
+    def __getitem__(self, chosen: Sequence[int]) -> Style:
+        """Of some people."""
+        rows = list(chosen)
+        return Style(self.posture[rows], self.bow[rows], self.aim[rows], self.free[rows])
+
     @classmethod
     def none(cls, n: int, joints: int) -> Style:
         """What the expert would do at best."""
@@ -216,15 +221,24 @@ class SuiteTask(ABC):
         posture = skill().neutral_posture().numpy() + spread
         return np.clip(posture, self.robot.lower.numpy(), self.robot.upper.numpy())
 
-    def demonstrations(self, n: int, seed: int = 0, rate: float = 100.0) -> list[Demonstration]:
+    def demonstrations(
+        self,
+        n: int,
+        seed: int = 0,
+        rate: float = 100.0,
+        only: Sequence[int] | None = None,
+    ) -> list[Demonstration]:
         """Demonstrations with different objects, start postures, timing and style.
 
         Parameters
         ----------
         n : int
+            How many are drawn.
         seed : int, default=0
         rate : float, default=100
             Time steps per second.
+        only : sequence of int, optional
+            The numbers of those that are made, since each takes a second; by default all.
 
         Returns
         -------
@@ -238,7 +252,14 @@ class SuiteTask(ABC):
         phases = Phases(self.phases, rate, STRETCH)
         ends = torch.from_numpy(phases.lengths(n, rng).cumsum(1))
         style = Style.draw(n, self.robot.n_joints, rng)
-        return self._moved(drawn, torch.from_numpy(starts), phases, ends, style)
+        made = list(range(n) if only is None else only)
+        return self._moved(
+            [drawn[i] for i in made],
+            torch.from_numpy(starts[made]),
+            phases,
+            ends[made],
+            style[made],
+        )
 
     def nominal(
         self, poses: Mapping[str, Pose], joints: NDArray[np.float64], rate: float = 100.0

@@ -32,6 +32,12 @@ def motions():
     return suite_task("handover").demonstrations(5, seed=2, rate=10)
 
 
+def test_a_demonstration_is_the_same_without_the_others(motions):
+    [alone] = suite_task("handover").demonstrations(5, seed=2, rate=10, only=[3])
+    assert torch.equal(alone.time, motions[3].time) and alone.events == motions[3].events
+    assert torch.allclose(alone.joints, motions[3].joints, rtol=0, atol=1e-9)
+
+
 def test_names_are_those_that_are_known_without_mujoco():
     assert set(TASKS) == set(SUITE) <= set(BENCHMARKS)
     assert list(SUITE) == sorted(SUITE)
@@ -50,8 +56,8 @@ def test_a_task_hangs_together(name):
     assert set(task.limits) <= set(figures) and set(task.limits) <= set(task.headings)
     assert set(task.headings) <= set(figures)
     for hold in task.holds:
-        assert hold.hand in HANDS and hold.thing in task.objects
-        assert env._scene.gap(hold) > 0.02
+        # what is held may be a part of an object, like a lid
+        assert hold.hand in HANDS and env._scene.gap(hold) > 0.02
     for orientation in (False, True):
         for held in (False, True):
             operators = task.operators(orientation, held)
