@@ -1,28 +1,37 @@
-"""Demonstrations by keyboard in the simulated robot, written as a LeRobot data set.
+"""Demonstrations by keyboard or gamepad in the simulated robot, written as a LeRobot data set.
 
-    python examples/teleoperate.py out/mine --episodes 10
+    python examples/teleoperate.py out/mine --episodes 10 --gamepad
     tpgmm fit out/mine --robot upper_body --link l_hand --link r_hand --out out/skill
 
-A window shows the robot. While a key is down, both hands move, or turn about the middle between
-them:
+A window shows the robot. While a key is down, or a stick is held, both hands move, or turn
+about the middle between them: as fast as sticks and triggers are pushed.
 
-====== ============================== ====== ==============================
-keys   the hands go                   keys   the hands go
-====== ============================== ====== ==============================
-w, s   ahead, back                    e, q   together, apart
-a, d   to the left, to the right      i, k   turn down, up
-r, f   up, down                       j, l   turn to the left, to the right
-====== ============================== ====== ==============================
+====== ============================== ================================
+keys   gamepad                        the hands go
+====== ============================== ================================
+w, s   left stick up, down            ahead, back
+a, d   left stick left, right         to the left, to the right
+r, f   right trigger, left trigger    up, down
+e, q   right bumper, left bumper      together, apart
+i, k   right stick down, up           turn down, up
+j, l   right stick left, right        turn to the left, to the right
+====== ============================== ================================
 
 It is for reaching, grasping and lifting: both hands close when both palms are at the bottle.
 Grasps are coarser than what the environment counts as a success, and no key shakes.
 
-Enter ends an episode and keeps it, backspace throws it away, escape ends the program. It needs
-the plugin with its extra ``environments``, a screen for the window, and EGL or OSMesa to draw.
+Enter (A) ends an episode and keeps it, backspace (B) throws it away, escape (start) ends the
+program. The names are those of an Xbox controller; on others the same places count. Keys work
+beside a gamepad, too.
+
+It needs the plugin with its extra ``environments``, for a gamepad ``teleoperation``, a screen
+for the window, and EGL or OSMesa to draw.
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Set
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +43,7 @@ from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
 from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration, Frame, Robot
+from tpgmm_torch.exceptions import DependencyError
 
 FPS = 25
 #: Of the hands while a key is down [m/s], [rad/s].
@@ -57,14 +67,26 @@ KEYS = {
     "l": (0, 0, 0, 0, 0, -TURNING),
 }
 MIRRORED = {"e", "q"}
+#: Axes of a gamepad, by SDL's numbers, with the keys that their two directions stand for.
+#: Right and down are positive, and triggers have one direction.
+STICKS = {0: ("d", "a"), 1: ("s", "w"), 2: ("l", "j"), 3: ("i", "k")}
+AXES = STICKS | {4: ("f", "f"), 5: ("r", "r")}
+#: Buttons, likewise: the bumpers; and A, B and start, which end an episode.
+BUTTONS = {9: "q", 10: "e"}
+ENDS = {0: "enter", 1: "backspace", 6: "escape"}
+#: Share of a stick's way in which it is taken to be let go.
+DEAD_ZONE = 0.15
 HANDS = ("l_hand", "r_hand")
 
 
-def hand_velocities(keys: Set[str]) -> NDArray[np.float64]:
-    """What the keys that are down ask of both hands, (2, 6); other keys do nothing."""
+def hand_velocities(pressed: Mapping[str, float]) -> NDArray[np.float64]:
+    """What keys ask of both hands, (2, 6), each as far as it is pressed, from 0 to 1.
+
+    Other keys do nothing.
+    """
     asked = np.zeros((2, 6))
-    for key in keys & KEYS.keys():
-        left = np.array(KEYS[key], dtype=float)
+    for key in pressed.keys() & KEYS.keys():
+        left = pressed[key] * np.array(KEYS[key], dtype=float)
         asked += left, (-left if key in MIRRORED else left)
     return asked
 
@@ -88,7 +110,7 @@ class Teleoperation:
         self._robot, self._period, self._rest = robot, period, joints.copy()
         self.reference = joints.copy()
 
-    def step(self, keys: Set[str]) -> NDArray[np.float64]:
+    def step(self, pressed: Mapping[str, float]) -> NDArray[np.float64]:
         """The next reference: damped least squares, within the limits of the joints."""
         state = self._robot.state(torch.from_numpy(self.reference))
         rows = [state.linear_jacobian(hand) for hand in HANDS]
@@ -97,11 +119,12 @@ class Teleoperation:
         jacobian = torch.cat(stacked).numpy()
         n = len(self.reference)
         gain = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING**2 * np.eye(12))
-        asked = hand_velocities(keys)
+        asked = hand_velocities(pressed)
+        moving = asked.any()
         places = np.stack([state.position(hand).numpy() for hand in HANDS])
         asked[:, :3] += np.cross(asked[:, 3:], places - places.mean(axis=0))
         velocity = gain @ asked.ravel()
-        if keys & KEYS.keys():  # back to the posture, as far as the hands do not notice
+        if moving:  # back to the posture, as far as the hands do not notice
             velocity += POSTURE * (np.eye(n) - gain @ jacobian) @ (self._rest - self.reference)
         fastest = self._robot.velocity.numpy()
         velocity = np.clip(velocity, -fastest, fastest)
@@ -112,11 +135,11 @@ class Teleoperation:
 
 def episode(
     env: BottleShakingEnv,
-    keys_down: Callable[[], Set[str] | None],
+    pressed: Callable[[], Mapping[str, float] | None],
     seed: int,
     shown: Callable[[BottleShakingEnv], object] = lambda env: None,
 ) -> Demonstration:
-    """What a person does with the keys, until ``keys_down`` gives None or time is up.
+    """What a person does with keys or a gamepad, until ``pressed`` gives None or time is up.
 
     The demonstration has the measured joints, and the pose of the bottle at the start.
     """
@@ -125,7 +148,7 @@ def episode(
     robot = BottleBenchmark(rate=env.fps).robot
     hands = Teleoperation(robot, observation["agent_pos"], 1 / env.fps)
     measured, over = [observation["agent_pos"]], False
-    while not over and (keys := keys_down()) is not None:
+    while not over and (keys := pressed()) is not None:
         observation, _, ended, cut, _ = env.step(hands.step(keys))
         measured.append(observation["agent_pos"])
         shown(env)
@@ -138,13 +161,79 @@ def episode(
     )
 
 
-class Window:
-    """Shows the robot, and knows which keys are down."""
+class Gamepad:
+    """A gamepad, in the layout of an Xbox controller whatever its make: SDL knows the wires.
+
+    Raises
+    ------
+    DependencyError
+        If pygame is not installed.
+    SystemExit
+        If there is no gamepad, or only devices whose layout SDL does not know.
+    """
 
     def __init__(self) -> None:
+        # the window is matplotlib's: SDL has none, and is to listen all the same
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ["SDL_JOYSTICK_ALLOW_BACKGROUND_EVENTS"] = "1"
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        try:
+            with warnings.catch_warnings():  # of pkg_resources, which pygame imports
+                warnings.simplefilter("ignore")
+                import pygame
+                from pygame._sdl2 import controller
+        except ImportError:
+            raise DependencyError(
+                "a gamepad needs pygame: pip install 'lerobot_policy_tpgmm[teleoperation]'"
+            ) from None
+        pygame.display.init()
+        controller.init()
+        self._pygame = pygame
+        devices = range(controller.get_count())
+        known = [device for device in devices if controller.is_controller(device)]
+        if not known:
+            found = f"{len(devices)} whose layout SDL does not know" if devices else "none"
+            raise SystemExit(
+                f"error: no gamepad: {found} connected; connect one, or leave out --gamepad"
+            )
+        self._pad = controller.Controller(known[0])
+
+    def ended(self) -> str:
+        """The last of the keys in :data:`ENDS` that a button stood for since the last call."""
+        events, last = self._pygame.event, ""
+        for event in events.get(self._pygame.CONTROLLERBUTTONDOWN):
+            last = ENDS.get(event.button, last)
+        events.clear(pump=False)  # of others, which nobody fetches
+        return last
+
+    def pressed(self) -> dict[str, float]:
+        """Keys that sticks, triggers and bumpers stand for, each with how far it is pressed."""
+        self._pygame.event.pump()
+        asked = dict[str, float]()
+        for axis, directions in AXES.items():
+            value = self._pad.get_axis(axis) / 32767
+            far = (abs(value) - DEAD_ZONE) / (1 - DEAD_ZONE)
+            if far > 0:
+                asked[directions[value < 0]] = min(far, 1.0)
+        return asked | {
+            key: 1.0 for button, key in BUTTONS.items() if self._pad.get_button(button)
+        }
+
+
+class Window:
+    """Shows the robot, and knows what is pressed.
+
+    Parameters
+    ----------
+    gamepad : Gamepad, optional
+        To listen to, beside the keys.
+    """
+
+    def __init__(self, gamepad: Gamepad | None = None) -> None:
         from matplotlib import pyplot
 
-        self._plot, self.down, self.last = pyplot, set[str](), ""
+        self._plot, self._down, self.last = pyplot, set[str](), ""
+        self._gamepad = gamepad
         for name in ("keymap.save", "keymap.quit", "keymap.fullscreen", "keymap.home"):
             pyplot.rcParams[name] = []  # they are ours
         self._figure, axes = pyplot.subplots()
@@ -155,14 +244,18 @@ class Window:
 
     def _pressed(self, event: Any) -> None:
         self.last = event.key
-        self.down.add(event.key)
+        self._down.add(event.key)
 
     def _released(self, event: Any) -> None:
-        self.down.discard(event.key)
+        self._down.discard(event.key)
 
-    def keys(self) -> Set[str] | None:
-        """Those that are down; None once the episode is ended."""
-        return None if self.last in ("enter", "backspace", "escape") else set(self.down)
+    def pressed(self) -> Mapping[str, float] | None:
+        """What is pressed, each how far, from 0 to 1; None once the episode is ended."""
+        asked = dict.fromkeys(self._down, 1.0)
+        if self._gamepad:
+            self.last = self._gamepad.ended() or self.last
+            asked = self._gamepad.pressed() | asked
+        return None if self.last in ENDS.values() else asked
 
     def show(self, env: BottleShakingEnv) -> None:
         """Draw, and wait a moment."""
@@ -170,14 +263,14 @@ class Window:
         self._plot.pause(0.5 / FPS)
 
 
-def record(n_episodes: int, seed: int) -> Iterator[Demonstration]:
+def record(window: Window, n_episodes: int, seed: int) -> Iterator[Demonstration]:
     """Episodes that were kept, with the bottle elsewhere in each."""
-    env, window = BottleShakingEnv(fps=FPS, render_mode="rgb_array"), Window()
+    env = BottleShakingEnv(fps=FPS, render_mode="rgb_array")
     kept = 0
     while kept < n_episodes and window.last != "escape":
         window.last = ""
-        one = episode(env, window.keys, seed, window.show)
-        if window.last in ("", "enter"):
+        one = episode(env, window.pressed, seed, window.show)
+        if window.last not in ("backspace", "escape"):
             yield one
             kept += 1
         seed += 1
@@ -188,9 +281,11 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path, help="of the data set; must not exist")
     parser.add_argument("--episodes", type=int, default=10, help="how many")
     parser.add_argument("--seed", type=int, default=0, help="of the first bottle")
+    parser.add_argument("--gamepad", action="store_true", help="listen to a gamepad, too")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    shown = list(record(options.episodes, options.seed))
+    window = Window(Gamepad() if options.gamepad else None)
+    shown = list(record(window, options.episodes, options.seed))
     if shown:
         save_lerobot(
             shown, options.folder, fps=FPS, task="teleoperated", robot_type="upper_body"
