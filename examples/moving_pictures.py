@@ -31,6 +31,7 @@ from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark, CarryBen
 from tpgmm_torch import Frame, Impedance, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.command import Command, Status
+from tpgmm_torch.plotting import BLUE, VERMILION
 
 #: File, task, condition of the environment, what happens.
 EPISODES = {
@@ -116,8 +117,8 @@ class Curves:
         above.plot((0, length), (0, length), color="0.8", linewidth=1)
         above.set(ylabel="progress [s]", ylim=(0, 1.05 * length), xlim=(0, seconds))
         below.set(ylabel="stiffness\n[N m/rad]", xlabel="time [s]", ylim=(0, 420))
-        self._lines = above.plot([], [], "k")[0], below.plot([], [], "tab:blue")[0]
-        self._status = above.text(0.02, 0.82, "", transform=above.transAxes, color="tab:red")
+        self._lines = above.plot([], [], "k")[0], below.plot([], [], color=BLUE)[0]
+        self._status = above.text(0.02, 0.82, "", transform=above.transAxes, color=VERMILION)
         self._points: list[tuple[float, float, float]] = []
 
     def __call__(self, time: float, command: Command) -> NDArray[np.uint8]:

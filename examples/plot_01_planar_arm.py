@@ -22,6 +22,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 
 # %%
 # The robot
@@ -113,27 +114,28 @@ print(f"20 new objects, missed by {np.median(misses):.2f} mm, at worst {max(miss
 # before. On the right the arm follows the path in a new situation. It ends less than 2 mm from
 # the object, wherever that is; more components make this smaller still.
 
+plt.style.use(STYLE)
 figure, (room, local, new) = plt.subplots(1, 3, figsize=(11, 3.9), layout="constrained")
 for demonstration in demonstrations:
     path = robot.state(demonstration.joints).position("tip")
     room.plot(*path[:, :2].T, color="0.3")
-    room.plot(*demonstration.frames["object"].position[:2], "o", color="tab:orange")
+    room.plot(*demonstration.frames["object"].position[:2], "o", color=ORANGE)
     local.plot(*demonstration.frames["object"].inverse_transform(path)[:, :2].T, color="0.3")
 for mean, covariance in zip(model.means_[0], model.covariances_[0], strict=True):
     spread, axes = torch.linalg.eigh(covariance[1:3, 1:3])
     angle = torch.linspace(0, 2 * torch.pi, 50, dtype=torch.float64)
     circle = 2 * torch.stack((angle.cos(), angle.sin()))
     contour = mean[1:3, None] + axes @ (spread.clamp(min=0).sqrt()[:, None] * circle)
-    local.fill(*contour, color="tab:green", alpha=0.3)
-local.plot(0, 0, "o", color="tab:orange")
+    local.fill(*contour, color=GREEN, alpha=0.3)
+local.plot(0, 0, "o", color=ORANGE)
 
 trajectory, situation = trajectories[0], situations[0]
 state = robot.state(trajectory.joints)
 for step in (0, 25, 32, 59):
     corners = [torch.zeros(3), *state.positions[step]]
-    new.plot(*torch.stack(corners)[:, :2].T, "o-", color="tab:blue", alpha=0.25 + step / 80)
-new.plot(*state.position("tip")[:, :2].T, color="tab:red")
-new.plot(*situation.frames["object"].position[:2], "o", color="tab:orange", markersize=10)
+    new.plot(*torch.stack(corners)[:, :2].T, "o-", color=BLUE, alpha=0.25 + step / 80)
+new.plot(*state.position("tip")[:, :2].T, color=VERMILION)
+new.plot(*situation.frames["object"].position[:2], "o", color=ORANGE, markersize=10)
 for axes, title in (
     (room, "demonstrations"),
     (local, "seen from the object"),

@@ -21,6 +21,7 @@ from tpgmm_torch import (
     RelativePosition,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.plotting import BLUE, SKY, STYLE, VERMILION
 
 # %%
 # Demonstrations
@@ -93,16 +94,18 @@ for name, chosen in operators.items():
 # boxes and sockets as axes, the curve that was wanted (dashed), and what each model makes of
 # it.
 
+plt.style.use(STYLE)
 figure, panels = plt.subplots(1, 3, figsize=(11, 4.2), layout="constrained")
-colors = {"both frames": "tab:red", "box alone": "tab:blue", "socket alone": "tab:green"}
+looks = {"both frames": (VERMILION, "-"), "box alone": (BLUE, "-."), "socket alone": (SKY, ":")}
 for number, axes in enumerate(panels):
     axes.plot(*situations[number].joints[:, :2].T, "k--", linewidth=1, label="wanted")
     for name, trajectories in results.items():
         path = trajectories[number].joints
-        axes.plot(*path[:, :2].T, color=colors[name], label=name)
+        color, line = looks[name]
+        axes.plot(*path[:, :2].T, color=color, linestyle=line, label=name)
     for place in situations[number].frames.values():
         ends = place.transform(0.12 * torch.eye(3, dtype=torch.float64))
-        for end, color in zip(ends[:2], ("tab:red", "tab:green"), strict=True):
+        for end, color in zip(ends[:2], (VERMILION, SKY), strict=True):
             corners = torch.stack((place.position, end))
             axes.plot(*corners[:, :2].T, color=color, linewidth=4, alpha=0.6)
     axes.set(title=f"new situation {number + 1}", xlabel="x [m]", ylabel="y [m]")

@@ -23,6 +23,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
+from tpgmm_torch.plotting import BLUE, SKY, STYLE, VERMILION
 
 # %%
 # A hand that turns, recorded by a tracker that flips signs
@@ -93,15 +94,16 @@ for name, error in errors.items():
 # differ by up to 17 degrees. As plain numbers the reproduction is off by more than 90 degrees
 # somewhere; as an orientation it stays within 10 degrees throughout.
 
+plt.style.use(STYLE)
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.6), layout="constrained")
 for axes, title in ((left, "what the tracker says"), (middle, "each made continuous")):
     axes.set(title=title, xlabel="time [s]", ylabel="w (black), x (red), y, z (blue)")
 for recording in recordings:
     smooth = quaternions.continuous(recording)
-    for part, color in enumerate(("black", "tab:red", "tab:green", "tab:blue")):
+    for part, color in enumerate(("black", VERMILION, SKY, BLUE)):
         left.plot(time, recording[:, part], color=color, linewidth=0.8)
         middle.plot(time, smooth[:, part], color=color, linewidth=0.8)
-for (name, error), color in zip(errors.items(), ("tab:gray", "tab:red"), strict=True):
+for (name, error), color in zip(errors.items(), ("0.5", VERMILION), strict=True):
     right.plot(time, error, color=color, label=f"taken for {name}")
 right.set(title="error of the reproduction", xlabel="time [s]", ylabel="degrees")
 right.legend(fontsize="small", loc="center left")
@@ -147,9 +149,9 @@ for geometry in ("quaternion", "tangent"):
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 for recording in far:
-    left.plot(time, between(recording, mean), color="tab:gray", linewidth=0.8)
+    left.plot(time, between(recording, mean), color="0.5", linewidth=0.8)
 left.set(title="recordings, from their mean", xlabel="time [s]", ylabel="degrees")
-for (geometry, error), color in zip(off.items(), ("tab:gray", "tab:red"), strict=True):
+for (geometry, error), color in zip(off.items(), ("0.5", VERMILION), strict=True):
     right.plot(time, error, color=color, label=f'geometry="{geometry}"')
 right.set(title="reproductions, from that mean", xlabel="time [s]", ylabel="degrees")
 right.legend(fontsize="small")

@@ -21,7 +21,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.plotting import plot_candidates
+from tpgmm_torch.plotting import STYLE, plot_candidates
 
 torch.set_num_threads(1)  # the matrices are small
 
@@ -76,6 +76,7 @@ for name, (start, end) in spans.items():
 # deviation, and the result in black. Below: the share of joint space. While the hands grasp,
 # almost nothing is asked for in joint space; while they shake, more than half.
 
+plt.style.use(STYLE)
 figure, (above, below) = plt.subplots(
     2, 1, figsize=(8, 6), sharex=True, height_ratios=(3, 1), layout="constrained"
 )

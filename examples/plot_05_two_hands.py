@@ -15,6 +15,7 @@ import torch
 
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import AbsolutePosition, Robot, Stack
+from tpgmm_torch.plotting import STYLE
 
 # %%
 # The Jacobian of both hands
@@ -35,6 +36,7 @@ hands = ("l_hand", "r_hand")
 state = robot.state(posture)
 stacked = torch.cat([state.linear_jacobian(hand) for hand in hands])
 
+plt.style.use(STYLE)
 figure, axes = plt.subplots(figsize=(8, 2.8), layout="constrained")
 image = axes.imshow(stacked.numpy(), cmap="RdBu", vmin=-0.4, vmax=0.4)
 axes.set_xticks(range(17), robot.joint_names, rotation=45, ha="right", fontsize="x-small")

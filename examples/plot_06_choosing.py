@@ -24,6 +24,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.metrics import make_scorer, reproduction_scorer
+from tpgmm_torch.plotting import STYLE
 
 # %%
 # Demonstrations
@@ -98,6 +99,7 @@ bic = [
 # are within 4 mm where the whole path is off by 20; the tray alone does as well, though it
 # is off by 92 along the path. With four the path already looks fair, and the hand misses by 23.
 
+plt.style.use(STYLE)
 figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 3.8), layout="constrained")
 errors, misses = {name: [] for name in sets}, {name: [] for name in sets}
 for row, parameters in enumerate(table["params"]):

@@ -27,6 +27,7 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import joint_rmse
+from tpgmm_torch.plotting import STYLE, VERMILION
 
 torch.set_num_threads(1)  # the matrices are small
 
@@ -89,12 +90,13 @@ print(
 
 moved = held_out.joints.amax(dim=0) - held_out.joints.amin(dim=0)
 most = moved.argsort(descending=True)[:5].tolist()
+plt.style.use(STYLE)
 figure, panels = plt.subplots(len(most), 1, figsize=(8, 8), sharex=True, layout="constrained")
 for axes, joint in zip(panels, most, strict=True):
     for demonstration in aligned:
         axes.plot(demonstration.time, demonstration.joints[:, joint], color="0.75")
     axes.plot(truth.time, truth.joints[:, joint], "k", label="left out")
-    axes.plot(trajectory.time, trajectory.joints[:, joint], color="tab:red", label="model")
+    axes.plot(trajectory.time, trajectory.joints[:, joint], color=VERMILION, label="model")
     axes.set_ylabel(f"{names[joint]} [rad]", fontsize="small")
 panels[0].legend(fontsize="small", loc="upper right")
 panels[-1].set_xlabel("time [s]")

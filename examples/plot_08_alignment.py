@@ -14,6 +14,7 @@ import torch
 
 from tpgmm_torch import Demonstration
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.plotting import STYLE
 
 # %%
 # Demonstrations out of step
@@ -66,6 +67,7 @@ for name, aligned in results.items():
 # begins at nearly the same instant everywhere. The demonstrations' spread about their mean
 # (black) falls to less than a fifth of what it is with time stretched.
 
+plt.style.use(STYLE)
 figure, panels = plt.subplots(2, 2, figsize=(10, 5.5), sharey=True, layout="constrained")
 for axes, (name, shown) in zip(
     panels.flat, {"as recorded": demonstrations, **results}.items(), strict=True

@@ -23,6 +23,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 # %%
 # Through a gate
@@ -104,20 +105,21 @@ print(f"spread of 200 samples over what the ellipses say: {ratio:.2f} (median ov
 # right their size over time. In the gate the model is more than three times surer than at the
 # end; nobody told it when the gate is passed.
 
+plt.style.use(STYLE)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")
 angle = torch.linspace(0, 2 * torch.pi, 60, dtype=torch.float64)
 circle = 2 * torch.stack((angle.cos(), angle.sin()))
 for step in range(0, len(time), 4):
     spread, axes = torch.linalg.eigh(covariance[step, :2, :2])
     contour = axes @ (spread.clamp(min=0).sqrt()[:, None] * circle)
-    left.fill(*(state.position("tip")[step, :2, None] + contour), color="tab:blue", alpha=0.25)
+    left.fill(*(state.position("tip")[step, :2, None] + contour), color=BLUE, alpha=0.25)
 for path in tips[:15]:
     left.plot(*path[:, :2].T, color="0.6", linewidth=0.5)
-left.plot(*state.position("tip")[:, :2].T, color="tab:red")
+left.plot(*state.position("tip")[:, :2].T, color=VERMILION)
 left.plot(*gate.position[:2], "x", color="black", markersize=9, label="gate")
 left.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
 left.legend()
-right.plot(time, 1e3 * deviation, color="tab:blue", label=r"$J \hat\Sigma J^\top$")
+right.plot(time, 1e3 * deviation, color=BLUE, label=r"$J \hat\Sigma J^\top$")
 right.plot(time, 1e3 * seen, "--", color="0.3", label="200 samples")
 right.axvline(1.0, color="black", linewidth=0.8)
 right.set(xlabel="time [s]", ylabel="standard deviation of the tip [mm]", ylim=(0, None))

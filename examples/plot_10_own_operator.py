@@ -25,6 +25,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.plotting import STYLE, VERMILION
 
 # %%
 # The operator
@@ -144,14 +145,13 @@ for name, operators in sets.items():
 # shows three of them from above; in the first second the start posture leads into the model's
 # reference, across the circle if need be.
 
+plt.style.use(STYLE)
 figure, panels = plt.subplots(1, 3, figsize=(10, 3.8), layout="constrained")
 for number, axes in enumerate(panels):
     centre = situations[number].frames["post"].position[:2]
     axes.add_patch(plt.Circle(centre, RADIUS, fill=False, linestyle="--", color="0.5"))
     axes.plot(*centre, "ko", markersize=8)
-    for (name, trajectories), color in zip(
-        results.items(), ("tab:gray", "tab:red"), strict=True
-    ):
+    for (name, trajectories), color in zip(results.items(), ("0.5", VERMILION), strict=True):
         path = robot.state(trajectories[number].joints).position("l_hand")
         axes.plot(*path[:, :2].T, color=color, label=name)
         axes.plot(*path[0, :2], "o", color=color, markersize=4)

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from tpgmm_torch import Demonstration, Frame, OperatorSelection, Poses, TaskParameterizedGMM
-from tpgmm_torch.plotting import plot_relevance
+from tpgmm_torch.plotting import STYLE, plot_relevance
 
 # %%
 # Demonstrations
@@ -62,6 +62,7 @@ print(selection.report())
 # The cup decides while the hand rests at it, the tray at the end. What stands below the line
 # was dropped.
 
+plt.style.use(STYLE)
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 plot_relevance(axes, selection)
 plt.show()

@@ -22,7 +22,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.plotting import plot_parts
+from tpgmm_torch.plotting import STYLE, plot_parts
 
 # %%
 # Demonstrations
@@ -68,6 +68,7 @@ print(segmentation.report())
 off = np.abs(segmentation.boundaries_ - true).max()
 print(f"off by {off:.2f} s at most")
 
+plt.style.use(STYLE)
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 plot_parts(axes, segmentation, demonstrations)
 plt.show()

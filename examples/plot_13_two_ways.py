@@ -22,6 +22,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.plotting import BLUE, ORANGE, SKY, STYLE, VERMILION
 
 # %%
 # Demonstrations
@@ -96,8 +97,9 @@ for name, one in (("single model", single), ("two modes", model)):
 # On the left the demonstrations as they are divided, seen from the obstacle. On the right a new
 # situation: the single model goes through, each mode goes around it.
 
+plt.style.use(STYLE)
 figure, (shown, new) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-colors = ("tab:blue", "tab:green")  # of the two modes
+colors = (BLUE, SKY)  # of the two modes
 for demonstration, label in zip(demonstrations, model.labels_, strict=True):
     path = demonstration.joints - demonstration.frames["obstacle"].position
     shown.plot(*path[:, :2].T, color=colors[label], alpha=0.7)
@@ -107,8 +109,8 @@ for mode, color in zip(model.models_, colors, strict=True):
     [trajectory] = mode.predict(situation)
     new.plot(*trajectory.joints[:, :2].T, color=color, label="one mode")
 [trajectory] = single.predict(situation)
-new.plot(*trajectory.joints[:, :2].T, color="tab:red", linestyle="--", label="single model")
-new.plot(*goal[:2], "*", color="tab:orange", markersize=12)
+new.plot(*trajectory.joints[:, :2].T, color=VERMILION, linestyle="--", label="single model")
+new.plot(*goal[:2], "*", color=ORANGE, markersize=12)
 for axes, middle in ((shown, (0, 0)), (new, obstacle[:2])):
     axes.add_patch(plt.Circle(middle, 0.06, color="0.6"))
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")

@@ -15,6 +15,7 @@ import numpy as np
 
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoint
 from tpgmm_torch.corrections import in_skill_time
+from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 # %%
 # A skill of one joint
@@ -62,16 +63,17 @@ print("demonstrations that count:", corrected.demonstration_weights_.tolist())
 # -----------
 # Bands are one standard deviation: at the via-point there is none left.
 
+plt.style.use(STYLE)
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
 for axis, bent, title in zip(axes, (through, after), ("via-point", "correction"), strict=True):
-    for one, colour, label in ((before, "tab:gray", "before"), (bent, "tab:blue", title)):
+    for one, colour, label in ((before, "0.5", "before"), (bent, BLUE, title)):
         mean, std = one.joints[:, 0], one.covariance[:, 0, 0].sqrt()
         axis.plot(time, mean, color=colour, label=label)
         axis.fill_between(time, mean - std, mean + std, color=colour, alpha=0.2)
     axis.set(title=title, xlabel="time [s]")
-axes[0].plot(2.0, 0.5, "o", color="tab:red")
+axes[0].plot(2.0, 0.5, "o", color=VERMILION)
 for one in placed:
-    axes[1].plot(one.time, one.joints[:, 0], "--", color="tab:red", linewidth=1)
+    axes[1].plot(one.time, one.joints[:, 0], "--", color=VERMILION, linewidth=1)
 axes[0].set_ylabel("joint [rad]")
 axes[1].legend()
 plt.show()

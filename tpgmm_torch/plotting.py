@@ -40,6 +40,7 @@ __all__ = [
 
 #: Colours of Okabe and Ito, which readers with any kind of colour vision tell apart.
 BLUE, GREEN, PURPLE, SKY, VERMILION = "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"
+ORANGE = "#E69F00"
 DEMONSTRATION, REPRODUCTION, COMPONENT = "0.15", VERMILION, GREEN
 #: Colour and line of each operator; in grey print, lines differ where colours do not.
 OPERATORS = (
@@ -49,9 +50,11 @@ OPERATORS = (
     (SKY, (0, (5, 1))),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1))),
 )
-#: What matplotlib's settings are while :func:`figure` and :func:`save` are at work.
+#: What matplotlib's settings are while :func:`figure` and :func:`save` are at work; for other
+#: pictures beside them, ``matplotlib.style.use(STYLE)``.
 STYLE: dict[str, Any] = {
     "axes.labelsize": 9,
+    "axes.prop_cycle": f"cycler(color={[BLUE, VERMILION, SKY, GREEN, PURPLE, ORANGE, '0.1']})",
     "font.size": 9,
     "legend.fontsize": 8,
     "legend.handlelength": 3.5,  # a whole period of every line

@@ -10,8 +10,11 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+from matplotlib import rc_context
 from sphinx.application import Sphinx
 from sphinx.util import logging
+
+from tpgmm_torch.plotting import STYLE
 
 __all__ = ["draw_all", "setup"]
 
@@ -37,7 +40,8 @@ def draw_all(out: Path) -> list[str]:
         if not hasattr(module, "draw"):
             continue
         if not stamp.exists() or stamp.stat().st_mtime < newest:
-            module.draw(out)
+            with rc_context(STYLE):
+                module.draw(out)
             stamp.touch()
             drawn.append(path.stem)
     return drawn

@@ -13,6 +13,7 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import largest_acceleration
+from tpgmm_torch.plotting import ORANGE
 
 __all__ = ["draw"]
 
@@ -54,7 +55,7 @@ def draw(out: Path) -> None:
         panels, titles, information, zip(*covariance, strict=True), strict=True
     ):
         axes.axhline(right, color="black", label="information form")
-        axes.plot(EPSILONS, printed, "o-", color="tab:orange", label="covariance form")
+        axes.plot(EPSILONS, printed, "o-", color=ORANGE, label="covariance form")
         axes.set(xscale="log", yscale="log", title=title, xlabel=r"$\epsilon$ [rad²]")
         axes.grid(which="major", color="0.9")
     panels[0].legend()

@@ -161,6 +161,23 @@ def test_the_gallery_has_the_examples_that_are_checked_here():
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
+def test_a_picture_of_the_gallery_is_in_the_one_style(script):
+    text = (FOLDER / script).read_text(encoding="utf-8")
+    assert text.index("plt.style.use(STYLE)") < text.index("plt.subplots(")
+
+
+@pytest.mark.parametrize(
+    "folder", ["examples", "docs/pictures", "tpgmm_torch", "datasets", "policies"]
+)
+def test_no_picture_has_colours_of_matplotlib(folder):
+    for path in (FOLDER.parent / folder).rglob("*.py"):
+        found = re.findall(
+            r"""["'](?:tab:\w+|C\d|red|green|blue)["']""", path.read_text("utf-8")
+        )
+        assert not found, f"{path.name}: {found}; take those of tpgmm_torch.plotting"
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
 def test_an_example_draws_and_its_text_is_true(script, pyplot, monkeypatch):
     figures, holds = CLAIMS[script]
     variables = run(script, monkeypatch)

@@ -18,14 +18,14 @@ from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
 from lerobot_policy_tpgmm.evaluation.report.significance import REFERENCE
 from lerobot_policy_tpgmm.evaluation.report.tables import wilson
-from tpgmm_torch.plotting import BLUE, GREEN, PURPLE, SKY, STYLE, VERMILION, save
+from tpgmm_torch.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION, save
 
 __all__ = ["draw_conditions", "draw_curves", "draw_errors", "draw_success"]
 
 #: What is written of each figure: vectors for print, and something small for pages.
 FORMATS = (".pdf", ".webp")
 #: Colours of the families of policies beside TP-GMM: Okabe and Ito's, black and grey.
-COLOURS = (BLUE, GREEN, PURPLE, SKY, "#E69F00", "0.1", "0.55")
+COLOURS = (BLUE, GREEN, PURPLE, SKY, ORANGE, "0.1", "0.55")
 #: Markers and lines differ too, for readers without colours.
 MARKERS = "s^DvPX<>ph*d"
 LINES = ("--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)))
