@@ -81,7 +81,7 @@ sphinx_gallery_conf = {
     "abort_on_example_error": False,
     "only_warn_on_example_error": False,
     "capture_repr": (),
-    "first_notebook_cell": notebooks.FIRST_CELL,
+    "first_notebook_cell": notebooks.first_cell(notebooks.repository()),
     "image_scrapers": ("matplotlib",),
     "remove_config_comments": True,
     "show_memory": False,

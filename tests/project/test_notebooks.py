@@ -6,10 +6,13 @@ import re
 import sys
 from copy import deepcopy
 from pathlib import Path
+from urllib.parse import unquote
 
 import nbformat
 import pytest
+from IPython.core.interactiveshell import InteractiveShell
 from nbclient import NotebookClient
+from sphinx.application import Sphinx
 from sphinx_gallery.gen_gallery import DEFAULT_GALLERY_CONF
 from sphinx_gallery.notebook import jupyter_notebook
 from sphinx_gallery.py_source_parser import split_code_and_text_blocks
@@ -38,7 +41,9 @@ def extension(monkeypatch):
 
 def converted(script: Path, extension) -> nbformat.NotebookNode:
     """A script as a notebook, by the gallery's own converter."""
-    settings = deepcopy(DEFAULT_GALLERY_CONF) | {"first_notebook_cell": extension.FIRST_CELL}
+    settings = deepcopy(DEFAULT_GALLERY_CONF) | {
+        "first_notebook_cell": extension.first_cell(None)
+    }
     _, cells = split_code_and_text_blocks(script)
     text = json.dumps(jupyter_notebook(cells, settings, script.parent))
     return nbformat.reads(text, as_version=4)
@@ -66,9 +71,64 @@ def test_a_notebook_runs_and_shows_a_picture(name, extension, tmp_path, monkeypa
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 def test_a_notebook_can_be_read(script, extension):
     install, title, *cells = converted(script, extension).cells
-    assert install.source.splitlines()[-1] == "# %pip install 'tpgmm-torch[cli]'"
+    assert install.source.splitlines()[-1] == "# %pip install --quiet 'tpgmm-torch[cli]'"
     assert title.source.strip().startswith("# ")
     texts = [cell.source for cell in (title, *cells) if cell.cell_type == "markdown"]
     assert sum(text.strip().startswith("## ") for text in texts) >= 2
     for text in texts:
         assert not re.search(r":[a-z]+:`|^\.\. |^[-=]{4,}$", text, re.MULTILINE), text
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    """Builds a site of one page of the gallery and another one, as from a public repository."""
+    source = tmp_path / "docs"
+    (source / "gallery").mkdir(parents=True)
+    (source / "conf.py").write_text("extensions = ['notebooks']\n")
+    (source / "index.rst").write_text("Home\n====\n\n.. toctree::\n\n   gallery/plot_arm\n")
+    (source / "gallery" / "plot_arm.rst").write_text("Arm\n===\n\nOf two links.\n")
+    (source / "gallery" / "plot_arm.ipynb").write_text("{}")
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    monkeypatch.setattr("sphinx_gallery.notebook.rst2md", None)  # the extension replaces it
+
+    def build(address: str | None) -> Path:
+        if address is None:
+            monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
+        else:
+            monkeypatch.setenv("GITHUB_REPOSITORY", address)
+        out = tmp_path / f"html-{address is None}"
+        Sphinx(source, source, out, tmp_path / "doctrees", "html", status=None).build()
+        return out
+
+    return build
+
+
+def test_buttons_open_what_the_site_publishes(site):
+    out = site("someone/tpgmm")
+    page = (out / "gallery" / "plot_arm.html").read_text()
+    links = re.findall(r'<a class="btn[^"]*" href="([^"]+)">Open in (\w+)</a>', page)
+    assert [service for _, service in links] == ["Colab", "Binder", "Kaggle"]
+    for address, _ in links:
+        opened = unquote(address)
+        assert "someone/tpgmm" in opened and "gh-pages" in opened
+        assert (out / re.search(r"notebooks/\w+\.ipynb$", opened)[0]).is_file()
+    assert "Open in" not in (out / "index.html").read_text()
+    assert (
+        "git+https://github.com/someone/tpgmm"
+        in (out / "binder" / "requirements.txt").read_text()
+    )
+
+
+def test_without_a_public_address_there_are_no_buttons(site):
+    out = site(None)
+    assert "Open in" not in (out / "gallery" / "plot_arm.html").read_text()
+    assert not (out / "notebooks").exists()
+
+
+def test_a_hosted_notebook_installs_itself_only_where_it_is_not_installed(extension):
+    cell = extension.first_cell("someone/tpgmm")
+    ran = InteractiveShell.instance().run_cell(cell)
+    ran.raise_error()
+    assert cell.splitlines()[-1].strip() == (
+        "%pip install --quiet 'tpgmm-torch[cli] @ git+https://github.com/someone/tpgmm'"
+    )
