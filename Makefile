@@ -22,7 +22,7 @@ WORKERS ?= 2
 METAWORLD := .venv-metaworld
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
 
-.PHONY: help demo compare evidence conditions metaworld bench test fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare evidence conditions metaworld bench test oldest newest fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -62,6 +62,12 @@ oldest: ## Run the tests of the core with the oldest versions promised, in .venv
 	    --continue-on-collection-errors -o filterwarnings=default \
 	    --ignore tests/tpgmm_torch/viewing/test_rerun_recording.py --ignore tests/tpgmm_datasets/app \
 	    --ignore tests/tpgmm_datasets/lerobot/test_calibration.py $(PYTEST_ARGS)
+
+newest: ## Run the tests with the newest versions that are allowed, in .venv-newest
+	$(firstword $(wildcard $(BIN)/python) python3) -m venv .venv-newest
+	.venv-newest/bin/python -m pip install --disable-pip-version-check --upgrade \
+	    --upgrade-strategy eager '.[test]' './policies[test]'
+	OMP_NUM_THREADS=1 .venv-newest/bin/python -m pytest -n 2 -o filterwarnings=default $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
 	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
