@@ -25,6 +25,7 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.motion.trajectory_generator import Seconds
 from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.regression.conditioning import Conditioning
@@ -42,6 +43,9 @@ PUSH_MEMORY = 0.5
 #: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
 #: another one for each size, ends there, before whoever follows enlarges it.
 GRID = 2.0**32
+
+#: What passes for a robot whose time did not increase, and which is held [s].
+INSTANT = 1e-6
 
 _Joints = TypeVar("_Joints", Tensor, Tensor | None)
 
@@ -153,6 +157,7 @@ class Controller:
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
             self._position_bounds = low / GRID, high / GRID
         self._search, self._via = PostureSearch(), via
+        self._late: Tensor | None = None  # robots whose time did not increase in this tick
         self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
         self._gap_before: NDArray[np.float64] | None = None  # reference and robot, last tick
@@ -188,8 +193,9 @@ class Controller:
         Parameters
         ----------
         dt : float or Tensor of shape (...)
-            Seconds since the last step. The first step is at the beginning, whatever it is. A
-            robot whose time did not increase is held for this step.
+            Seconds since the last step, for all robots or of each one. The first step is at
+            the beginning, whatever it is. A robot whose time did not increase is held for this
+            step.
         joints : array-like of shape (..., n_joints), optional
             Where the robots stand [rad].
         frames : mapping of str to Frame, optional
@@ -210,23 +216,28 @@ class Controller:
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
         """
-        last = self.command
-        passed: float | Tensor = dt
-        if isinstance(dt, Tensor):  # the follower has one time step for all
-            increased = (dt > 0) & dt.isfinite()
-            passed = torch.where(increased, dt, 0.0).double()
-            dt = float(dt[increased].median()) if bool(increased.any()) else 0.0
-        if last is not None and not 0 < dt < math.inf:
-            return self._refuse(last, f"time did not increase: dt = {dt} s")
-        measured, halted = self._hear(dt, joints, frames, ages)
+        last, self._late = self.command, None
+        seconds: Seconds
+        if isinstance(dt, Tensor):
+            seconds, late = _durations(dt)
+            self._late = None if last is None else late
+        else:
+            seconds = dt
+        nothing = not isinstance(seconds, np.ndarray) and not 0 < seconds < math.inf
+        if last is not None and nothing:
+            return self._refuse(last, f"time did not increase: dt = {seconds} s")
+        measured, halted = self._hear(seconds, joints, frames, ages)
         before = self._progress
+        if last is not None and self._trust is not None:
+            seconds = np.minimum(seconds, self._trust.longest_step)
+        passed = _of_each(seconds, torch.float64)
+        for robots in (halted, self._late):
+            if robots is not None:
+                going = torch.as_tensor(passed, dtype=torch.float64)
+                passed = torch.where(robots, 0.0, going)
         if last is not None:
-            if self._trust is not None and dt > self._trust.longest_step:
-                passed = dt = self._trust.longest_step
-            if halted is not None:
-                passed = torch.where(halted, 0.0, torch.as_tensor(passed, dtype=torch.float64))
             holding = self.holding
-            away = None if measured is None else self._driven_away(measured, dt)
+            away = None if measured is None else self._driven_away(measured, seconds)
             observed = Observation(
                 self._unbent(measured), self._unbent(self._asked), None,
                 holding.frames, last.estimate,
@@ -244,7 +255,7 @@ class Controller:
         if last is not None and bool((time >= self._end).any()):
             ended = (time >= self._end) & (before.time >= self._end)
             if bool(ended.all()):  # nothing more is asked: the follower comes to rest
-                return self._send(last.estimate, self._wanted, dt, halted, ended)
+                return self._send(last.estimate, self._wanted, seconds, halted, ended)
         at = self.reference
         if self._measured_feedback and measured is not None:
             at = torch.where(measured.isnan(), at, measured)
@@ -253,20 +264,21 @@ class Controller:
         if self._inputs is not None and self._inputs.poses and not told:
             known = {hold.frame for hold in self.holding.holds}  # from when to when
             self._watch, self.holding, seen = self._watch.look(
-                self._inputs.poses.keys() - known, self._frames, stands, self.holding, dt
-            )
+                self._inputs.poses.keys() - known, self._frames, stands, self.holding,
+                _of_each(seconds, stands),
+            )  # fmt: skip
         self.holding = self.holding.advance(time, stands, seen, told)
         at = self._unbent(at)
         estimate = self._estimated(time, at)
         if self._via is not None:
             estimate, self._via = self._conditioned(time, estimate)
-        shift = self._fade(estimate.joints, 0.0 if last is None else dt)
+        shift = self._fade(estimate.joints, 0.0 if last is None else seconds)
         wanted = self._shifted(estimate.joints, shift)
         # robots that via-points lead are late for another reason than what is searched for
         bent = self._via is not None and self._via.shift is not None
         following = self._follower is not None and last is not None and not bent
-        if following and not self._follows(wanted, dt):
-            wanted = self._shifted(self._searched(time, at, estimate, wanted, dt), shift)
+        if following and not self._follows(wanted, seconds):
+            wanted = self._shifted(self._searched(time, at, estimate, wanted, seconds), shift)
         if last is not None and ended is not None and bool(ended.any()):
             # for them it is as if all had come to the end
             wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
@@ -276,7 +288,7 @@ class Controller:
             waits = (time - before.time < STANDS * passed).expand(self._led.shape)
             waits = waits if ended is None else waits & ~ended
             goal = self._leading(estimate.joints, wanted, measured, waits)
-        return self._send(estimate, wanted, dt, halted, ended, goal)
+        return self._send(estimate, wanted, seconds, halted, ended, goal)
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
@@ -329,7 +341,7 @@ class Controller:
 
     def _hear(
         self,
-        dt: float,
+        dt: Seconds,
         joints: Any,
         frames: Mapping[str, Any] | None,
         ages: Mapping[str, float] | None,
@@ -346,7 +358,7 @@ class Controller:
 
     def _told(
         self,
-        dt: float,
+        dt: Seconds,
         joints: Any,
         frames: Mapping[str, Any] | None,
         ages: Mapping[str, float] | None,
@@ -355,7 +367,7 @@ class Controller:
             if frames is not None:
                 self._frames = self._converted(frames)
             return self._checked(joints), None
-        dt = dt if self.command else max(dt, 1e-3)
+        dt = dt if self.command else np.maximum(dt, 1e-3)
         self._inputs = inputs = self._inputs.hear(dt, joints, frames, ages)
         self._frames = inputs.frames
         untrusted = inputs.untrusted()
@@ -371,7 +383,7 @@ class Controller:
         rounded = (joints.detach() * GRID).round() / GRID
         return joints + (rounded - joints).detach() if joints.requires_grad else rounded
 
-    def _follows(self, wanted: Tensor, dt: float) -> bool:
+    def _follows(self, wanted: Tensor, dt: Seconds) -> bool:
         """Whether all robots can be where they are wanted, as in an ordinary tick."""
         if self._search.active is not None or self._follower is None:
             return False
@@ -379,7 +391,7 @@ class Controller:
         return self._taken is not None
 
     def _searched(
-        self, time: Tensor, at: Tensor, estimate: Estimate, wanted: Tensor, dt: float
+        self, time: Tensor, at: Tensor, estimate: Estimate, wanted: Tensor, dt: Seconds
     ) -> Tensor:
         """What is wanted where one step of the linearised product leads too far."""
         assert self._follower is not None and self._position_bounds is not None
@@ -450,7 +462,7 @@ class Controller:
             activation[index] = estimate.activation
         return Estimate(joints, covariance, activation)
 
-    def _driven_away(self, measured: Tensor, dt: float) -> Tensor | None:
+    def _driven_away(self, measured: Tensor, dt: Seconds) -> Tensor | None:
         """Robots that somebody else has moved from their references; None if there is none.
 
         A robot that is slow, or stopped, is left behind as fast as its reference moves; one
@@ -467,8 +479,9 @@ class Controller:
             return None
         if unknown.any():
             gap = np.where(unknown, before, gap)
-        kept = self._pushed * max(0.0, 1 - dt / PUSH_MEMORY)
-        pushed = np.maximum(kept + gap - before - speed * dt, 0.0)
+        each = dt[..., None] if isinstance(dt, np.ndarray) else dt
+        kept = self._pushed * np.maximum(0.0, 1 - each / PUSH_MEMORY)
+        pushed = np.maximum(kept + gap - before - speed * each, 0.0)
         far = (gap > trust.largest_gap + trust.lag * speed) | (pushed > trust.largest_push)
         self._gap_before, self._pushed = gap, pushed
         if not far.any():
@@ -533,7 +546,7 @@ class Controller:
         self._since = torch.where(robots, -1.0, self._since)  # their gap is not known yet
         self._fading = self._blend > 0
 
-    def _fade(self, estimate: Tensor, dt: float) -> Tensor | None:
+    def _fade(self, estimate: Tensor, dt: Seconds) -> Tensor | None:
         """What is left of the difference between where robots went on and the estimate."""
         if not self._fading:
             return None
@@ -541,7 +554,7 @@ class Controller:
         if bool(fresh.any()):
             gap = self.reference - estimate
             self._gap = torch.where(fresh.unsqueeze(-1), gap.nan_to_num(0.0), self._gap)
-        self._since = torch.where(fresh, 0.0, self._since + dt)
+        self._since = torch.where(fresh, 0.0, self._since + _of_each(dt, estimate))
         left = 1 - minimum_jerk(self._since / self._blend)
         self._fading = bool((left > 0).any())
         return left.unsqueeze(-1) * self._gap
@@ -550,7 +563,7 @@ class Controller:
         self,
         estimate: Estimate,
         wanted: Tensor,
-        dt: float,
+        dt: Seconds,
         halted: Tensor | None,
         ended: Tensor | None,
         goal: Tensor | None = None,
@@ -558,23 +571,28 @@ class Controller:
         """The command that brings robots to where they are wanted, or are led."""
         last, self._wanted, lost = self.reference, wanted, None
         wanted = wanted if goal is None else goal
+        each = _of_each(dt, last)
+        each = each.unsqueeze(-1) if isinstance(each, Tensor) else each
         if self._bounds is None:
-            if halted is not None:
-                wanted = torch.where(halted.unsqueeze(-1), last, wanted)
+            for still in (halted, self._late):
+                if still is not None:
+                    wanted = torch.where(still.unsqueeze(-1), last, wanted)
             if self.command is not None:
-                self._velocity = (wanted - last) / dt
+                self._velocity = (wanted - last) / each
             self.reference = wanted
         elif self.command is not None:  # the first reference is where robots stand
             if halted is not None:  # what is not finite brings a robot to rest
                 wanted = torch.where(halted.unsqueeze(-1), torch.nan, wanted)
             if self._follower is None:
                 fastest = self._bounds.velocity
-                moving = ((wanted - last) / dt).clamp(-fastest, fastest)
+                moving = ((wanted - last) / each).clamp(-fastest, fastest)
                 self._follower = Follower.at(self._bounds, last, moving)
-            follower, self._taken = self._taken, None
+            before, (follower, self._taken) = self._follower, (self._taken, None)
             if follower is None or follower.reference is not wanted:
                 follower = self._follower.advance(wanted, dt)
                 lost = ~wanted.isfinite().all(-1)  # and is brought to rest
+            if self._late is not None:
+                follower = follower.undone(self._late, before)
             self._follower = follower
             self.reference, self._velocity = follower.reference, follower.velocity
         # who is led or was brought elsewhere is not where it should be, however near its
@@ -593,6 +611,10 @@ class Controller:
             codes = torch.where(lost, Status.HOLDING.code, codes)
             robots = map(tuple, np.argwhere(lost.numpy(force=True)).tolist())
             reasons = dict.fromkeys(robots, "the model has no finite answer here")
+        if self._late is not None:
+            codes = torch.where(self._late, Status.HOLDING.code, codes)
+            late = map(tuple, np.argwhere(self._late.numpy(force=True)).tolist())
+            reasons = {**reasons, **dict.fromkeys(late, "time did not increase")}
         if halted is not None and self._inputs is not None:
             codes = torch.where(halted, Status.HOLDING.code, codes)
             reasons = {**reasons, **self._inputs.reasons(halted.numpy(force=True))}
@@ -615,6 +637,23 @@ class Controller:
         return functools.partial(
             _ratio, self._novelty, self._start, self.holding.frames, self._at_first
         )
+
+
+def _of_each(seconds: Seconds, like: Tensor | torch.dtype) -> float | Tensor:
+    """A tensor, if each robot has a duration of its own."""
+    return torch.as_tensor(seconds).to(like) if isinstance(seconds, np.ndarray) else seconds
+
+
+def _durations(dt: Tensor) -> tuple[Seconds, Tensor | None]:
+    """Of the tick, of each robot or of all, and the robots whose time did not increase."""
+    increased = (dt > 0) & dt.isfinite()
+    seconds = torch.where(increased, dt, INSTANT).double().numpy(force=True)
+    if not bool(increased.any()):
+        return 0.0, None
+    if bool(increased.all()):
+        first = float(seconds.flat[0])
+        return (first if (seconds == first).all() else seconds), None
+    return seconds, ~increased
 
 
 def _ratio(

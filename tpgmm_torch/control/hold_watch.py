@@ -41,7 +41,7 @@ class Rest:
         Where the robots stood when it rested last [rad or m].
     away : Tensor of shape (...)
         For how long it is far from where its link would have it [s].
-    since : float
+    since : float or Tensor of shape (...)
         The last look at that [s].
     """
 
@@ -49,7 +49,7 @@ class Rest:
     pose: Frame
     joints: Tensor
     away: Tensor
-    since: float = 0.0
+    since: float | Tensor = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class HoldWatch:
         frames: Mapping[str, Frame],
         joints: Tensor,
         holding: Holding,
-        dt: float,
+        dt: float | Tensor,
     ) -> tuple[Self, Holding, dict[str, Frame]]:
         """What is held after one more look, and where objects are taken to be.
 
@@ -95,7 +95,7 @@ class HoldWatch:
             Where the robots stand [rad or m].
         holding : Holding
             What is known to be held.
-        dt : float
+        dt : float or Tensor of shape (...)
             Since the last look [s].
         """
         rests, found, places = dict(self.rests), self.found, dict(frames)
@@ -107,8 +107,9 @@ class HoldWatch:
                 rest = replace(rest, seen=seen, since=rest.since + dt)
                 rest, holding, taken = self._taken(name, rest, joints, holding, dt)
                 found = found | {name} if taken else found
-                if name in found and rest.since >= LOOK:
-                    rest, holding = self._lost(name, rest, joints, holding)
+                due = rest.since >= LOOK
+                if name in found and (due if isinstance(due, bool) else bool(due.any())):
+                    rest, holding = self._lost(name, rest, joints, holding, due)
                 rests[name], places[name] = rest, rest.pose
             elif rest.pose is seen:  # it has not moved
                 rests[name] = replace(rest, joints=joints)
@@ -117,7 +118,7 @@ class HoldWatch:
         return replace(self, rests=rests, found=found), holding, places
 
     def _taken(
-        self, name: str, rest: Rest, joints: Tensor, holding: Holding, dt: float
+        self, name: str, rest: Rest, joints: Tensor, holding: Holding, dt: float | Tensor
     ) -> tuple[Rest, Holding, bool]:
         """Whether a link has taken an object along, or somebody else has moved it."""
         moved = rest.pose.change(rest.seen, MOVED, TURNED)
@@ -142,25 +143,29 @@ class HoldWatch:
                 where = held & (holder == index)
                 if bool(where.any()):
                     holding = holding.taken(name, index, where, rest.pose, grasp)
-        share = torch.where(settles, min(1.0, dt / SETTLING), elsewhere.to(moved))
+        settled = dt / SETTLING
+        settled = settled.clamp(max=1.0) if isinstance(settled, Tensor) else min(1.0, settled)
+        share = torch.where(settles, settled, elsewhere.to(moved))
         stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
         pose = _between(rest.pose, rest.seen, share)
         return replace(rest, pose=pose, joints=stood), holding, bool(held.any())
 
     def _lost(
-        self, name: str, rest: Rest, joints: Tensor, holding: Holding
+        self, name: str, rest: Rest, joints: Tensor, holding: Holding, due: bool | Tensor
     ) -> tuple[Rest, Holding]:
-        """Let go what is not where its link would have it."""
+        """Let go what is not where its link would have it, of robots that are due."""
         carried = holding.carried(name, self.kinematics.state(joints))
+        due = torch.as_tensor(due, device=joints.device)
         far = ~holding.free(name, rest.away)
         far = far & (carried.change(rest.seen, LOST, LOST_TURN) >= 1)
-        away = torch.where(far, rest.away + rest.since, 0.0)
-        lost = away >= LOST_TIME
+        away = torch.where(due, torch.where(far, rest.away + rest.since, 0.0), rest.away)
+        lost = due & (away >= LOST_TIME)
         if bool(lost.any()):
             holding = holding.advance(0.0, joints, {name: rest.seen}, {name: None}, lost)
         pose = choose(lost, rest.seen, rest.pose)
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
-        return replace(rest, pose=pose, joints=stood, away=away, since=0.0), holding
+        since = rest.since.masked_fill(due, 0.0) if isinstance(rest.since, Tensor) else 0.0
+        return replace(rest, pose=pose, joints=stood, away=away, since=since), holding
 
 
 def _between(one: Frame, other: Frame, share: Tensor) -> Frame:

@@ -43,7 +43,12 @@ from torch import Tensor
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.motion.trajectory_generator import Motion, first_part, stopping_range
+from tpgmm_torch.motion.trajectory_generator import (
+    Motion,
+    Seconds,
+    first_part,
+    stopping_range,
+)
 
 __all__ = ["Follower"]
 
@@ -134,15 +139,15 @@ class Follower:
         """Of the reference [rad/s^2 or m/s^2], shape (..., n_joints)."""
         return torch.from_numpy(self.moment.motion.acceleration).to(self.reference)
 
-    def take(self, wanted: Tensor, dt: float) -> Self | None:
+    def take(self, wanted: Tensor, dt: Seconds) -> Self | None:
         """The wanted posture as the reference, where that is within bounds for all robots.
 
         Parameters
         ----------
         wanted : Tensor of shape (..., n_joints)
             At the end of this tick.
-        dt : float
-            Duration of the tick [s].
+        dt : float or ndarray of shape (...)
+            Duration of the tick, for all robots or of each one [s].
 
         Returns
         -------
@@ -150,7 +155,7 @@ class Follower:
             None if a joint of a robot cannot follow.
         """
         moment, raw = self.moment, as_array(wanted)
-        exact = moment.taken(raw, dt)
+        exact = moment.taken(raw, _column(dt))
         # bytes are sooner looked at than an array of bool
         certain = (
             moment.behind is None and b"\0" not in moment.measured(exact, self.bounds).tobytes()
@@ -159,10 +164,10 @@ class Follower:
             return None
         return type(self)(self.bounds, wanted, exact)
 
-    def fits(self, wanted: Tensor, dt: float) -> Tensor:
+    def fits(self, wanted: Tensor, dt: Seconds) -> Tensor:
         """Which robots :meth:`take` would serve: bool of shape (...)."""
         raw = as_array(wanted)
-        fits = self._serves(raw, self.moment.taken(raw, dt)).all(-1)
+        fits = self._serves(raw, self.moment.taken(raw, _column(dt))).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
 
     def _serves(self, wanted: Array, exact: Moment) -> Mask:
@@ -171,7 +176,7 @@ class Follower:
         within = (wanted >= limits.lower) & (wanted <= limits.upper)
         return within & self.moment.allows(exact, self.bounds)
 
-    def advance(self, wanted: Tensor, dt: float) -> Self:
+    def advance(self, wanted: Tensor, dt: Seconds) -> Self:
         """The next reference: what is wanted where it can be followed, else towards it.
 
         Parameters
@@ -179,20 +184,20 @@ class Follower:
         wanted : Tensor of shape (..., n_joints)
             At the end of this tick. What lies beyond the limits of position is wanted at them;
             a joint of which it is not finite comes to rest.
-        dt : float
-            Duration of the tick [s].
+        dt : float or ndarray of shape (...)
+            Duration of the tick, for all robots or of each one [s].
 
         Raises
         ------
         DataError
             If ``dt`` is not positive.
         """
-        if not 0 < dt < np.inf:
+        if not np.all((dt > 0) & (dt < np.inf)):
             raise DataError(f"a tick takes a positive number of seconds, got dt={dt}")
         moment, bounds, raw = self.moment, self.bounds, as_array(wanted)
         known = np.where(np.isfinite(raw), raw, moment.motion.position)
         target = np.clip(known, bounds.arrays.lower, bounds.arrays.upper)
-        exact = moment.taken(target, dt)
+        exact = moment.taken(target, _column(dt))
         fits = moment.allows(exact, bounds)
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
         as_wanted = torch.from_numpy(fits & (raw == target)).to(wanted.device)
@@ -200,6 +205,21 @@ class Follower:
         return replace(
             self, reference=torch.where(as_wanted, wanted, reached), moment=following
         )
+
+    def undone(self, robots: Tensor, before: Self) -> Self:
+        """The same follower, with some robots as they were.
+
+        Parameters
+        ----------
+        robots : Tensor of bool, of shape (...)
+            Which ones.
+        before : Follower
+            Of the same robots.
+        """
+        joints = robots.unsqueeze(-1)
+        reference = torch.where(joints, before.reference, self.reference)
+        moment = before.moment.choose(joints.numpy(force=True), self.moment)
+        return replace(self, reference=reference, moment=moment)
 
 
 class Moment(NamedTuple):
@@ -215,7 +235,7 @@ class Moment(NamedTuple):
         The posture that was wanted, and the velocity that it moves with.
     behind : ndarray of bool, or None
         Joints that are on their way to it; None if there are none.
-    dt : float
+    dt : float or ndarray of shape (..., 1)
         Duration of the tick [s]; 0 at the start.
     """
 
@@ -225,7 +245,7 @@ class Moment(NamedTuple):
     wanted: Array
     drift: Array
     behind: Mask | None
-    dt: float
+    dt: Seconds
 
     @classmethod
     def moving(cls, position: Array, velocity: Array) -> Self:
@@ -237,26 +257,40 @@ class Moment(NamedTuple):
     def put(self, joints: Mask, position: Array) -> Self:
         """Some joints at rest somewhere else."""
         rest = type(self).moving(position, np.zeros_like(position))
+        return rest.choose(joints, self)._replace(dt=self.dt)
 
-        def either(new: Array, old: Array) -> Array:
-            return np.where(joints, new, old)
+    def choose(self, where: Mask, other: Self) -> Self:
+        """For some joints, or robots (..., 1), this moment, and another for the rest."""
 
-        behind = None if self.behind is None else self.behind & ~joints
-        slope, bend, wanted, drift = map(either, rest[1:5], self[1:5])
+        def either(one: Array, rest: Array) -> Array:
+            return np.where(where, one, rest)
+
+        behind = None
+        if self.behind is not None or other.behind is not None:
+            none = np.zeros(self.slope.shape, dtype=bool)
+            one, rest = (none if x.behind is None else x.behind for x in (self, other))
+            behind = np.asarray(np.where(where, one, rest), dtype=bool)
+        slope, bend, wanted, drift = map(either, self[1:5], other[1:5])
         return type(self)(
-            Motion(*map(either, rest.motion, self.motion)),
+            Motion(*map(either, self.motion, other.motion)),
             slope,
             bend,
             wanted,
             drift,
             behind if behind is not None and behind.any() else None,
-            self.dt,
+            np.where(where, self.dt, other.dt) if where.shape[-1] == 1 else other.dt,
         )
 
-    def taken(self, position: Array, dt: float) -> Self:
+    def ago(self, dt: Seconds) -> Seconds:
+        """How long the tick before took; as long as this one, if there was none [s]."""
+        if isinstance(self.dt, np.ndarray):
+            return np.where(self.dt > 0, self.dt, dt)
+        return self.dt or dt
+
+    def taken(self, position: Array, dt: Seconds) -> Self:
         """The next moment if that is the next reference."""
         slope = (position - self.motion.position) / dt
-        bend = (slope - self.slope) * (2 / (dt + (self.dt or dt)))
+        bend = (slope - self.slope) * (2 / (dt + self.ago(dt)))
         velocity = slope + bend * (dt / 2)  # (F1)
         drift = slope if self.behind is None else (position - self.wanted) / dt
         motion = Motion(position, velocity, bend)
@@ -268,7 +302,7 @@ class Moment(NamedTuple):
         size = np.abs(bend)
         rows = np.empty((*bend.shape[:-1], 5, bend.shape[-1]))
         rows[..., 0, :] = size
-        between = (following.dt + 2 * (self.dt or following.dt)) / 3
+        between = (following.dt + 2 * self.ago(following.dt)) / 3
         rows[..., 1, :] = np.abs(bend - self.bend) / between
         # the speed may grow until the acceleration is gone
         rows[..., 2, :] = peak = np.abs(motion.velocity) + size * size * limits.half_over_jerk
@@ -308,24 +342,26 @@ class Moment(NamedTuple):
             np.clip(np.rint(x[asked] * GRID) / GRID, low, high)
             for x in (exact.wanted, self.wanted)
         )
-        drift, moved = self.drift[asked], (target - before) / dt
+        each = dt if isinstance(dt, float) else np.broadcast_to(dt, asked.shape)[asked]
+        drift, moved = self.drift[asked], (target - before) / each
         # what is faster than the joint is a jump, not a motion
         moves = np.abs(moved) <= np.minimum(speed, HASTE * acceleration)
-        drift = drift + min(1.0, dt / MEMORY) * np.where(moves, moved - drift, 0.0)
+        drift = drift + np.minimum(1.0, each / MEMORY) * np.where(moves, moved - drift, 0.0)
         drift = np.clip(drift, -CRUISE * speed, CRUISE * speed)
-        part = first_part(start, target, drift, dt, speed, acceleration, jerk)
+        part = first_part(start, target, drift, each, speed, acceleration, jerk)
         unsafe = ~self._stops(part, asked, bounds)
         if unsafe.any():  # towards a limit: as if the target stood still, which ends in time
             still = np.zeros(unsafe.sum())
+            share = each if isinstance(each, float) else each[unsafe]
             safe = first_part(
-                start.select(unsafe), target[unsafe], still, dt,
+                start.select(unsafe), target[unsafe], still, share,
                 speed[unsafe], acceleration[unsafe], jerk[unsafe],
             )  # fmt: skip
             part.put(unsafe, safe)
         motion = Motion(*(field.copy() for field in exact.motion))
         motion.put(asked, part)
         slope = (motion.position - self.motion.position) / dt
-        bend = (slope - self.slope) * (2 / (dt + (self.dt or dt)))
+        bend = (slope - self.slope) * (2 / (dt + self.ago(dt)))
         drifts = exact.drift.copy()
         drifts[asked] = drift
         return type(self)(motion, slope, bend, exact.wanted, drifts, asked, dt)
@@ -349,6 +385,11 @@ class Moment(NamedTuple):
         peak = motion.velocity + motion.acceleration * np.abs(motion.acceleration) * half
         slow = np.maximum(np.abs(peak), np.abs(motion.velocity)) <= speed * (1 + ROUNDING)
         return slow & (lowest >= low - ROUNDING) & (highest <= high + ROUNDING)
+
+
+def _column(dt: Seconds) -> Seconds:
+    """For joints: of shape (..., 1), if each robot has a duration of its own."""
+    return dt[..., None] if isinstance(dt, np.ndarray) else float(dt)
 
 
 def _checked(bounds: MotionBounds, values: Any, name: str) -> Tensor:

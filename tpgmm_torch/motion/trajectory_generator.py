@@ -21,7 +21,10 @@ from ruckig import (
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["Motion", "first_part", "stopping_range"]
+__all__ = ["Motion", "Seconds", "first_part", "stopping_range"]
+
+#: A duration, of all motions or of each one [s].
+Seconds = float | Array
 
 #: Faster than anything: bounds that are not there.
 ENDLESS = 1e9
@@ -54,7 +57,7 @@ def first_part(
     start: Motion,
     target: Array,
     drift: Array,
-    dt: float,
+    dt: Seconds,
     velocity: Array,
     acceleration: Array,
     jerk: Array,
@@ -72,7 +75,7 @@ def first_part(
         Where the targets are after ``dt``.
     drift : ndarray of shape (N,)
         Their velocities, within the bounds of speed.
-    dt : float
+    dt : float or ndarray of shape (N,)
         Duration [s].
     velocity, acceleration, jerk : ndarray of shape (N,)
         Bounds; they may be infinite.
@@ -82,7 +85,8 @@ def first_part(
     for part, fastest in ((free, _jumped), (~free, _planned)):
         if part.any():
             bounds = velocity[part], acceleration[part], jerk[part]
-            motion = fastest(start.select(part), target[part], drift[part], dt, *bounds)
+            share = dt[part] if isinstance(dt, np.ndarray) else dt
+            motion = fastest(start.select(part), target[part], drift[part], share, *bounds)
             found.put(part, motion)
     return found
 
@@ -116,7 +120,7 @@ def stopping_range(start: Motion, acceleration: Array, jerk: Array) -> tuple[Arr
 
 
 def _jumped(
-    start: Motion, target: Array, drift: Array, dt: float, velocity: Array, *_: Array
+    start: Motion, target: Array, drift: Array, dt: Seconds, velocity: Array, *_: Array
 ) -> Motion:
     """Motions that only speed binds."""
     reach = velocity * dt
@@ -128,7 +132,7 @@ def _planned(
     start: Motion,
     target: Array,
     drift: Array,
-    dt: float,
+    dt: Seconds,
     velocity: Array,
     acceleration: Array,
     jerk: Array,
@@ -142,7 +146,7 @@ def _planned(
     asked.min_velocity = (-fastest - drift).tolist()
     plan = _plan(asked)
     if plan is not None:
-        position, speed, rate = map(np.array, plan.at_time(dt))
+        position, speed, rate = _at(plan, dt)
         return Motion(position + drift * dt, speed + drift, rate)
     if len(target) == 1:
         return _braked(start, dt, acceleration)
@@ -151,7 +155,7 @@ def _planned(
             start.select([i]),
             target[[i]],
             drift[[i]],
-            dt,
+            dt[[i]] if isinstance(dt, np.ndarray) else dt,
             velocity[[i]],
             acceleration[[i]],
             jerk[[i]],
@@ -159,6 +163,17 @@ def _planned(
         for i in range(len(target))
     ]
     return Motion(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _at(plan: Trajectory, dt: Seconds) -> Motion:
+    """Each motion of a plan after its own duration."""
+    if not isinstance(dt, np.ndarray):
+        return Motion(*map(np.array, plan.at_time(dt)))
+    found = Motion(*(np.empty_like(dt) for _ in range(3)))
+    for duration in np.unique(dt):
+        then = dt == duration
+        found.put(then, Motion(*map(np.array, plan.at_time(duration))).select(then))
+    return found
 
 
 def _input(start: Motion, acceleration: Array, jerk: Array) -> InputParameter:
@@ -183,7 +198,7 @@ def _plan(asked: InputParameter) -> Trajectory | None:
     return plan
 
 
-def _braked(start: Motion, dt: float, acceleration: Array) -> Motion:
+def _braked(start: Motion, dt: Seconds, acceleration: Array) -> Motion:
     """A motion that loses speed: what is left where nothing can be planned."""
     change = np.clip(-start.velocity / dt, -acceleration, acceleration)
     return Motion(

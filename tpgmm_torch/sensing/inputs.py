@@ -78,7 +78,7 @@ class Inputs:
 
     def hear(
         self,
-        dt: float,
+        dt: float | NDArray[np.float64],
         joints: Any,
         frames: Mapping[str, Any] | None,
         ages: Mapping[str, float] | None = None,
@@ -87,8 +87,8 @@ class Inputs:
 
         Parameters
         ----------
-        dt : float
-            Above 0 [s].
+        dt : float or ndarray of shape (...)
+            Above 0, the same for all robots or of each one [s].
         joints : array-like of shape (..., n_joints), optional
             Measured; a robot whose values are not finite has none.
         frames : mapping of str to Frame, to array-like of shape (..., 7), or to None, optional
@@ -194,7 +194,9 @@ class Inputs:
         )
         return known + [(f"frame {name!r}", pose) for name, pose in self.poses.items()]
 
-    def _joints(self, measured: NDArray[np.float64], dt: float) -> JointReading:
+    def _joints(
+        self, measured: NDArray[np.float64], dt: float | NDArray[np.float64]
+    ) -> JointReading:
         if self.joints is not None:
             return self.joints.hear(measured, dt)
         robot = self.kinematics
@@ -202,7 +204,9 @@ class Inputs:
         start = JointReading.of(self.trust, _numpy(self.start).copy(), limits)  # type: ignore[arg-type]
         return start.hear(measured, dt)
 
-    def _pose(self, name: str, heard: Any, dt: float) -> tuple[PoseReading, PoseFilter, Frame]:
+    def _pose(
+        self, name: str, heard: Any, dt: float | NDArray[np.float64]
+    ) -> tuple[PoseReading, PoseFilter, Frame]:
         pose = None if heard is None else self._pose_array(heard, name)
         reading = self.poses.get(name)
         if reading is None:

@@ -104,10 +104,10 @@ class PoseFilter:
         zero = np.zeros_like(pose)
         return cls(settings, pose, zero, zero, pose, np.zeros((MEMORY, *pose.shape[:-1])))
 
-    def see(self, pose: Floats, dt: float) -> Self:
+    def see(self, pose: Floats, dt: float | Floats) -> Self:
         """What is known after one more ``pose``, ``dt`` seconds later.
 
-        Its quaternion may be on either side.
+        Its quaternion may be on either side; ``dt`` may be one of each robot, shape (...).
         """
         settings = self.settings
         if math.isinf(settings.cutoff):
@@ -122,8 +122,9 @@ class PoseFilter:
         bend = np.square(change - self.change) @ METRIC
         history = np.concatenate((self.history[1:], bend[None]))
         variance = np.partition(history, MEMORY // 2, axis=0)[MEMORY // 2] / MEDIAN
-        velocity = self.velocity + _share(settings.speed_cutoff, dt) * (
-            change / dt - self.velocity
+        each = dt[..., None] if isinstance(dt, np.ndarray) else dt
+        velocity = self.velocity + _share(settings.speed_cutoff, each) * (
+            change / each - self.velocity
         )
         speed = np.sqrt(np.square(velocity) @ METRIC)
         with np.errstate(divide="ignore"):
@@ -145,6 +146,6 @@ class PoseFilter:
         return other
 
 
-def _share(cutoff: float | Floats, dt: float) -> Any:
+def _share(cutoff: float | Floats, dt: float | Floats) -> Any:
     """Of the new value, in a first-order low pass."""
     return 1 / (1 + 1 / (2 * math.pi * cutoff * dt))

@@ -123,10 +123,10 @@ class Reading:
     rival_age: Floats
     calm: bool
 
-    def hear(self, heard: Floats | None, dt: float) -> Self:
+    def hear(self, heard: Floats | None, dt: float | Floats) -> Self:
         """The next reading, ``dt`` seconds later; None if there was none.
 
-        ``heard`` has the shape of ``value``.
+        ``heard`` has the shape of ``value``; ``dt`` may be one of each robot, shape (...).
         """
         if heard is None:
             heard = np.full_like(self.value, np.nan)

@@ -217,8 +217,14 @@ def test_robots_may_have_times_of_their_own():
     for _ in range(11):
         controller.step(steps)
     assert controller.time.tolist() == pytest.approx([0.3, 0.4])
-    controller.step(torch.tensor([0.01, -1.0]))
+    before = controller.reference
+    command = controller.step(torch.tensor([0.01, -1.0]))
     assert controller.time.tolist() == pytest.approx([0.31, 0.4])
+    moved = (command.reference - before).abs().amax(-1) > 0
+    assert moved.tolist() == [True, False]
+    assert command.status == ["running", "holding"]
+    assert "time did not increase" in command.reason(1)
+    assert controller.step(0.01).status == ["running"] * 2
 
 
 def test_what_the_model_cannot_tell_stops_one_robot():
@@ -267,9 +273,10 @@ def test_a_robot_that_is_driven_away_goes_on_from_there():
 CLOCKS = ["even", "waiting", "localizing"]
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
 @pytest.mark.parametrize("clock", CLOCKS)
-def test_a_robot_in_a_batch_is_what_it_is_alone(clock):
-    """With faults in some of them, at different times."""
+def test_a_robot_in_a_batch_is_what_it_is_alone(clock, jitter):
+    """With faults in some of them, at different times, and ticks of their own."""
     problem = Problem.of(CASES["the paper's"], 3, 8)
     options = {"clock": parse_clock(clock)}
     batch = watched(problem, **options)
@@ -288,9 +295,10 @@ def test_a_robot_in_a_batch_is_what_it_is_alone(clock):
         poses[:, :3] += torch.from_numpy(1e-3 * rng.standard_normal((8, 3)))
         if 60 <= k < 100:
             poses[3] = torch.nan
-        command = batch.step(0.01, joints, {OBJECT: poses})
+        steps = 0.01 * (1 + jitter * torch.from_numpy(rng.uniform(-1, 3, 8)))
+        command = batch.step(steps, joints, {OBJECT: poses})
         for robot, one in enumerate(alone):
-            single = one.step(0.01, joints[robot], {OBJECT: poses[robot]})
+            single = one.step(float(steps[robot]), joints[robot], {OBJECT: poses[robot]})
             assert_close(command.reference[robot], single.reference, 1e-9)
             assert command.status[robot] == single.status
             assert command.reason(robot) == single.reason()
@@ -313,9 +321,11 @@ def test_a_robot_of_the_bottle_in_a_batch_is_what_it_is_alone():
             joints[3] += 0.7
         if tick >= 20:
             poses[5, :3] += torch.tensor([0.1, 0.2, 0.3])
-        command = batch.step(0.02, joints, {"bottle": poses})
+        # every robot has ticks of its own, in the second half
+        steps = 0.02 * (1 + (tick >= 60) * torch.from_numpy(rng.uniform(-0.5, 1, len(start))))
+        command = batch.step(steps, joints, {"bottle": poses})
         for robot, one in alone.items():
-            single = one.step(0.02, joints[robot], {"bottle": poses[robot]})
+            single = one.step(float(steps[robot]), joints[robot], {"bottle": poses[robot]})
             assert_close(command.reference[robot], single.reference, 1e-9)
             assert command.status[robot] == single.status
         active = batch._search.active

@@ -177,12 +177,15 @@ def test_without_bounds_what_is_wanted_is_taken():
     np.testing.assert_allclose(followers[-1].reference.numpy(), [1.0, -0.10, 0.1])
 
 
-def test_a_robot_does_not_depend_on_its_batch():
-    limits, steps = bounds(), 200
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+def test_a_robot_does_not_depend_on_its_batch(jitter):
+    limits, steps, rng = bounds(), 200, np.random.default_rng(2)
     wanted, start = paths(11, steps), torch.zeros(16, 3, dtype=torch.float64)
-    together = follow(Follower.at(limits, start), wanted, [DT] * steps)
+    ticks = DT * (1 + jitter * rng.uniform(-1, 3, (steps, 16)))
+    together = follow(Follower.at(limits, start), wanted, list(ticks))
     for robot in (0, 5, 15):
-        alone = follow(Follower.at(limits, start[robot]), wanted[:, robot], [DT] * steps)
+        own = ticks[:, robot].tolist()
+        alone = follow(Follower.at(limits, start[robot]), wanted[:, robot], own)
         for one, all_of_them in zip(alone, together, strict=True):
             np.testing.assert_allclose(
                 one.reference.numpy(), all_of_them.reference[robot].numpy(), atol=1e-12
