@@ -590,9 +590,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
         EM goes on from where it was, with the local data of the demonstrations of before,
         which the model keeps, and of those: the result is what ``fit`` of all of them gives
-        with ``warm_start=True, robust=False`` and the holds of now, to rounding. With one
-        component it is that of any fit. No demonstration is left out for being unlike the
-        others: corrections are.
+        with ``warm_start=True, robust=False`` and the holds of now, to rounding, unless as
+        many are forgotten as are new. With new ones EM begins from the shrunken covariances,
+        from which they are not infinitely far. With one component it is that of any fit. No
+        demonstration is left out for being unlike the others: corrections are.
 
         Parameters
         ----------
@@ -659,7 +660,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         forgotten = self._forgotten(forget, weights)
         weights[forgotten] = 0.0
         kept = kept.without(forgotten)
-        self._learn_again(kept)
+        self._learn_again(kept, unseen=bool(added))
         if counted is not None:
             self._weigh(counted)
         self.shown_, self.demonstration_weights_, self._kept = seen, weights, kept
@@ -682,8 +683,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             )
         return list(forget)
 
-    def _learn_again(self, kept: KeptRows) -> None:
-        """EM from where it was, on rows that were kept."""
+    def _learn_again(self, kept: KeptRows, unseen: bool) -> None:
+        """EM from where it was, on rows that were kept, of which some may be new to it."""
         operators, kinematics, parts = self.operators_, self.kinematics_, self.parts_
         widths = block_widths(operators, kinematics)
         turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
@@ -697,7 +698,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             shares = float(members[own].sum() * len(kept.rows) / own.sum())
             mixture = self.unfitted_mixture(
                 whole, 1, operators, kinematics, shares, k,
-                go_on=slice(first, first + k), whole=whole if parts else None,
+                go_on=slice(first, first + k), whole=whole if parts else None, unseen=unseen,
             )  # fmt: skip
             fit_subsets([mixture], table[own], members[own][None], group_size)
             mixtures.append(mixture)
@@ -1256,6 +1257,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         *,
         go_on: slice | None = None,
         whole: ColumnMoments | None = None,
+        unseen: bool = False,
     ) -> BlockGaussianMixture:
         """The mixture that :meth:`fit` learns from rows of local data.
 
@@ -1277,6 +1279,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             ``warm_start``.
         whole : ColumnMoments, optional
             Of the rows of all parts, where these are those of one.
+        unseen : bool, default=False
+            Whether EM has not seen some of the rows; it has not, if there are more
+            demonstrations than before.
         """
         settings = self._shared_settings(operators, kinematics, n_components)
         settings |= {"group_size": group_size, "n_demonstrations": n_demonstrations}
@@ -1287,7 +1292,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             weights = before.weights_[chosen]
             settings["weights_init"] = weights if whole is None else weights / weights.sum()
             settings["means_init"] = [mean[chosen] for mean in before.means_]
-            settings["covariances_init"] = [c[chosen] for c in before.unshrunk_covariances]
+            # those of N demonstrations are flat: one more lies infinitely far from all of them,
+            # and chance would decide which components keep their data
+            unseen = unseen or n_demonstrations > (before.n_demonstrations or 0.0)
+            covariances = before.covariances_ if unseen else before.unshrunk_covariances
+            settings["covariances_init"] = [c[chosen] for c in covariances]
         return BlockGaussianMixture(**settings)
 
     def _regularized(

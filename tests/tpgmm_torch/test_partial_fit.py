@@ -1,12 +1,16 @@
 """Learning goes on: with more demonstrations, with fewer, and from a file."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
 
+from tests.support.planted import HAND, NAMES, PlantedTask
 from tests.support.skills import handlings, hands_model, wave, waves
-from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch import Canonical, Demonstration, Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, DegenerateComponentWarning, UnknownNameError
+from tpgmm_torch.operators.text import parse_operator
 
 SHOWN = waves(6, 60)
 
@@ -76,6 +80,20 @@ def test_what_is_forgotten_was_not_learned():
     left = [SHOWN[i] for i in (2, 3, 5)]
     warm = model(warm_start=True).fit(SHOWN).fit(SHOWN[2:]).fit(left)
     assert_equal(fitted, warm)
+
+
+@pytest.mark.parametrize("forget", [0, 1])
+def test_components_keep_their_data_when_a_demonstration_is_added(forget):
+    """However many more coordinates there are than demonstrations."""
+    task = PlantedTask(0, 1)
+    operators = [parse_operator(f"pose:hand@{name}") for name in NAMES[:4]]
+    shown = task.demonstrations(5)
+    fitted = TaskParameterizedGMM(6, [*operators, Canonical()], HAND, robust=False)
+    fitted.fit(shown[:4])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DegenerateComponentWarning)
+        fitted.partial_fit(shown[4:], forget=forget)
+    assert fitted.weights_.min() > 0.5 / 6
 
 
 def test_one_that_was_left_out_stays_out():
