@@ -133,6 +133,7 @@ def gather_evidence(
     tolerance: float,
     n_instants: int,
     holds: Sequence[Hold] = (),
+    prior_degrees: float = 0.0,
 ) -> Evidence:
     """Leave each demonstration out, and ask operators about it.
 
@@ -148,6 +149,11 @@ def gather_evidence(
         T, at most: evenly spread.
     holds : sequence of Hold, default=()
         Objects that the robot held.
+    prior_degrees : float, default=0
+        Degrees of freedom d0 of a scaled inverse chi-squared prior of each variance, whose
+        scale is the variance of all N demonstrations: those that are left have N - 2, and a
+        variance is ``((N - 2) s^2 + d0 s0^2) / (N - 2 + d0)``. Of three demonstrations two
+        are left, which agree by chance in what the third shows to differ.
     """
     time = typical_time(demonstrations).to(kinematics.lower)
     count = min(n_instants, *map(len, demonstrations))
@@ -162,6 +168,9 @@ def gather_evidence(
     ]
     data = torch.stack(local_data(seen, operators, kinematics, holds=holds))  # (N, T, ...)
     number = len(seen)
+    # s0^2 has a share in each variance, and none where nothing is asked of a prior
+    prior, degrees = data.var(0), number - 2.0
+    share = prior_degrees / (degrees + prior_degrees) if prior_degrees else 0.0
     left_out = torch.linspace(0, number - 1, min(number, MOST_LEFT_OUT)).round().long()
     shape = (len(left_out), count)
     jacobians: list[list[Tensor]] = [[] for _ in operators]
@@ -179,7 +188,9 @@ def gather_evidence(
             size = operator.dimension(kinematics)
             local = data[..., column + 1 : column + 1 + size]
             column += 1 + size
-            variance = local[others].var(0) * number / (number - 1) + RESOLUTION**2
+            own = local[others].var(0) * number / (number - 1)
+            whole = prior[..., column - size : column] * (number + 1) / number
+            variance = (1 - share) * own + share * whole + RESOLUTION**2
             gap = local[others].mean(0) - local[index]
             present = operator.coordinates(state, frames)
             for start in operator.quaternion_starts(kinematics):
@@ -213,7 +224,7 @@ def gather_evidence(
         list(map(torch.stack, rows)),
         nothing=Fused((1 / spread).diag().expand(*shape, -1, -1), gap / spread),
         floor=floor,
-        degrees=max(number - 2.0, 1.0),
+        degrees=max(degrees, 1.0),
     )
 
 

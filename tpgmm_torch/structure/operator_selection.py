@@ -39,6 +39,9 @@ __all__ = ["Judgement", "OperatorSelection", "arranged", "candidate_operators"]
 
 #: Of two, one is left to learn from, and has no variance.
 FEWEST = 3
+#: What demonstrations show together is worth one more that a variance is learned from: with
+#: three, of which two are left, their chance agreement else decides.
+PRIOR_DEGREES = 1.0
 POSITIONS = AbsolutePosition, RelativePosition
 ORIENTATIONS = AbsoluteOrientation, RelativeOrientation
 
@@ -228,6 +231,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
             tolerance=self.tolerance,
             n_instants=self.n_instants,
             holds=holds,
+            prior_degrees=PRIOR_DEGREES,
         )
         joints = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
         free = [j for j, one in enumerate(operators) if not one.determines_joints]
