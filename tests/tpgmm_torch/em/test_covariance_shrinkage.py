@@ -21,7 +21,9 @@ def mixture(width=5, n_components=3, seed=0):
 def conditional(covariance, given):
     """Of what follows the first columns, given them."""
     cross, time = covariance[:, given:, :given], covariance[:, :given, :given]
-    return covariance[:, given:, given:] - cross @ np.linalg.solve(time, cross.mT)
+    return covariance[:, given:, given:] - cross @ np.linalg.solve(
+        time, np.swapaxes(cross, -1, -2)
+    )
 
 
 @pytest.mark.parametrize("given", [0, 1])

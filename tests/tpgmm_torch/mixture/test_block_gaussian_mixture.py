@@ -50,7 +50,7 @@ def test_every_check_of_scikit_learn_runs_and_passes():
     assert done.returncode == 0, done.stderr
     results = json.loads(done.stdout.splitlines()[-1])
     assert [result for result in results if result[1] != "passed"] == []
-    assert len(results) == 41
+    assert len(results) >= 40  # scikit-learn 1.6 has one less than 1.9
 
 
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
