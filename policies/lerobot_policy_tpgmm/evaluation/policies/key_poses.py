@@ -295,19 +295,22 @@ class _Shown:
         return tuple(sorted(steps))
 
     def _deviation(self, begin: int, steps: Sequence[int]) -> Array:
-        """How far each demonstration is from the path through its own poses, in the mean."""
+        """How far demonstrations are from paths through their own poses, in the mean.
+
+        Of the links, the one that is farthest.
+        """
         rows = np.arange(steps[-1] - begin + 1, dtype=np.float64)
-        total: Array = np.zeros(len(rows))
+        ways = []
         for shown in self.links.values():
+            apart: Array = np.zeros(len(rows))
             for i in range(self.n):
                 poses = [shown[i, step] for step in steps]
                 path = minimum_jerk_path(
                     shown[i, begin], poses, [step - begin for step in steps], rows
                 )
-                total = np.maximum(
-                    total, as_array(_apart(path, shown[i, begin : steps[-1] + 1]) / self.n)
-                )
-        return total
+                apart += as_array(_apart(path, shown[i, begin : steps[-1] + 1])) / self.n
+            ways.append(apart)
+        return np.max(ways, axis=0)
 
     def _poses(self, begin: int, step: int) -> tuple[KeyPose, ...]:
         """Of each link, in the frame in which it differs least."""

@@ -1,10 +1,13 @@
 """The mean of demonstrations, and key poses: what they do in situations that were not shown."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.evaluation.policies.aligned import Aligned
+from lerobot_policy_tpgmm.evaluation.policies.key_poses import find_moves
 from lerobot_policy_tpgmm.evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 from tests.support.learned_sets import (
     aligned,
@@ -63,6 +66,18 @@ def test_hands_reach_the_demonstrated_grasp_wherever_the_bottle_is(keys):
         assert distance.max() < 1e-3
         assert angle.max() < 0.01
         assert (done.diff(dim=0).abs() * keys.config.fps <= shaking().robot.velocity).all()
+
+
+def test_key_poses_are_on_the_way_however_many_demonstrations_show_it():
+    once = aligned(carrying())
+    often = replace(
+        once,
+        demonstrations=tuple(4 * list(once.demonstrations)),
+        starts=once.starts.repeat(4, 1),
+    )
+    steps, again = ([m.steps for m in find_moves(shown)] for shown in (once, often))
+    assert steps == again
+    assert any(len(on_the_way) > 1 for on_the_way in steps)
 
 
 def test_turning_points_keep_the_rhythm(keys):
