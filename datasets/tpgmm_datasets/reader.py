@@ -26,7 +26,7 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Unit, Units
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import Demonstration, check_robot
 from tpgmm_torch.events.detection import doubtful_events
 from tpgmm_torch.plausibility.check import episodes_report, summarize
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Report
@@ -155,6 +155,7 @@ def open_recording(
     """
     if plausibility not in PLAUSIBILITY:
         raise DatasetError(f"plausibility is one of {PLAUSIBILITY}, got {plausibility!r}")
+    check_robot(robot)
     policy = Relaxed(relax)
     layout = open_layout(local_folder(path))
     for problem in layout.problems:

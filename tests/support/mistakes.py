@@ -31,6 +31,13 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
+from tpgmm_torch.data.pose_names import POSE_PARTS
+from tpgmm_torch.data.tables import (
+    demonstrations_from_frame,
+    demonstrations_to_frame,
+    read_table,
+)
+from tpgmm_torch.plausibility import check
 
 __all__ = ["MISTAKES", "Mistake"]
 
@@ -746,7 +753,30 @@ def frames_for_situations(_):
     learned().predict([usual().frames["bottle"]])
 
 
+@mistake("shapes", r"got 'arm\.urdf'; .*Robot\.from_urdf")
+def a_file_for_a_robot(_):
+    check(shown(), "arm.urdf")
+
+
+@mistake("shapes", r"got 'arm\.urdf'; .*Robot\.from_urdf")
+def a_file_for_the_robot_of_a_set(folder):
+    load_lerobot(stored(folder), robot="arm.urdf")
+
+
 # -- files ---------------------------------------------------------------------------------
+
+
+@mistake("files", r"\['Unnamed: 0'\] count the rows")
+def a_table_with_numbers_of_rows(folder):
+    demonstrations_to_frame(shown()).to_csv(folder / "log.csv")
+    demonstrations_from_frame(read_table(folder / "log.csv"))
+
+
+@mistake("files", r"part of the pose of 'bottle', and no columns \['bottle.qw'")
+def a_table_with_positions_of_objects(_):
+    table = demonstrations_to_frame(shown())
+    turns = [f"bottle.{part}" for part in POSE_PARTS[3:]]
+    demonstrations_from_frame(table.drop(columns=turns))
 
 
 @mistake("files", r"info\.json")

@@ -22,7 +22,7 @@ from tpgmm_torch.notebook import Tabular, listed, panels
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Demonstration", "Situation", "check_demonstrations"]
+__all__ = ["Demonstration", "Situation", "check_demonstrations", "check_robot"]
 
 
 def _checked_time(values: Any) -> Tensor:
@@ -433,6 +433,26 @@ def _columns(
         if name not in present:
             raise UnknownNameError("joint", name, where, present)
     return [present.index(name) for name in wanted]
+
+
+def check_robot(robot: Any) -> None:
+    """Refuse what is no robot, as the name of its file.
+
+    Parameters
+    ----------
+    robot : object
+        None, or what has ``joint_names`` or ``state(joints)``.
+
+    Raises
+    ------
+    DataError
+        If it is something else.
+    """
+    if robot is not None and not (hasattr(robot, "state") or hasattr(robot, "joint_names")):
+        raise DataError(
+            f"robot is a Robot, Poses, or another Kinematics, got {robot!r}; a file is read by "
+            "Robot.from_urdf(path, links) or Robot.from_mjcf(path, links)"
+        )
 
 
 def check_demonstrations(demonstrations: Any) -> list[Demonstration]:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-__all__ = ["POSE_PARTS", "is_gripper", "pose_groups", "quaternion_groups", "words"]
+__all__ = [
+    "POSE_PARTS",
+    "incomplete_poses",
+    "is_gripper",
+    "pose_groups",
+    "quaternion_groups",
+    "words",
+]
 
 #: How the parts of a pose are called after its own name: metres, and (w, x, y, z).
 POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
@@ -61,6 +68,32 @@ def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
         Of columns; None has no quaternions.
     """
     return list(_groups(names, POSE_PARTS[3:]).values())
+
+
+def incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Which columns of poses are missing that the names tell of in part.
+
+    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, tell of a pose.
+
+    Parameters
+    ----------
+    names : sequence of str
+
+    Returns
+    -------
+    dict of str to tuple of str
+        By name of the pose, the columns that complete it.
+    """
+    parts: dict[str, set[str]] = {}
+    for name in names:
+        if match := re.fullmatch(r"(.+[._])(x|y|z|qw|qx|qy|qz)", name, re.DOTALL):
+            parts.setdefault(match[1], set()).add(match[2])
+    return {
+        stem[:-1]: tuple(stem + part for part in POSE_PARTS if part not in there)
+        for stem, there in parts.items()
+        if there != set(POSE_PARTS)
+        and (there >= {"x", "y", "z"} or len(there & set(POSE_PARTS[3:])) > 1)
+    }
 
 
 def _groups(names: Sequence[str] | None, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:

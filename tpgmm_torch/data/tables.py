@@ -19,7 +19,7 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups
+from tpgmm_torch.data.pose_names import POSE_PARTS, incomplete_poses, pose_groups
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
@@ -38,6 +38,8 @@ __all__ = [
 EVENT, COVARIANCE = "event.", "covariance."
 #: Where pandas keeps which columns are joints, among the attributes of a table.
 JOINTS = "joints"
+#: Fewer rows do not show that a column counts them.
+FEWEST_COUNTED = 4
 
 
 def demonstrations_to_frame(demonstrations: Sequence[Demonstration]) -> pd.DataFrame:
@@ -151,7 +153,8 @@ def demonstrations_from_frame(
     ------
     DataError, UnknownNameError
         If a column is missing, occurs twice or holds no numbers, a value is missing, or an
-        event has two times; and as :class:`Demonstration`. The message says in which episode.
+        event has two times; without ``joints``, if there is only a part of a pose, or a column
+        counts the rows; and as :class:`Demonstration`. The message says in which episode.
 
     Examples
     --------
@@ -347,7 +350,7 @@ def _each[Motion](
             raise UnknownNameError("column", name, "the table", table.columns)
     if not len(table):
         raise DataError("the table has no rows")
-    names = list(joints) if joints is not None else _joints(table, {time, episode})
+    names = list(joints) if joints is not None else _joints(table, time, episode)
     if episode in table.columns:
         if table[episode].isna().any():
             raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
@@ -363,9 +366,9 @@ def _each[Motion](
     return made
 
 
-def _joints(table: pd.DataFrame, others: set[str]) -> list[str]:
+def _joints(table: pd.DataFrame, time: str, episode: str) -> list[str]:
     """Columns that are joints: those known to be, and those that are nothing else."""
-    columns = _others(table, others)
+    columns = _others(table, {time, episode})
     known = {name for name in columns if f"{COVARIANCE}{name}.{name}" in table.columns}
     known |= set(table.attrs.get(JOINTS, ()))
     rest = [name for name in columns if name not in known]
@@ -376,7 +379,29 @@ def _joints(table: pd.DataFrame, others: set[str]) -> list[str]:
             f"the table has no joints: {columns} are poses of frames or something else. If "
             "some are joints, say so: joints=[...]"
         )
+    taken = [name for name in names if name not in known]
+    for frame, missing in incomplete_poses(taken).items():
+        raise DataError(
+            f"the table has a part of the pose of {frame!r}, and no columns {list(missing)}: "
+            "add them (1, 0, 0, 0 where no orientation was recorded), or say which columns are "
+            "joints: joints=[...]"
+        )
+    counters = [name for name in taken if _counts_rows(table, name, episode)]
+    if counters:
+        raise DataError(
+            f"columns {counters} count the rows and are no joints: drop them (pandas leaves "
+            "its own out of a file with index=False), or say which are: joints=[...]"
+        )
     return names
+
+
+def _counts_rows(table: pd.DataFrame, name: str, episode: str) -> bool:
+    """Whether a column holds whole numbers that go up by one in every episode."""
+    if table[name].dtype.kind not in "iu" or len(table) < FEWEST_COUNTED:
+        return False
+    groups: Any = table[episode] if episode in table.columns else np.zeros(len(table))
+    steps = table[name].groupby(groups).diff().dropna()
+    return bool(len(steps)) and bool((steps == 1).all())
 
 
 def _others(table: pd.DataFrame, known: set[str]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.plausibility.clock import check_clock, check_one_clock
@@ -84,6 +84,7 @@ def examine(demonstrations: Iterable[Demonstration], robot: Kinematics | None = 
     DataError, ShapeError, UnknownNameError
         If demonstrations do not fit together, or with the robot.
     """
+    check_robot(robot)
     return episodes_report(summarize(check_demonstrations(demonstrations), robot), robot)
 
 

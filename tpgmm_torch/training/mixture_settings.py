@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -113,14 +114,14 @@ def regularization(
     Raises
     ------
     DataError
-        If a tolerance is negative, or not finite.
+        If a tolerance is no number, negative, or not finite.
     """
     units = moments.standardization(
         block_widths(operators, kinematics), isotropic=covariance_type == "spherical"
     )
     tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
     for operator, (_, *given) in zip(operators, tolerances, strict=True):
-        if not all(0 <= tolerance < math.inf for tolerance in given):
+        if not all(isinstance(one, Real) and 0 <= one < math.inf for one in given):
             raise DataError(f"a tolerance is a number of at least 0, {operator!r} has {given}")
     scales = torch.cat(units.scales).numpy()
     paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]

@@ -11,7 +11,12 @@ from sklearn.base import clone
 
 from tests.support.motions import DEMONSTRATIONS, turning
 from tpgmm_torch import quaternions
-from tpgmm_torch.alignment import Alignment, DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch.alignment import (
+    Alignment,
+    DynamicTimeWarping,
+    EventAlignment,
+    LinearTimeNormalization,
+)
 from tpgmm_torch.alignment.base import retime, seconds, steps_at
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
@@ -207,3 +212,11 @@ def test_situations_pass_unchanged_but_not_among_demonstrations():
         alignment.transform([])
     with pytest.raises(NotFittedError, match=r"this Backwards is not fitted: call fit\("):
         Backwards().transform(situations)
+
+
+@pytest.mark.parametrize(
+    "alignment", [DynamicTimeWarping, EventAlignment, LinearTimeNormalization]
+)
+def test_the_name_of_a_file_is_no_robot(alignment):
+    with pytest.raises(DataError, match=r"got 'arm.urdf'; .*Robot.from_urdf\(path, links\)"):
+        alignment(robot="arm.urdf").fit(DEMONSTRATIONS)

@@ -188,6 +188,19 @@ def put(row, column, value):
         (put(1, "event.go", 0.02), DataError, "'event.go' is one time"),
         (put(1, "time", 0.0), DataError, "time must increase"),
         (put(1, "shoulder", "left"), DataError, "'shoulder' holds no numbers"),
+        (without("bottle.qz"), DataError, r"part of the pose of 'bottle', .*\['bottle.qz'\]"),
+        (without("bottle.z"), DataError, r"part of the pose of 'bottle', .*\['bottle.z'\]"),
+        (
+            lambda t: t.drop(columns=[f"hand.left.{part}" for part in POSE_PARTS[3:]]),
+            DataError,
+            r"part of the pose of 'hand.left', .*'hand.left.qw'.*1, 0, 0, 0",
+        ),
+        (lambda t: t.reset_index(), DataError, r"\['index'\] count the rows .*index=False"),
+        (
+            lambda t: t.assign(frame=t.groupby("episode").cumcount()),
+            DataError,
+            r"\['frame'\] count the rows",
+        ),
     ],
 )
 def test_other_tables_are_refused(change, error, message):
@@ -195,6 +208,26 @@ def test_other_tables_are_refused(change, error, message):
     table.attrs.clear()
     with pytest.raises(error, match=message):
         demonstrations_from_frame(change(table))
+
+
+def test_a_file_with_the_rows_numbers_is_refused(tmp_path):
+    table = demonstrations_to_frame([demonstration()])
+    table.to_csv(tmp_path / "log.csv")
+    with pytest.raises(DataError, match=r"\['Unnamed: 0'\] count the rows .*index=False"):
+        demonstrations_from_frame(read_table(tmp_path / "log.csv"))
+    [found] = demonstrations_from_frame(read_table(tmp_path / "log.csv"), joints=NAMES)
+    assert_same(found, demonstration())
+
+
+def test_columns_that_look_like_parts_of_poses_can_be_joints():
+    table = demonstrations_to_frame([demonstration()])[["time", *NAMES]]
+    table = table.rename(columns={"shoulder": "base_x", "elbow": "base_y"})
+    [found] = demonstrations_from_frame(table)  # a plane has two
+    assert found.joint_names == ("base_x", "base_y")
+    table = table.assign(base_z=0.1, step=range(len(table)))
+    names = ["base_x", "base_y", "base_z", "step"]
+    [found] = demonstrations_from_frame(table, joints=names)
+    assert found.joint_names == tuple(names)
 
 
 def test_what_makes_no_table_is_refused():

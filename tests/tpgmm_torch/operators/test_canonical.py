@@ -133,7 +133,7 @@ def test_every_operator_has_a_tolerance_in_its_unit():
         torch.testing.assert_close(difference, torch.full_like(difference, added**2))
 
 
-@pytest.mark.parametrize("tolerance", [-0.01, float("nan"), float("inf")])
+@pytest.mark.parametrize("tolerance", [-0.01, float("nan"), float("inf"), "2 mm", [1, 2]])
 def test_what_is_no_tolerance_is_refused(tolerance):
     with pytest.raises(DataError, match=r"a tolerance is a number of at least 0, Canonical"):
         TaskParameterizedGMM(2, [Canonical(tolerance)]).fit(waves())
