@@ -70,7 +70,7 @@ newest: ## Run the tests with the newest versions that are allowed, in .venv-new
 	OMP_NUM_THREADS=1 .venv-newest/bin/python -m pytest -n 2 -o filterwarnings=default $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
-	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest \
+	TPGMM_FUZZ=full HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest --timeout 0 \
 	    tests/project/test_damaged_files.py tests/project/test_killed_saves.py \
 	    tests/tpgmm_torch/control/test_controller.py $(PYTEST_ARGS)
 
