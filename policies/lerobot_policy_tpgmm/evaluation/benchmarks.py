@@ -241,14 +241,8 @@ class BottleBenchmark(_HandlingBenchmark):
         return [pool[number] for number in numbers]
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
-        """Both hands seen from the bottle, one from the other, and the joints.
-
-        The paper has the bottle's and the joints' (``bottle_operators``). Hands that hold one
-        thing have to keep their distance; of few demonstrations the Gaussians seen from the
-        bottle do not say so, as their covariances are shrunk to their diagonals.
-        """
-        grasp, joints = bottle_operators(orientation)
-        return [grasp, _between_hands(orientation), joints]
+        """Both hands seen from the bottle, and the joints."""
+        return bottle_operators(orientation)
 
 
 class CarryBenchmark(_HandlingBenchmark):
@@ -285,8 +279,9 @@ class CarryBenchmark(_HandlingBenchmark):
         grasp, put = (_poses(HANDS, name, orientation) for name in self.objects)
         if not held:
             return [grasp, put, Canonical()]
-        carried = _poses(("bottle",), "tray", orientation)
-        return [grasp, carried, _between_hands(orientation), Canonical()]
+        left, right = HANDS
+        together = _poses((right,), left, orientation)
+        return [grasp, _poses(("bottle",), "tray", orientation), together, Canonical()]
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         return {**super()._start(motion), "slide": slid(motion)}
@@ -330,12 +325,6 @@ def _poses(links: Sequence[str], frame: str, orientation: bool) -> Stack:
     """Where links, or objects, are seen from a frame."""
     kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
     return Stack(*(kind(link, frame) for link in links for kind in kinds))
-
-
-def _between_hands(orientation: bool) -> Stack:
-    """Where the right hand is seen from the left."""
-    left, right = HANDS
-    return _poses((right,), left, orientation)
 
 
 def _references(motion: Demonstration) -> torch.Tensor:

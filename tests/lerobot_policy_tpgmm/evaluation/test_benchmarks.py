@@ -6,7 +6,7 @@ from lerobot.envs import preprocess_observation
 
 from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
 from lerobot_policy_tpgmm.evaluation import jobs
-from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark, CarryBenchmark
+from lerobot_policy_tpgmm.evaluation.benchmarks import CarryBenchmark
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.settings import Settings
 from lerobot_policy_tpgmm.evaluation.trainings import TRAININGS
@@ -16,20 +16,10 @@ from tpgmm_datasets.bottle.carrying import slid
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.pose_names import POSE_PARTS
-from tpgmm_torch.operators.text import format_operator
 
 NAMES = [f"{name}.{part}" for name in ("bottle", "tray") for part in POSE_PARTS]
 KINEMATIC = {"mode": "kinematic"}
 DEMONSTRATIONS = 7
-
-
-@pytest.mark.parametrize("held", [True, False])
-@pytest.mark.parametrize("orientation", [True, False])
-def test_hands_that_hold_the_bottle_are_seen_from_each_other(orientation, held):
-    grasp, together, joints = BottleBenchmark().operators(orientation, held)
-    seen = ("position:r_hand@l_hand", "orientation:r_hand@l_hand")[: 1 + orientation]
-    assert format_operator(together) == " + ".join(seen)
-    assert grasp.references() == ("bottle",) and joints.determines_joints
 
 
 @pytest.fixture(scope="module")
