@@ -591,8 +591,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         EM goes on from where it was, with the local data of the demonstrations of before,
         which the model keeps, and of those: the result is what ``fit`` of all of them gives
         with ``warm_start=True, robust=False`` and the holds of now, to rounding, unless as
-        many are forgotten as are new. With new ones EM begins from the shrunken covariances,
-        from which they are not infinitely far. With one component it is that of any fit. No
+        many are forgotten as are new. With new ones, and more coordinates than demonstrations
+        before, EM begins from the shrunken covariances, from which they are not infinitely far:
+        then the skill may change elsewhere, too. With one component it is that of any fit. No
         demonstration is left out for being unlike the others: corrections are.
 
         Parameters
@@ -1292,10 +1293,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             weights = before.weights_[chosen]
             settings["weights_init"] = weights if whole is None else weights / weights.sum()
             settings["means_init"] = [mean[chosen] for mean in before.means_]
-            # those of N demonstrations are flat: one more lies infinitely far from all of them,
-            # and chance would decide which components keep their data
-            unseen = unseen or n_demonstrations > (before.n_demonstrations or 0.0)
-            covariances = before.covariances_ if unseen else before.unshrunk_covariances
+            # of fewer demonstrations than coordinates they are flat: one more lies infinitely
+            # far from all of them, and chance would decide which components keep their data
+            shown = before.n_demonstrations or 0.0
+            unseen = unseen or n_demonstrations > shown
+            flat = shown <= sum(mean.shape[-1] for mean in before.means_)
+            covariances = (
+                before.covariances_ if unseen and flat else before.unshrunk_covariances
+            )
             settings["covariances_init"] = [c[chosen] for c in covariances]
         return BlockGaussianMixture(**settings)
 

@@ -33,10 +33,16 @@ def test_a_promp_passes_through_the_posture_it_is_conditioned_on():
     [situation] = shaking().situations(1, seed=12)
     bottle, move = situation.frames["bottle"], policy.moves[0]
     frames = {"bottle": bottle}
-    [via] = policy.postures(move, situation.joints, frames, frames)[-1:]
+    vias = policy.postures(move, situation.joints, frames, frames)
     args = situation.joints, situation.joints, frames, frames, 0
     longer = policy.references(*args)
-    assert (longer[move.arrive - 1] - via).abs().max() < 0.02
+    # the last one is that in which the next move begins
+    on_the_way = list(zip(move.steps, vias, strict=True))[:-1]
+    assert len(on_the_way) >= 2
+    for step, posture in on_the_way:
+        assert (longer[step] - posture).abs().max() < 1e-4
+    via = vias[-1]
+    assert (longer[-1] - via).abs().max() < 0.05
     assert (longer[0] - situation.joints).abs().max() < 1e-3
     # without it the mean of the demonstrations would be played
     assert (policy.mean[move.arrive] - via).abs().max() > 0.05
