@@ -33,6 +33,7 @@ NOT_CODE = (
     "tpgmm_datasets.commands.dataset",
     "tpgmm_datasets.commands.demo",
     "lerobot_policy_tpgmm.evaluation.command",
+    "lerobot_policy_tpgmm.evaluation.metaworld.__main__",
 )
 
 

@@ -418,7 +418,7 @@ def follow_hands(
     starts : Tensor of shape (n, n_joints)
         Where the joints begin [rad].
     wanted : callable
-        Gives the poses of both hands, :data:`HANDS`, at times (n,).
+        Gives the poses of both hands, ``HANDS``, at times (n,).
     times : Tensor of shape (T,)
         At even distances [s].
     posture : Tensor of shape (n_joints,) or (n, n_joints)
