@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
@@ -257,6 +257,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     kinematics_ : Kinematics
     holds_ : tuple of Hold
         In the time of the skill.
+    joint_names_ : tuple of str
+        The joints that were learned, in the order of all results.
     frame_names_ : tuple of str
         Frames that a situation must have; those at which a link was at the start of every
         demonstration (``--frame start=l_hand@start``) follow from its start posture where
@@ -306,35 +308,35 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "n_components": [
             Interval(Integral, 1, None, closed="left"),
-            StrOptions({"auto"}),
+            Options("auto"),
             ComponentSelection,
         ],
-        "operators": [StrOptions({"auto"}), OperatorSelection, "array-like", tuple, None],
+        "operators": [Options("auto"), OperatorSelection, "array-like", None],
         "robot": [Kinematics, None],
         "priorities": ["array-like", None],
-        "operator_weights": [StrOptions({"equal", "held-out"})],
-        "parts": [StrOptions({"auto"}), Segmentation, "array-like", tuple, None],
-        "covariance_type": [StrOptions({"full", "diag", "tied", "spherical"})],
+        "operator_weights": [Options("equal", "held-out")],
+        "parts": [Options("auto"), Segmentation, "array-like", None],
+        "covariance_type": [Options("full", "diag", "tied", "spherical")],
         "reg_covar": [Interval(Real, 0, None, closed="left")],
-        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
+        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), Options("auto")],
         "tol": [Interval(Real, 0, None, closed="left")],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
-        "init_params": [StrOptions({"time", "kmeans", "random"})],
-        "responsibilities": [StrOptions({"auto", "instant", "point"})],
-        "fusion": [StrOptions({"information", "covariance"})],
-        "activation": [StrOptions({"time", "product"})],
+        "init_params": [Options("time", "kmeans", "random")],
+        "responsibilities": [Options("auto", "instant", "point")],
+        "fusion": [Options("information", "covariance")],
+        "activation": [Options("time", "product")],
         "epsilon": [Interval(Real, 0, None, closed="left")],
         "prior_std": [Interval(Real, 0, None, closed="neither"), dict, "array-like"],
         "negligible": [Interval(Real, 0, 1, closed="left")],
         "blend": [Interval(Real, 0, None, closed="left")],
         "keep_limits": ["boolean"],
-        "holds": [StrOptions({"auto"}), "array-like", tuple, None],
+        "holds": [Options("auto"), "array-like", None],
         "robust": ["boolean"],
-        "plausibility": [StrOptions(set(PLAUSIBILITY))],
+        "plausibility": [Options(*PLAUSIBILITY)],
         "random_state": ["random_state"],
         "warm_start": ["boolean"],
-        "dtype": [StrOptions({"float64", "float32"})],
+        "dtype": [Options("float64", "float32")],
         "device": [str],
         "verbose": ["verbose"],
     }
@@ -427,6 +429,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.verbose = verbose
 
     @property
+    def joint_names_(self) -> tuple[str, ...]:
+        """The joints that were learned, in the order of all results."""
+        return tuple(self.kinematics_.joint_names)
+
+    @property
     def selects(self) -> bool:
         """Whether :meth:`fit` finds parts, operators, weights or the number of components."""
         found = isinstance(self.operators, str | OperatorSelection) or self.parts is not None
@@ -441,7 +448,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         InvalidParameterError
             If one is not allowed.
         """
-        self._validate_params()
+        check_parameters(self)
 
     def fit(
         self,
@@ -483,7 +490,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DistributedError
             If another of the processes died.
         """
-        self._validate_params()
+        check_parameters(self)
         demonstrations, batches = split_batches(X)
         if batches is None and processes.count == 1:
             known = check_demonstrations(demonstrations)
@@ -1443,7 +1450,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
         settings = {"n_components": len(weights)} | settings
         model = cls(operators=operators, robot=robot, **settings)
-        model._validate_params()
+        check_parameters(model)
         if not isinstance(robot, Kinematics):
             raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
         checked = check_operators(operators)

@@ -15,6 +15,7 @@ __all__ = [
     "DegenerateComponentWarning",
     "DependencyError",
     "DistributedError",
+    "InvalidParameterError",
     "MissingLimitsWarning",
     "ModelFileError",
     "NotFittedError",
@@ -40,6 +41,10 @@ class ShapeError(DataError):
 
 class PlausibilityError(DataError):
     """Recordings or situations cannot be what they are taken for: units, order, clock."""
+
+
+class InvalidParameterError(TPGMMError, ValueError, TypeError):
+    """A parameter of a constructor is not what it may be; ``fit`` says so."""
 
 
 class UnknownNameError(TPGMMError, KeyError):

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
-from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import consistent, replacing
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.command import Command
 from tpgmm_torch.data.affine import Affine
@@ -133,7 +133,7 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "model": [TaskParameterizedGMM, None],
         "modes": [
-            StrOptions({"auto"}),
+            Options("auto"),
             Interval(Integral, 1, None, closed="left"),
             ModeSelection,
         ],
@@ -177,7 +177,7 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DataError, ShapeError, UnknownNameError, PlausibilityError
             As :meth:`TaskParameterizedGMM.fit` and :meth:`ModeSelection.fit` do.
         """
-        self._validate_params()
+        check_parameters(self)
         known = check_demonstrations(X)
         model = TaskParameterizedGMM() if self.model is None else self.model
         selection = self._selection(model).fit(known)

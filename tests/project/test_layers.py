@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
         ("exceptions",),
-        ("atomic", "quaternions", "gaussians", "notebook"),
+        ("atomic", "constraints", "quaternions", "gaussians", "notebook"),
         ("storage",),
         ("data", "em"),
         ("robots", "alignment", "large_data"),
@@ -182,6 +182,17 @@ def test_rooms_are_small(package):
         str(at.name): len(n) for at, n in counts.items() if len(n) > MOST_FILES_IN_A_ROOM
     }
     assert counts and not crowded, f"too many files in one room: {crowded}"
+
+
+def test_nothing_private_of_scikit_learn_is_used():
+    # its private modules move and change without notice
+    wrong = [
+        f"{module} imports {name}"
+        for module, tree in EVERY.items()
+        for name in imported(module, ast.walk(tree))
+        if name.startswith("sklearn.") and "._" in name
+    ]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_core_knows_nothing_of_the_packages_built_on_it():

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal, multivariate_t, norm
+from sklearn import config_context
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 from sklearn.model_selection import GridSearchCV, KFold, LeaveOneOut, cross_val_score
 from sklearn.pipeline import make_pipeline
-from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
 from tests.support import oracles, skills
@@ -61,11 +61,14 @@ from tpgmm_torch.em.covariance_shrinkage import oracle_approximating_intensity
 from tpgmm_torch.exceptions import (
     DataError,
     DegenerateComponentWarning,
+    InvalidParameterError,
     NotFittedError,
     ShapeError,
     TPGMMError,
     UnknownNameError,
 )
+from tpgmm_torch.large_data.checkpoints import Checkpoint
+from tpgmm_torch.large_data.processes import ALONE
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
@@ -857,6 +860,18 @@ def test_a_pipeline_aligns_and_learns():
     )
     assert torch.equal(own.time, model[-1].time_)
     assert torch.equal(given.time, uneven[0].time)
+
+
+def test_what_fit_takes_besides_data_is_routed_through_pipelines(tmp_path):
+    # https://scikit-learn.org/stable/metadata_routing.html
+    with config_context(enable_metadata_routing=True):
+        learner = TaskParameterizedGMM(4, blend=0.0).set_fit_request(checkpoint=True)
+        model = make_pipeline(LinearTimeNormalization(), learner)
+        model.fit(waves(3), checkpoint=Checkpoint(tmp_path / "em"))
+        assert (tmp_path / "em").is_dir()
+        with pytest.raises(ValueError, match="processes"):
+            model.fit(waves(3), processes=ALONE)  # it was not asked for
+    assert model[-1].joint_names_ == JOINT_NAMES
 
 
 def test_it_says_that_samples_are_no_rows():

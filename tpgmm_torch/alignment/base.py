@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.features import quaternion_columns
+from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import (
     Demonstration,
@@ -168,7 +169,7 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
 
     def _start(self, X: Any) -> list[Demonstration]:
         """What each ``fit`` begins with: check parameters and demonstrations."""
-        self._validate_params()
+        check_parameters(self)
         check_robot(self.robot)
         demonstrations = check_demonstrations(X)
         self.joint_names_ = demonstrations[0].joint_names

@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch.alignment.base import Alignment, seconds, steps_at
@@ -21,6 +20,7 @@ from tpgmm_torch.alignment.warping_paths import (
     warping_map,
     warping_path,
 )
+from tpgmm_torch.constraints import ANYTHING, Interval, Options
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
@@ -118,10 +118,10 @@ class DynamicTimeWarping(Alignment):
     """
 
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012
-        "reference": [StrOptions({"medoid", "barycenter"}), Integral],
-        "features": ["array-like", tuple, None],
+        "reference": [Options("medoid", "barycenter"), Integral],
+        "features": ["array-like", None],
         "weights": [Mapping, None],
-        "robot": "no_validation",
+        "robot": ANYTHING,
         "window": [Interval(Real, 0, None, closed="neither"), None],
         "penalty": [Interval(Real, 0, None, closed="left")],
         "max_slope": [Interval(Integral, 1, None, closed="left")],
@@ -130,7 +130,7 @@ class DynamicTimeWarping(Alignment):
         "smoothing": [Interval(Real, 0, None, closed="left")],
         "n_iter": [Interval(Integral, 1, None, closed="left")],
         "n_steps": [Interval(Integral, 2, None, closed="left"), None],
-        "interpolation": [StrOptions({"linear", "cubic"})],
+        "interpolation": [Options("linear", "cubic")],
     }
 
     def __init__(

@@ -12,12 +12,12 @@ from typing import Any, Self
 import numpy as np
 import torch
 from sklearn.base import clone
-from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch.alignment.base import Alignment, retime, seconds, steps_at
 from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping, warn_of_linear_time
 from tpgmm_torch.alignment.features import quaternion_columns
+from tpgmm_torch.constraints import ANYTHING, Interval, Options
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
@@ -80,12 +80,12 @@ class EventAlignment(Alignment):
     """
 
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012
-        "events": ["array-like", tuple, None],
-        "duration": [StrOptions({"mean", "median"}), Interval(Real, 0, None, closed="neither")],
+        "events": ["array-like", None],
+        "duration": [Options("mean", "median"), Interval(Real, 0, None, closed="neither")],
         "within": [DynamicTimeWarping, None],
         "n_steps": [Interval(Integral, 2, None, closed="left"), None],
-        "interpolation": [StrOptions({"linear", "cubic"})],
-        "robot": "no_validation",
+        "interpolation": [Options("linear", "cubic")],
+        "robot": ANYTHING,
     }
 
     def __init__(

@@ -8,10 +8,10 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from sklearn.utils._param_validation import Interval, StrOptions
 from torch import Tensor
 
 from tpgmm_torch.alignment.base import Alignment, seconds, steps_at
+from tpgmm_torch.constraints import ANYTHING, Interval, Options
 from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["LinearTimeNormalization"]
@@ -48,10 +48,10 @@ class LinearTimeNormalization(Alignment):
     """
 
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012
-        "duration": [StrOptions({"mean", "median"}), Interval(Real, 0, None, closed="neither")],
+        "duration": [Options("mean", "median"), Interval(Real, 0, None, closed="neither")],
         "n_steps": [Interval(Integral, 2, None, closed="left"), None],
-        "interpolation": [StrOptions({"linear", "cubic"})],
-        "robot": "no_validation",
+        "interpolation": [Options("linear", "cubic")],
+        "robot": ANYTHING,
     }
 
     def __init__(

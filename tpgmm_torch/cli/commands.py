@@ -96,11 +96,9 @@ def explain(error: Exception) -> str | None:
         return "aborted"
     if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL:
         return f"this command needs {error.name}: pip install 'tpgmm-torch[cli]'"
-    from sklearn.utils._param_validation import InvalidParameterError
-
     from tpgmm_torch.exceptions import TPGMMError
 
-    expected = isinstance(error, TPGMMError | InvalidParameterError | OSError)
+    expected = isinstance(error, TPGMMError | OSError)
     return str(error) if expected else None
 
 

@@ -14,10 +14,10 @@ from numpy.random import RandomState
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, DensityMixin
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import validate_data
 from torch import Tensor
 
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.em.covariance_family import CovarianceFamily
 from tpgmm_torch.em.covariance_shrinkage import shrink
@@ -163,16 +163,16 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
         "n_components": [Interval(Integral, 1, None, closed="left")],
         "blocks": ["array-like", None],
-        "covariance_type": [StrOptions({"full", "tied", "diag", "spherical"})],
+        "covariance_type": [Options("full", "tied", "diag", "spherical")],
         "tol": [Interval(Real, 0.0, None, closed="left")],
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
-        "regularization": [StrOptions({"relative", "absolute"})],
-        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), StrOptions({"auto"})],
+        "regularization": [Options("relative", "absolute")],
+        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), Options("auto")],
         "n_demonstrations": [Interval(Real, 0, None, closed="neither"), None],
         "timed_blocks": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
-        "init_params": [StrOptions({"time", "kmeans", "random"})],
+        "init_params": [Options("time", "kmeans", "random")],
         "time_feature": [Interval(Integral, 0, None, closed="left")],
         "group_size": [Interval(Integral, 1, None, closed="left")],
         "weights_init": ["array-like", None],
@@ -181,7 +181,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "random_state": ["random_state"],
         "warm_start": ["boolean"],
         "verbose": ["verbose"],
-        "dtype": [StrOptions({"float64", "float32"})],
+        "dtype": [Options("float64", "float32")],
         "device": [str, torch.device],
     }
 
@@ -305,7 +305,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         DistributedError
             If another of the processes died.
         """
-        self._validate_params()
+        check_parameters(self)
         if are_batches(X):
             rows: Rows = BatchedRows(X, self.group_size)
             return self.fit_rows(rows, checkpoint=checkpoint, processes=processes)

@@ -10,10 +10,10 @@ from typing import Any, Self
 import numpy as np
 import torch
 from sklearn.base import BaseEstimator
-from sklearn.utils._param_validation import Interval
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.constraints import Interval, check_parameters
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.em.column_moments import ColumnMoments
@@ -94,7 +94,7 @@ class ComponentSelection(BaseEstimator):  # type: ignore[misc]
     """
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
-        "candidates": ["array-like", tuple],
+        "candidates": ["array-like"],
         "n_folds": [Interval(Integral, 2, None, closed="left")],
         "tolerance": [Interval(Real, 0, None, closed="neither")],
         "threshold": [Interval(Real, 0, None, closed="left")],
@@ -144,7 +144,7 @@ class ComponentSelection(BaseEstimator):  # type: ignore[misc]
         DataError
             If there are fewer than three demonstrations, or no candidate fits them.
         """
-        self._validate_params()
+        check_parameters(self)
         count, size = len(demonstrations), learning.group_size
         if count < FEWEST:
             raise DataError(

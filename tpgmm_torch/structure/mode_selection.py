@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
-from sklearn.utils._param_validation import Interval, StrOptions
 
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
@@ -128,13 +128,13 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
     """
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
-        "operators": ["array-like", tuple, None],
+        "operators": ["array-like", None],
         "robot": [Kinematics, None],
-        "n_modes": [StrOptions({"auto"}), Interval(Integral, 1, None, closed="left")],
+        "n_modes": [Options("auto"), Interval(Integral, 1, None, closed="left")],
         "max_modes": [Interval(Integral, 2, None, closed="left")],
         "shift": [Interval(Real, 0, 1, closed="left")],
-        "holds": [StrOptions({"auto"}), "array-like", tuple, None],
-        "dtype": [StrOptions({"float64", "float32"})],
+        "holds": [Options("auto"), "array-like", None],
+        "dtype": [Options("float64", "float32")],
         "device": [str],
     }
 
@@ -179,7 +179,7 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
             If demonstrations do not fit together, or with the operators and the robot, or are
             too few for ``n_modes``.
         """
-        self._validate_params()
+        check_parameters(self)
         known = check_demonstrations(X)
         count, wanted = len(known), self.n_modes
         if isinstance(wanted, Integral) and wanted > 1 and count < FEWEST * wanted:

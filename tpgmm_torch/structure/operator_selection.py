@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
-from sklearn.utils._param_validation import Interval, StrOptions
 
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
@@ -152,14 +152,14 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     """
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
-        "candidates": ["array-like", tuple, None],
+        "candidates": ["array-like", None],
         "robot": [Kinematics, None],
         "tolerance": [Interval(Real, 0, None, closed="neither")],
         "threshold": [Interval(Real, 0, None, closed="left")],
         "n_instants": [Interval(Integral, 2, None, closed="left")],
-        "holds": [StrOptions({"auto"}), "array-like", tuple, None],
+        "holds": [Options("auto"), "array-like", None],
         "robust": ["boolean"],
-        "dtype": [StrOptions({"float64", "float32"})],
+        "dtype": [Options("float64", "float32")],
         "device": [str],
     }
 
@@ -205,7 +205,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         DataError, ShapeError, UnknownNameError
             If there are fewer, or they do not fit the candidates and the robot.
         """
-        self._validate_params()
+        check_parameters(self)
         demonstrations = check_demonstrations(X)
         if len(demonstrations) < FEWEST:
             raise DataError(

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin, clone
-from sklearn.utils._param_validation import Interval, StrOptions
 
 from tpgmm_torch.alignment.events import EventAlignment
 from tpgmm_torch.alignment.linear import LinearTimeNormalization
+from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.events.boundaries import find_boundaries
@@ -115,7 +115,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         "robot": [Kinematics, None],
         "agreement": [Interval(Real, 0, 1, closed="right")],
         "shortest": [Interval(Real, 0, 1, closed="left")],
-        "selection": [StrOptions({"auto"}), OperatorSelection, None],
+        "selection": [Options("auto"), OperatorSelection, None],
     }
 
     def __init__(
@@ -150,7 +150,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         DataError, ShapeError, UnknownNameError
             If the demonstrations do not fit together, or with the robot.
         """
-        self._validate_params()
+        check_parameters(self)
         demonstrations = check_demonstrations(X)
         phases, reasons = self._candidates(demonstrations)
         cuts = self._agreed(phases, reasons)

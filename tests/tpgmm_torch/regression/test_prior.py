@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from sklearn.utils._param_validation import InvalidParameterError
 
 from tests.support.skills import HANDS, handlings, hands, hands_model
 from tests.support.worlds import upper_body
@@ -17,6 +16,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.exceptions import (
     DataError,
+    InvalidParameterError,
     ShapeError,
     UnknownNameError,
 )
