@@ -52,6 +52,8 @@ class Interval:
 
     Examples
     --------
+    >>> from numbers import Integral, Real
+    >>> from tpgmm_torch.constraints import Interval
     >>> 0.0 in Interval(Real, 0, 1, closed="left"), 1 in Interval(Real, 0, 1, closed="left")
     (True, False)
     >>> print(Interval(Integral, 1, None, closed="left"))
@@ -90,6 +92,7 @@ class Options:
 
     Examples
     --------
+    >>> from tpgmm_torch.constraints import Options
     >>> print(Options("time", "kmeans"))
     one of 'kmeans', 'time'
     """
