@@ -115,18 +115,14 @@ def reduce(
 
 def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:
     """The last step from the base to each other link: the joint, and the link before it."""
-    neighbours: dict[str, list[tuple[UrdfJoint, str]]] = {link: [] for link in model.links}
-    for joint in model.joints:
-        neighbours[joint.parent].append((joint, joint.child))
-        neighbours[joint.child].append((joint, joint.parent))
-    steps: dict[str, tuple[UrdfJoint, str]] = {}
-    front = [base]
-    while front:
-        near = front.pop()
-        for joint, far in neighbours[near]:
-            if far != base and far not in steps:
-                steps[far] = joint, near
-                front.append(far)
+    above = {joint.child: joint for joint in model.joints}
+    steps = {child: (joint, joint.parent) for child, joint in above.items()}
+    steps.pop(base, None)
+    near = base
+    while near in above:  # towards the root, joints are crossed from child to parent
+        joint = above[near]
+        steps[joint.parent] = joint, near
+        near = joint.parent
     return steps
 
 

@@ -463,7 +463,8 @@ def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
 
 def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tuple[str, Array]]]:
     """The base, and for each wanted link a link of the URDF and the pose in it."""
-    places = {link: (link, np.eye(4)) for link in model.links}
+    here = np.eye(4)
+    places = {link: (link, here) for link in model.links}
     if config["base"] not in places:
         raise UnknownNameError("base link", config["base"], "the URDF", model.links)
     for name, (parent, position, orientation) in config["tools"].items():

@@ -190,7 +190,7 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     if root.tag != "robot":
         other = OTHER_FORMATS.get(root.tag, "")
         raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{other}")
-    if any("xacro" in element.tag for element in root.iter()):
+    if any("xacro" in tag for tag in {element.tag for element in root.iter()}):
         raise DataError(XACRO)
     links = tuple(_names(root, "link"))
     if not links:
