@@ -10,7 +10,6 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
@@ -28,8 +27,7 @@ from lerobot_policy_tpgmm.environments.metaworld.hand import (
 from lerobot_policy_tpgmm.evaluation.metaworld.nearness import Nearness
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
-from tpgmm_torch.alignment import LinearTimeNormalization
-from tpgmm_torch.alignment.text import parse_alignment
+from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
 
 __all__ = ["LEARNERS", "Actor", "Perceptron", "TaskParameterized", "switches"]
 
@@ -58,24 +56,22 @@ def switches(references: Rows) -> list[int]:
     return [int(i) + 1 for i in np.flatnonzero(jumps)]
 
 
-def smoothed(references: Rows, width: int) -> Rows:
-    """References whose positions are means over ``width`` steps; the last column stays."""
-    places = np.pad(references[:, :-1], ((width // 2, width // 2), (0, 0)), mode="edge")
-    means = sliding_window_view(places, width, axis=0).mean(axis=-1)
-    return np.column_stack((means, references[:, -1]))
+def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
+    """Demonstrations at ``pace`` of their speed; the switches that all of them have are events.
 
-
-def with_switches(episodes: Sequence[Recorded], smoothing: int) -> list[Demonstration]:
-    """Demonstrations with the switches of the gripper as events, if all have as many."""
-    found = [switches(episode.references) for episode in episodes]
-    demonstrations = [
-        replace(one, references=smoothed(one.references, smoothing)).demonstration()
-        for one in episodes
-    ]
-    if len({len(steps) for steps in found}) > 1:
-        return demonstrations
+    Switches count from the first: some experts take a second grip, and others do not need it.
+    """
+    demonstrations = [episode.demonstration() for episode in episodes]
+    found = [switches(episode.references[:-1]) for episode in episodes]
     return [
-        replace(one, events={f"switch {i + 1}": step / FPS for i, step in enumerate(steps)})
+        replace(
+            one,
+            time=one.time / pace,
+            events={
+                f"switch {i + 1}": step / FPS / pace
+                for i, step in enumerate(steps[: min(map(len, found))])
+            },
+        )
         for one, steps in zip(demonstrations, found, strict=True)
     ]
 
@@ -93,16 +89,17 @@ class TaskParameterized:
 
     Parameters
     ----------
-    smoothing : int
-        References of the hand are moving means over so many steps, an odd number. The experts'
-        gains make the hand's target swing by centimetres, ten times a second, out of step in
-        different demonstrations: their mean would say nothing.
+    pace : float
+        The speed of the reproduction, as a share of the demonstrations'. The experts move the
+        target as fast as Meta-World lets them: at their own pace, what differs from them falls
+        behind, and cuts the corners and the depth of a push.
     steps_per_component : int
         How much of the skill one Gaussian is for, of at least ``fewest``.
     fewest : int
-    alignment : str
-        As :func:`~tpgmm_torch.alignment.text.parse_alignment` reads it; linear where it needs
-        events and the grippers switch differently often.
+    warping : dict
+        Of :class:`~tpgmm_torch.alignment.DynamicTimeWarping`, between switches of the gripper:
+        its defaults are for motions of several seconds, these last about one. The default
+        compares where the target is, whose speed is always the same.
     nearness : Nearness or None
         The prior on covariances.
     clock : str or None
@@ -112,10 +109,17 @@ class TaskParameterized:
         Of the estimator.
     """
 
-    smoothing: int = 9
-    steps_per_component: int = 6
+    pace: float = 0.8
+    steps_per_component: int = 3
     fewest: int = 8
-    alignment: str = "events+dtw"
+    warping: dict[str, Any] = field(
+        default_factory=lambda: {
+            "features": ["hand"],
+            "penalty": 0.3,
+            "smoothing": 0.04,
+            "fallback": False,
+        }
+    )
     nearness: Nearness | None = field(default_factory=Nearness)
     clock: str | None = None
     options: dict[str, Any] = field(default_factory=dict)
@@ -126,8 +130,8 @@ class TaskParameterized:
         """Learn from episodes; ``seed`` is that of EM."""
         robot = metaworld_robot()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # parts without motion stay on linear time
-            demonstrations = self._aligned(with_switches(episodes, self.smoothing), robot)
+            warnings.simplefilter("ignore")
+            demonstrations = self._aligned(paced(episodes, self.pace), robot)
             n_steps = len(demonstrations[0])
             model = TaskParameterizedGMM(
                 max(self.fewest, n_steps // self.steps_per_component),
@@ -139,6 +143,8 @@ class TaskParameterized:
                     "plausibility": "ignore",
                     "robust": False,
                     "random_state": seed,
+                    # a gripper that closes is a step, which Gaussians across it would smear
+                    "parts": [*demonstrations[0].events] or None,
                     **self.options,
                 },
             ).fit(demonstrations)
@@ -158,7 +164,7 @@ class TaskParameterized:
             closed_loop=self.clock is not None,
             clock=self.clock or "even",
             smoothing=None,
-            chunk_size=len(model.time_),
+            chunk_size=round(float(model.time_[-1] - model.time_[0]) * FPS) + 1,
             largest_start_gap=None,
         )
         return TaskParameterizedActor(policy, self.clock is None)
@@ -166,14 +172,11 @@ class TaskParameterized:
     def _aligned(self, demonstrations: list[Demonstration], robot: Any) -> list[Demonstration]:
         if len(demonstrations) == 1:
             return demonstrations
-        method = self.alignment
-        if method.startswith("events") and not demonstrations[0].events:
-            method = "dtw" if method.endswith("dtw") else "linear"
-        try:
-            alignment = parse_alignment(method, robot) or LinearTimeNormalization(robot=robot)
-            return list(alignment.fit_transform(demonstrations))
-        except ValueError:  # a switch at the very beginning or end is no anchor
-            return list(LinearTimeNormalization(robot=robot).fit_transform(demonstrations))
+        warping = DynamicTimeWarping(robot=robot, **self.warping)
+        if not demonstrations[0].events:
+            return list(warping.fit_transform(demonstrations))
+        events = EventAlignment(duration="median", within=warping, robot=robot)
+        return list(events.fit_transform(demonstrations))
 
 
 class TaskParameterizedActor:

@@ -61,7 +61,11 @@ class Nearness:
         return self.floor + self.ratio * self.reach * (distance / self.reach) ** self.power
 
     def posterior(
-        self, covariances: Tensor, deviation: Tensor, n_demonstrations: int
+        self,
+        covariances: Tensor,
+        deviation: Tensor,
+        n_demonstrations: int,
+        lengths: Tensor | None = None,
     ) -> Tensor:
         """Covariances (K, 1 + D, 1 + D) under the prior; slopes over time stay.
 
@@ -72,10 +76,14 @@ class Nearness:
         deviation : Tensor of shape (K, D)
             The prior's standard deviations.
         n_demonstrations : int
+        lengths : Tensor of shape (D,), dtype bool, optional
+            Which coordinates are lengths: given time, they are independent of the others.
         """
         slope = covariances[:, 1:, :1] / covariances[:, :1, :1]
         steep = slope @ covariances[:, :1, 1:]
         given_time = covariances[:, 1:, 1:] - steep
+        if lengths is not None:
+            given_time = given_time * (lengths[:, None] == lengths)
         total = n_demonstrations + self.strength
         blended = n_demonstrations * given_time + self.strength * (deviation**2).diag_embed()
         result = covariances.clone()
@@ -87,27 +95,29 @@ class Nearness:
     ) -> TaskParameterizedGMM:
         """A fitted model under the prior; operators are ``Canonical`` and relative positions.
 
-        Coordinates of ``Canonical`` that are no lengths keep their covariance.
+        Coordinates of ``Canonical`` that are no lengths keep their variance, and lose their
+        covariance with those that are: a gripper does not close because a hand is elsewhere.
         """
         covariances = []
         for operator, mean, covariance in zip(
             model.operators_, model.means_, model.covariances_, strict=True
         ):
+            lengths = None
             if isinstance(operator, Canonical):
-                distance = torch.full_like(mean[:, 1:], self.reach)
-                deviation = self.deviation(distance)
-                lengths = list(model.kinematics_.lengths)
-                others = [i for i in range(mean.shape[1] - 1) if i not in lengths]
-                deviation[:, others] = self.floor
+                lengths = torch.zeros(mean.shape[1] - 1, dtype=torch.bool)
+                lengths[list(model.kinematics_.lengths)] = True
+                deviation = self.deviation(torch.full_like(mean[:, 1:], self.reach))
+                deviation[:, ~lengths] = self.floor
             else:
                 distance = mean[:, 1:].norm(dim=1, keepdim=True)
                 deviation = self.deviation(distance).expand(-1, mean.shape[1] - 1)
-            covariances.append(self.posterior(covariance, deviation, n_demonstrations))
+            covariances.append(self.posterior(covariance, deviation, n_demonstrations, lengths))
         settings = model.get_params(deep=False) | {
             "n_components": model.n_components_,
             "operators": list(model.operators_),
             "robot": model.kinematics_,
             "holds": [],
+            "parts": None,  # they are in the components
         }
         prior = TaskParameterizedGMM.from_parameters(
             model.weights_, model.means_, covariances, model.time_, **settings

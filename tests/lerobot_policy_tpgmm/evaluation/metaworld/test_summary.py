@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
+from lerobot_policy_tpgmm.environments.metaworld.hand import metaworld_robot
 from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     Perceptron,
     TaskParameterized,
-    smoothed,
+    paced,
     switches,
 )
 from lerobot_policy_tpgmm.evaluation.metaworld.nearness import Nearness
@@ -101,17 +102,35 @@ def test_too_few_successes_are_refused():
         successes(episodes, 2, "push-v3")
 
 
-def test_smoothing_ends_swinging_and_keeps_lines_and_grippers():
-    steps = np.arange(90.0)
-    line = np.column_stack((steps, -steps, 0 * steps, steps > 40))
-    assert np.allclose(smoothed(line, 15)[7:-7], line[7:-7])
-    swinging = line.copy()
-    swinging[:, 0] += 20 * np.sin(2 * np.pi * steps / 15)
-    assert np.allclose(smoothed(swinging, 15)[7:-7], line[7:-7])
-
-
 def test_switches_are_where_the_gripper_jumps():
     assert switches(reaching(0).references) == [30]
+
+
+def test_events_are_the_switches_that_all_demonstrations_have():
+    once, twice = reaching(0), reaching(1)
+    twice.references[50:, -1] = 1.0
+    first, second = paced([once, twice], 0.5)
+    assert first.events == second.events == {"switch 1": pytest.approx(30 / 80 / 0.5)}
+    assert float(first.time[-1]) == pytest.approx(59 / 80 / 0.5)
+    once.references[30:, -1] = 1.0  # never closed: nothing is common
+    assert not any(one.events for one in paced([once, twice], 0.5))
+
+
+def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
+    """Its means at equal shares of the time are flat: 3 cm apart, of an amplitude of 5 cm."""
+    shown, steps = [], np.arange(110)
+    for seed, wait in enumerate((0, 10, 20)):
+        one = reaching(seed, 110)
+        one.references[:, 3] = 1.0
+        clock = np.clip(steps - wait, 0, None) * 110 / (110 - wait)
+        one.references[:, 2] = 0.2 + 0.05 * np.sin(2 * np.pi * clock / 24)
+        shown.append(one)
+    for warping, largest in (({}, 0.015), ({"max_slope": 1}, 0.04)):
+        learner = TaskParameterized()
+        learner = replace(learner, warping=learner.warping | warping)
+        aligned = learner._aligned(paced(shown, learner.pace), metaworld_robot())
+        heights = torch.stack([one.joints[:, 2] for one in aligned])
+        assert largest / 3 < float(heights.std(0).mean()) < largest
 
 
 def test_the_prior_is_what_its_formula_says():
@@ -127,6 +146,18 @@ def test_the_prior_is_what_its_formula_says():
     given = [torch.linalg.inv(torch.linalg.inv(c)[:, 1:, 1:]) for c in (before, after)]
     expected = (3 * given[0] + 2 * (deviation**2).diag_embed()) / 5
     assert torch.allclose(given[1], expected)
+
+
+def test_the_prior_can_part_lengths_from_other_coordinates():
+    prior = Nearness()
+    root = torch.randn(5, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    before = root @ root.mT
+    lengths = torch.tensor([True, True, False])
+    after = prior.posterior(before, torch.ones(5, 3, dtype=torch.float64), 3, lengths)
+    given = torch.linalg.inv(torch.linalg.inv(after)[:, 1:, 1:])
+    assert torch.allclose(given[:, 2, :2], torch.zeros(5, 2, dtype=torch.float64), atol=1e-9)
+    assert (given[:, 0, 1].abs() > 0.01).all()
+    assert torch.allclose(after[:, 0], before[:, 0])
 
 
 def test_one_demonstration_is_enough_to_reach_another_goal():
