@@ -163,7 +163,10 @@ def report(results: Results, out: Path) -> None:
     )
     with replacing(out / "results.md") as file:
         file.write_text(text, encoding="utf-8")
-    write_table(episode_table(found), out / "episodes")
+    # its demonstrations are those of the training seed
+    shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
+    rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
+    write_table(episode_table(rows), out / "episodes")
     typer.echo(summary(found))
 
 

@@ -72,7 +72,7 @@ def successes(episodes: Sequence[Recorded], n: int, task: str) -> list[Recorded]
     if len(solved) < n:
         raise DataError(
             f"the expert of {task} solved {len(solved)} of {len(episodes)} situations; {n} "
-            "demonstrations need more of them, see --recorded"
+            "demonstrations need more of them, see --record"
         )
     return solved[:n]
 

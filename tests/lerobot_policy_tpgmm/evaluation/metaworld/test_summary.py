@@ -3,12 +3,15 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
 from lerobot_policy_tpgmm.environments.metaworld.hand import metaworld_robot
 from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
+from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
+from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     Perceptron,
     TaskParameterized,
@@ -69,6 +72,21 @@ def test_tables_put_tpgmm_first_and_leave_room_where_nothing_was_measured():
     assert push.endswith("|  | 1/4 |")
     assert reach.endswith("| 2/4 |  |")
     assert ("tuned" in push) == ("push-v3" in TUNED)
+
+
+def test_a_report_is_written_of_all_cells_that_are_there(tmp_path):
+    results = Results(tmp_path / "cells")
+    for solved, seed in ((4, 0), (2, 7)):
+        place = Cell("push-v3", "tpgmm", 3, seed)
+        rest = {"settings": {"pace": 0.8}, "versions": {"numpy": "2"}}
+        expert = {"episodes": 12, "successes": 11}
+        results.write(place, cell("push-v3", 3, solved, seed=seed) | rest | {"expert": expert})
+    report(results, tmp_path)
+    text = (tmp_path / "results.md").read_text(encoding="utf-8")
+    assert "solved 22 of 24" in text and "| push-v3 | hard, tuned | 6/8 |" in text
+    table = pd.read_parquet(tmp_path / "episodes.parquet")
+    assert table["demonstration_seed"].tolist() == [0] * 4 + [7] * 4
+    assert table["success"].sum() == 6
 
 
 def test_situations_of_demonstrations_tuning_and_evaluation_are_different():
