@@ -140,7 +140,9 @@ class CompiledRegression(Regression):
         with torch.inference_mode(False), torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what torch asks of itself
             examples = tuple(torch.empty_like(x).copy_(x) for x in inputs)
-            program = torch.export.export(Tick(self, self.served_frames), examples)
+            tick = Tick(self, self.served_frames)
+            # traced, not interpreted: the default of later versions, not of PyTorch 2.7
+            program = torch.export.export(tick, examples, strict=False)
             if self.backend != "inductor":
                 graph = torch.compile(program.module(), backend=self.backend, fullgraph=True)
                 return lambda inputs: graph(*inputs)
@@ -190,11 +192,11 @@ class Tick(torch.nn.Module):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         regression, count = self._regression, len(self._names)
-        joints, positions, orientations = inputs[0], inputs[1 : 1 + count], inputs[1 + count :]
+        joints, poses = inputs[0], inputs[1 : 1 + 2 * count]
         frames = {
             name: Frame._from(position, orientation)
             for name, position, orientation in zip(
-                self._names, positions, orientations, strict=False
+                self._names, poses[:count], poses[count:], strict=True
             )
         }
         time, *parts = inputs[1 + 2 * count :]
