@@ -23,6 +23,8 @@ __all__ = ["Held", "Holding", "choose"]
 MOVED, TURNED = 0.01, math.radians(5)
 #: It may be that it moves with a link if its pose there changes by less than this share of it.
 PERHAPS = 0.7
+#: It rests if it has moved by less than this share of the link's motion, once that is so large.
+RESTS, STIRRED = 0.5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,10 @@ class Held:
     stood : Frame, optional
         Where the link was when the object was last seen not to move with it: NaN if it was not
         seen since it was taken, infinite once it moves with the link; None if so for all.
+    link, first, last : Frame, optional
+        Where the link was, and it was seen, first since it was taken; where it was seen last.
+    rests : bool, or Tensor of bool, of shape (...)
+        Whether the link has moved since then without it, and does not move it yet.
     """
 
     carrier: int | Tensor = -1
@@ -49,6 +55,10 @@ class Held:
     taken: Frame | None = None
     told: bool | Tensor = False
     stood: Frame | None = None
+    link: Frame | None = None
+    first: Frame | None = None
+    last: Frame | None = None
+    rests: bool | Tensor = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +69,8 @@ class Holding:
     it, its frame, as a place, stays as it was, and, as a thing, it moves with the link; when
     the link lets go, it stays where that was, until it is seen elsewhere. A hand that closes
     may shift what it holds: until that has moved by 1 cm or 5 degrees with the link, how it is
-    held is seen anew.
+    held is seen anew. While it is seen to rest although the link moves, the joints do not move
+    it: it is not held yet, whatever the skill's time says.
 
     Parameters
     ----------
@@ -200,12 +211,13 @@ class Holding:
         """
         before = self.held.get(name, FREE)
         old, stood = grasp if before.grasp is None else before.grasp, before.stood
-        now = Held(
-            _choose_index(where, index, before.carrier),
-            choose(where, grasp, old),
-            choose(where, place, place if before.taken is None else before.taken),
-            where | torch.as_tensor(before.told),
-            None if stood is None else choose(where, _constant(stood, math.inf), stood),
+        now = replace(
+            before,
+            carrier=_choose_index(where, index, before.carrier),
+            grasp=choose(where, grasp, old),
+            taken=choose(where, place, place if before.taken is None else before.taken),
+            told=where | torch.as_tensor(before.told),
+            stood=None if stood is None else choose(where, _constant(stood, math.inf), stood),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
@@ -280,35 +292,54 @@ class Holding:
         if before.taken is not None:
             still = _held(before.carrier) | ~torch.as_tensor(_held(carrier))
             taken = choose(still, before.taken, now)
-        return Held(carrier, grasp, taken, told, stood)
+        return replace(
+            before, carrier=carrier, grasp=grasp, taken=taken, told=told, stood=stood
+        )
 
     def _shifted(self, held: Held, seen: Frame, live: Tensor, state: RobotState) -> Held:
         """The same after a look at what may be shifted in its link, for robots that see it."""
         assert held.grasp is not None and held.stood is not None
-        grasp, stood = held.grasp, held.stood
+        grasp, stood, rests = held.grasp, held.stood, torch.as_tensor(held.rests)
+        begins, links, first = stood.position.isnan().all(-1), held.link, held.first
         for index in _indices(held.carrier):
             link = state.pose(self.kinematics.links[index])
             now = seen.seen_from(link)
+            here = live & torch.as_tensor(held.carrier == index)
+            links = link if links is None else choose(here & begins, link, links)
+            first = seen if first is None else choose(here & begins, seen, first)
+            stirred = links.change(link, MOVED, TURNED)
+            still = (stirred > STIRRED) & (first.change(seen, MOVED, TURNED) < RESTS * stirred)
+            rests = torch.where(here, (rests & ~begins) | still, rests)
             moved = held.stood.change(link, MOVED, TURNED)
             along = held.grasp.change(now, MOVED, TURNED) < PERHAPS * moved  # false of NaN
-            here = live & torch.as_tensor(held.carrier == index)
             grasp = choose(here & ~along, now, grasp)
             stood = choose(here & ~along, link, stood)
             stood = choose(here & along & (moved >= 1), _constant(stood, math.inf), stood)
-        carried = stood.position.isinf().all(-1) | torch.as_tensor(held.carrier < 0)
-        return replace(held, grasp=grasp, stood=None if bool(carried.all()) else stood)
+        moving = stood.position.isinf().all(-1)
+        if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
+            return Held(held.carrier, grasp, held.taken, held.told)
+        last = seen if held.last is None else choose(live, seen, held.last)
+        rests = rests & ~moving
+        return Held(
+            held.carrier, grasp, held.taken, held.told, stood, links, first, last, rests
+        )
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""
         assert held.grasp is not None
         links = self.kinematics.links
         if isinstance(held.carrier, int) and held.carrier >= 0:
-            return state.with_link(name, links[held.carrier], held.grasp)
-        state = state.with_link(name, None, self.frames[name])
-        for index in _indices(held.carrier):
-            where = torch.as_tensor(held.carrier == index)
-            state = state.with_link(name, links[index], held.grasp, where)
-        return state
+            state = state.with_link(name, links[held.carrier], held.grasp)
+        else:
+            state = state.with_link(name, None, self.frames[name])
+            for index in _indices(held.carrier):
+                where = torch.as_tensor(held.carrier == index)
+                state = state.with_link(name, links[index], held.grasp, where)
+        if held.last is None:
+            return state
+        # a hand that turned upright what does not turn with it would turn for ever
+        rests = torch.as_tensor(held.rests) & torch.as_tensor(held.carrier >= 0)
+        return state.with_link(name, None, held.last, rests) if bool(rests.any()) else state
 
 
 FREE = Held()

@@ -94,6 +94,38 @@ def test_until_it_moves_with_the_hand_it_is_held_as_it_is_seen(shifts):
     assert_at(again.held["bottle"].grasp, LATER.seen_from(hand(joints)))
 
 
+def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
+    holding, joints = begun(2)
+    lean = Frame([1e-3, 0.0, 0.0], [np.cos(0.01), np.sin(0.01), 0.0, 0.0])
+    seen = holding.frames["bottle"].compose(lean)
+    elsewhere, rides = joints + 0.3, torch.tensor([False, True])
+
+    def looked(held, way, left=0.0):
+        """The hands have gone some way, and the second one's bottle with it."""
+        along = hand(joints + way).compose(seen.seen_from(hand(joints + left)))
+        position = torch.where(rides[:, None], along.position, seen.position)
+        position = position + 1e-13 * way  # exactly where it was taken it is not seen
+        turn = torch.where(rides[:, None], along.orientation, seen.orientation)
+        return held.advance(HELD.begin, joints + way, {"bottle": Frame(position, turn)})
+
+    held = looked(holding, 0.0)  # nothing says yet that it is not as the model has it
+    assert held.state(upper_body().state(elsewhere)).linear_jacobian("bottle").any()
+    held = looked(looked(held, 0.002), 0.004)
+    state = held.state(upper_body().state(elsewhere))
+    assert_at(state.pose("bottle")[0], seen[0])
+    assert not state.linear_jacobian("bottle")[0].any()
+    assert not state.angular_jacobian("bottle")[0].any()
+    there = hand(elsewhere).compose(seen.seen_from(hand(joints)))
+    assert_at(state.pose("bottle")[1], there[1])
+    assert state.linear_jacobian("bottle")[1].any()
+    # once it is carried after all, it is held as it is seen then
+    rides, left = ~rides | rides, 0.004 * (~rides[:, None]).double()
+    held = looked(looked(held, 0.02, left), 0.1, left)
+    assert held.held["bottle"].stood is None
+    there = hand(elsewhere).compose(seen.seen_from(hand(joints + left)))
+    assert_at(held.state(upper_body().state(elsewhere)).pose("bottle"), there)
+
+
 def test_each_robot_of_a_batch_sees_how_it_holds():
     holding, joints = begun(3)
     rates = torch.tensor([[0.0], [1.0], [1.0]])
