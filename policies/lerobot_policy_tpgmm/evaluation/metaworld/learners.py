@@ -34,6 +34,9 @@ __all__ = ["LEARNERS", "Actor", "Perceptron", "TaskParameterized", "switches"]
 Rows = NDArray[np.float64]
 #: A change of the wanted opening by more than this, in a step, is a gripper that switches.
 SWITCH = 0.2
+#: Switches that are nearer to each other, or to the beginning or end [steps], are no events:
+#: what is between them is too little to learn from.
+APART = 3
 #: An object is there if it is ever further than this from the origin [m].
 ABSENT = 1e-6
 
@@ -56,13 +59,22 @@ def switches(references: Rows) -> list[int]:
     return [int(i) + 1 for i in np.flatnonzero(jumps)]
 
 
+def apart(steps: Sequence[int], n_steps: int) -> list[int]:
+    """Those of ``steps`` that are ``APART`` from the one before, the beginning and the end."""
+    kept = [0]
+    for step in steps:
+        if step - kept[-1] >= APART and step + APART <= n_steps:
+            kept.append(step)
+    return kept[1:]
+
+
 def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     """Demonstrations at ``pace`` of their speed; the switches that all of them have are events.
 
     Switches count from the first: some experts take a second grip, and others do not need it.
     """
     demonstrations = [episode.demonstration() for episode in episodes]
-    found = [switches(episode.references[:-1]) for episode in episodes]
+    found = [apart(switches(one.references), len(one.references)) for one in episodes]
     return [
         replace(
             one,

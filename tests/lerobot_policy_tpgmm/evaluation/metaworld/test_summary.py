@@ -134,6 +134,16 @@ def test_events_are_the_switches_that_all_demonstrations_have():
     assert not any(one.events for one in paced([once, twice], 0.5))
 
 
+def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
+    shown = reaching(1)
+    for step in (1, 40, 41, 58, 59):
+        shown.references[step:, -1] = 1 - shown.references[step:, -1]
+    assert switches(shown.references) == [1, 30, 40, 41, 58, 59]
+    [one] = paced([shown], 1.0)
+    assert [round(80 * instant) for instant in one.events.values()] == [30, 40]
+    TaskParameterized().fit([shown], 0)
+
+
 def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
     """Its means at equal shares of the time are flat: 3 cm apart, of an amplitude of 5 cm."""
     shown, steps = [], np.arange(110)
