@@ -267,7 +267,9 @@ class Controller:
                 self._inputs.poses.keys() - known, self._frames, stands, self.holding,
                 _of_each(seconds, stands),
             )  # fmt: skip
-        self.holding = self.holding.advance(time, stands, seen, told)
+        self.holding = self.holding.advance(
+            time, stands, seen, told, dt=_of_each(seconds, stands)
+        )
         at = self._unbent(at)
         estimate = self._estimated(time, at)
         if self._via is not None:

@@ -10,8 +10,15 @@ from typing import Self
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
-from tpgmm_torch.control.holding import MOVED, PERHAPS, TURNED, Holding, choose
+from tpgmm_torch.control.holding import (
+    MOVED,
+    PERHAPS,
+    SETTLING,
+    TURNED,
+    Holding,
+    between,
+    choose,
+)
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -25,8 +32,6 @@ WITH = 0.4
 LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
 #: How often that is looked at [s].
 LOOK = 0.1
-#: How fast a place follows what rests there, but is seen a little elsewhere [s].
-SETTLING = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +152,7 @@ class HoldWatch:
         settled = settled.clamp(max=1.0) if isinstance(settled, Tensor) else min(1.0, settled)
         share = torch.where(settles, settled, elsewhere.to(moved))
         stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
-        pose = _between(rest.pose, rest.seen, share)
+        pose = between(rest.pose, rest.seen, share)
         return replace(rest, pose=pose, joints=stood), holding, bool(held.any())
 
     def _lost(
@@ -166,13 +171,3 @@ class HoldWatch:
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
         since = rest.since.masked_fill(due, 0.0) if isinstance(rest.since, Tensor) else 0.0
         return replace(rest, pose=pose, joints=stood, away=away, since=since), holding
-
-
-def _between(one: Frame, other: Frame, share: Tensor) -> Frame:
-    """Some of the way from one pose to another."""
-    share = share.unsqueeze(-1)
-    position = one.position + share * (other.position - one.position)
-    turn = quaternions.match_hemisphere(other.orientation, one.orientation)
-    return Frame._from(
-        position, quaternions.normalize(one.orientation + share * (turn - one.orientation))
-    )

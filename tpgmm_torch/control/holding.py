@@ -10,6 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import UnknownNameError
@@ -25,6 +26,9 @@ MOVED, TURNED = 0.01, math.radians(5)
 PERHAPS = 0.7
 #: It rests if it has moved by less than this share of the link's motion, once that is so large.
 RESTS, STIRRED = 0.5, 0.1
+#: How fast what is seen elsewhere than it was taken to be is followed [s], and how slow a link
+#: must be for it, as a multiple of MOVED and TURNED per second: what is seen may be late.
+SETTLING, SLOW = 1.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +48,10 @@ class Held:
     stood : Frame, optional
         Where the link was when the object was last seen not to move with it: NaN if it was not
         seen since it was taken, infinite once it moves with the link; None if so for all.
-    link, first, last : Frame, optional
-        Where the link was, and it was seen, first since it was taken; where it was seen last.
+    link : Frame, optional
+        Where the link was first since it took it; at the last look, once it moves with it.
+    first, last : Frame, optional
+        Where it was seen first since it was taken, and last.
     rests : bool, or Tensor of bool, of shape (...)
         Whether the link has moved since then without it, and does not move it yet.
     """
@@ -69,8 +75,10 @@ class Holding:
     it, its frame, as a place, stays as it was, and, as a thing, it moves with the link; when
     the link lets go, it stays where that was, until it is seen elsewhere. A hand that closes
     may shift what it holds: until that has moved by 1 cm or 5 degrees with the link, how it is
-    held is seen anew. While it is seen to rest although the link moves, the joints do not move
-    it: it is not held yet, whatever the skill's time says.
+    held is seen anew. Afterwards what is seen is followed within a second, while the link
+    hardly moves: two hands that come together may have moved alike, and what is held may slip.
+    While it is seen to rest although the link moves, the joints do not move it: it is not held
+    yet, whatever the skill's time says.
 
     Parameters
     ----------
@@ -134,6 +142,7 @@ class Holding:
         frames: Mapping[str, Frame] | None = None,
         told: Mapping[str, str | None] | None = None,
         where: Tensor | None = None,
+        dt: float | Tensor = 0.0,
     ) -> Self:
         """The next moment.
 
@@ -151,6 +160,8 @@ class Holding:
             they are free from now on. The model's holds of that object no longer count.
         where : Tensor of bool, of shape (...), optional
             For which robots that is told; by default for all.
+        dt : float, or Tensor of shape (...), default=0
+            Since the last moment [s].
 
         Raises
         ------
@@ -180,7 +191,7 @@ class Holding:
                     live = _held(carrier) & ~_same(seen[name], before.taken)
                     if bool(live.any()):
                         state = self.kinematics.state(joints) if state is None else state
-                        held[name] = self._shifted(held[name], seen[name], live, state)
+                        held[name] = self._seen(held[name], seen[name], live, state, dt)
                 continue
             state = self.kinematics.state(joints) if state is None else state
             now = self._now(name, place, before, seen.get(name), state)
@@ -296,6 +307,25 @@ class Holding:
             before, carrier=carrier, grasp=grasp, taken=taken, told=told, stood=stood
         )
 
+    def _seen(
+        self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
+    ) -> Held:
+        """The same after a look at what is held, for robots that see it."""
+        assert held.grasp is not None and held.stood is not None
+        grasp, moving = held.grasp, held.stood.position.isinf().all(-1)
+        share, links = torch.as_tensor(dt / SETTLING).clamp(max=1.0), held.link
+        for index in _indices(held.carrier) if bool(moving.any()) else ():
+            link = state.pose(self.kinematics.links[index])
+            before = link if held.link is None else held.link
+            here = live & moving & torch.as_tensor(held.carrier == index)
+            rests = here & (before.change(link, MOVED, TURNED) < SLOW * torch.as_tensor(dt))
+            grasp = choose(rests, between(held.grasp, seen.seen_from(link), share), grasp)
+            links = link if links is None else choose(here, link, links)
+        held = replace(held, grasp=grasp, link=links)
+        if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
+            return held
+        return self._shifted(held, seen, live, state)
+
     def _shifted(self, held: Held, seen: Frame, live: Tensor, state: RobotState) -> Held:
         """The same after a look at what may be shifted in its link, for robots that see it."""
         assert held.grasp is not None and held.stood is not None
@@ -317,7 +347,7 @@ class Holding:
             stood = choose(here & along & (moved >= 1), _constant(stood, math.inf), stood)
         moving = stood.position.isinf().all(-1)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
-            return Held(held.carrier, grasp, held.taken, held.told)
+            return Held(held.carrier, grasp, held.taken, held.told, stood, links)
         last = seen if held.last is None else choose(live, seen, held.last)
         rests = rests & ~moving
         return Held(
@@ -398,3 +428,20 @@ def choose(where: bool | Tensor, one: Frame, other: Frame) -> Frame:
     mask = where[..., None]
     position = torch.where(mask, one.position, other.position)
     return Frame._from(position, torch.where(mask, one.orientation, other.orientation))
+
+
+def between(one: Frame, other: Frame, share: Tensor) -> Frame:
+    """Some of the way from one pose to another.
+
+    Parameters
+    ----------
+    one, other : Frame
+    share : Tensor of shape (...)
+        Of the way, from 0 to 1.
+    """
+    share = share.unsqueeze(-1)
+    position = one.position + share * (other.position - one.position)
+    turn = quaternions.match_hemisphere(other.orientation, one.orientation)
+    return Frame._from(
+        position, quaternions.normalize(one.orientation + share * (turn - one.orientation))
+    )
