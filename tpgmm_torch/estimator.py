@@ -102,6 +102,7 @@ from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
     check_operators,
+    column_units,
     kinematics_for,
     regularization,
 )
@@ -171,8 +172,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         from 0 to 1; slopes over time stay as they are. N demonstrations leave N - 1 directions
         in which they differ, and what seems exact across these is chance. "auto" follows from
         N and the number of coordinates, for each component and operator, and falls as 1 / N
-        (``oracle_approximating_intensity``);
-        0 is the paper's.
+        (``oracle_approximating_intensity``); it also moderates the variances of coordinates of
+        one unit by each other (``moderated_variances``), of which few demonstrations say
+        little. 0 is the paper's.
     tol : float, default=1e-3
         EM stops when the mean log-likelihood gains less.
     max_iter : int, default=100
@@ -2044,7 +2046,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         settings = {name: getattr(self, name) for name in MIXTURE_PARAMETERS}
         if n_components is not None:
             settings["n_components"] = n_components
-        return settings | {"blocks": block_widths(operators, kinematics), "timed_blocks": True}
+        return settings | {
+            "blocks": block_widths(operators, kinematics),
+            "column_units": column_units(operators, kinematics),
+            "timed_blocks": True,
+        }
 
     def _situation(self, given: Situation | Demonstration) -> Situation:
         names, like = self.kinematics_.joint_names, self.time_

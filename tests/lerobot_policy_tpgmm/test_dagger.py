@@ -133,9 +133,8 @@ def test_a_person_corrects_and_the_policy_goes_on(tmp_path, monkeypatch):
     assert abs(float(begin) - BEGIN) < 0.5 and abs(float(end) - END) < 0.5
     corrected = TaskParameterizedGMM.load(tmp_path / "model")
     bent = reproduced(corrected, shown) - path
-    elbow = bent[:, NAMES.index("l_elbow")]
-    middle = round((BEGIN + END) / 2 * RATE)
-    assert -0.3 < float(elbow[middle]) < -0.005
+    # one of five: arms move otherwise where a person led them, and as before afterwards
+    assert 0.03 < float(bent[round(BEGIN * RATE) : round(END * RATE)].abs().max()) < 0.3
     assert float(bent[round(6 * RATE) :].abs().max()) < 0.02
     again = TPGMMPolicy.from_pretrained(tmp_path / "corrected").to_estimator()
     assert torch.allclose(again.means_[0], corrected.means_[0])

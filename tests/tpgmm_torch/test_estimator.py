@@ -71,6 +71,7 @@ from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.variance_moderation import moderated_variances
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.persistence import MODEL
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -183,6 +184,13 @@ def test_few_demonstrations_shrink_covariances_given_time_towards_the_diagonal()
         share = oracle_approximating_intensity(em.covariance, 4.0)[:, None, None]
         diagonal = torch.diag_embed(em.covariance.diagonal(dim1=1, dim2=2))
         shrunk = (1 - share) * em.covariance + share * diagonal
+        names = model.operators_[j].units(model.kinematics_)
+        moderated = diagonal.diagonal(dim1=1, dim2=2).clone()
+        for unit in {*names} - {None}:
+            alike = [i for i, name in enumerate(names) if name == unit]
+            moderated[:, alike] = moderated_variances(moderated[:, alike], 4.0)
+        ratio = (moderated / diagonal.diagonal(dim1=1, dim2=2)).sqrt()
+        shrunk = shrunk * ratio[:, :, None] * ratio[:, None, :]
         torch.testing.assert_close(ours.covariance, shrunk, rtol=1e-6, atol=1e-10)
         gains.append(float(share.min()))
     assert min(gains) > 0.1

@@ -210,19 +210,20 @@ def run(controller, situation, moved=None, at=0.8):
 
 @pytest.mark.filterwarnings(FAR)
 def test_while_both_are_open_the_way_is_changed_without_a_jump():
-    model, switched = fitted(Handles), 0
+    model, switched, gaps = fitted(Handles, 2), 0, []
     for situation, moved in zip(
-        Handles().situations(2, 2), reach_of_one_handle(2, 3), strict=True
+        Handles().situations(3, 4), reach_of_one_handle(3, 5), strict=True
     ):
         controller = model.controller(situation.joints, situation.frames)
         first = controller.mode
         largest = run(controller, situation, moved)
         plain = [m.controller(situation.joints, situation.frames) for m in model.models_]
-        assert largest <= 1.2 * max(run(one, situation, moved) for one in plain)
+        assert largest <= 1.25 * max(run(one, situation, moved) for one in plain)
         gap = tip(controller.reference) - Handles().handles(moved.frames["object"])
-        assert float(gap.norm(dim=-1).min()) < 0.015
+        gaps.append(float(gap.norm(dim=-1).min()))
         switched += controller.mode != first
     assert switched >= 1
+    assert max(gaps) < 0.015
 
 
 def test_who_is_left_alone_stays_on_the_way_that_was_chosen():

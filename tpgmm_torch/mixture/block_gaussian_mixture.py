@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -43,6 +44,7 @@ from tpgmm_torch.large_data.row_batches import BatchedRows, Rows, StoredRows, ar
 from tpgmm_torch.large_data.row_points import RowPoints
 from tpgmm_torch.mixture.initial_parameters import InitialParameters
 from tpgmm_torch.mixture.initialization import check_distinct, draw_starts
+from tpgmm_torch.mixture.variance_moderation import moderate
 
 __all__ = ["BlockGaussianMixture", "fit_subsets"]
 
@@ -86,7 +88,12 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     covariance_shrinkage : float or "auto", default=0
         How far the full or tied covariances that EM found go towards their diagonals, from 0
         to 1. "auto" follows from the number of samples and of columns, component by component
-        (:func:`~tpgmm_torch.em.covariance_shrinkage.oracle_approximating_intensity`).
+        (:func:`~tpgmm_torch.em.covariance_shrinkage.oracle_approximating_intensity`); it also
+        moderates the variances of columns of one unit by each other
+        (:func:`~tpgmm_torch.mixture.variance_moderation.moderated_variances`).
+    column_units : sequence of str or None, of shape (n_features,), optional
+        The unit of each column, for "auto": those of one unit in one block are alike. None is
+        for columns that are like no other; by default all are.
     n_demonstrations : float, optional
         How many samples there are for "auto", where the rows are those of so many
         demonstrations that each visit every component; None counts each row.
@@ -168,6 +175,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
         "regularization": [Options("relative", "absolute")],
         "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), Options("auto")],
+        "column_units": ["array-like", None],
         "n_demonstrations": [Interval(Real, 0, None, closed="neither"), None],
         "timed_blocks": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
@@ -195,6 +203,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
         regularization: str = "relative",
         covariance_shrinkage: float | str = 0.0,
+        column_units: Sequence[str | None] | None = None,
         n_demonstrations: float | None = None,
         timed_blocks: bool = False,
         max_iter: int = 100,
@@ -218,6 +227,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.reg_covar = reg_covar
         self.regularization = regularization
         self.covariance_shrinkage = covariance_shrinkage
+        self.column_units = column_units
         self.n_demonstrations = n_demonstrations
         self.timed_blocks = timed_blocks
         self.max_iter = max_iter
@@ -467,7 +477,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.n_features_in_ = sum(units.widths)
         self._set(units.restore(best.parameters))
         self.unshrunk_covariances = self.covariances_
-        self._set(units.restore(self._shrunk(best.parameters, n_rows)))
+        self._set(self._shrunk(best.parameters, n_rows, units))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
         self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
         self.lower_bound_ = self.lower_bounds_[-1]
@@ -487,17 +497,30 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             )
         return self
 
-    def _shrunk(self, parameters: Parameters, n_rows: int) -> Parameters:
-        """What EM found, with covariances shrunk where they have correlations."""
+    def _shrunk(
+        self, parameters: Parameters, n_rows: int, units: Standardization
+    ) -> Parameters:
+        """What EM found, restored, with covariances shrunk where they have correlations."""
         if self.covariance_type not in ("full", "tied") or self.covariance_shrinkage == 0:
-            return parameters
+            return units.restore(parameters)
         n_samples: Tensor | float = n_rows  # those of a tied covariance
         if self.n_demonstrations is not None:
             n_samples = self.n_demonstrations
         elif self.covariance_type == "full":
             n_samples = n_rows * parameters.weights
         given = int(self.timed_blocks)
-        return shrink(parameters, self.covariance_shrinkage, n_samples, given=given)
+        shrunk = shrink(parameters, self.covariance_shrinkage, n_samples, given=given)
+        restored = units.restore(shrunk)
+        if self.column_units is None or self.covariance_shrinkage != "auto":
+            return restored
+        names = iter(self.column_units)
+        if len(self.column_units) != sum(units.widths):
+            raise ShapeError(
+                f"column_units has {len(self.column_units)} units, but the data have "
+                f"{sum(units.widths)} columns"
+            )
+        of_blocks = [tuple(islice(names, width))[given:] for width in units.widths]
+        return moderate(restored, of_blocks, n_samples, given=given)
 
     def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
         """Fit, and return :meth:`predict` of the same points."""

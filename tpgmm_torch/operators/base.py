@@ -187,6 +187,13 @@ class Operator(Tabular, ABC):
         """
         return (0.0,) * self.dimension(kinematics)
 
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """The unit of each coordinate; None, the default, if it is like no other.
+
+        Few demonstrations say little of a variance: those of one unit are learned together.
+        """
+        return (None,) * self.dimension(kinematics)
+
     def links(self) -> tuple[str, ...]:
         """Links of the robot, and objects it may carry, whose pose is needed; default none."""
         return ()

@@ -89,6 +89,13 @@ class Canonical(Operator):
             tolerances[start : start + 4] = [self.tolerance / 2] * 4
         return tuple(tolerances)
 
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Metres and radians; a gripper's share or a part of a quaternion is like no other."""
+        if kinematics is None:
+            return super().units(kinematics)
+        known = dict.fromkeys(kinematics.lengths, "m") | dict.fromkeys(kinematics.angles, "rad")
+        return tuple(map(known.get, self.columns(kinematics.joint_names)))
+
     def dimension(self, kinematics: Kinematics | None) -> int:
         """The number of joints."""
         if kinematics is None:

@@ -77,6 +77,10 @@ class _Orientation(Operator):
         """The tolerance; of a quaternion half of it, which a turn moves by half its angle."""
         return (self.tolerance,) * 3 if self._tangent else (self.tolerance / 2,) * 4
 
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Radians; those of a quaternion, whose length does not vary, are unlike each other."""
+        return ("rad",) * 3 if self._tangent else (None,) * 4
+
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """All of it is a quaternion, if it is one."""
         return () if self._tangent else (0,)

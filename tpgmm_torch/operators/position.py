@@ -47,6 +47,10 @@ class AbsolutePosition(Operator):
         """The tolerance, along each axis."""
         return (self.tolerance,) * 3
 
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Metres."""
+        return ("m",) * 3
+
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_p (q - q_{t-1}) = mu - x_{t-1}``."""
         if self.link in state.robot_links:
@@ -109,6 +113,10 @@ class RelativePosition(Operator):
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """The tolerance, along each axis."""
         return (self.tolerance,) * 3
+
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Metres."""
+        return ("m",) * 3
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J (q - q_{t-1}) = R mu + p - x_{t-1}``.

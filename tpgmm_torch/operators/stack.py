@@ -149,6 +149,10 @@ class Stack(Operator):
         """Those of the members, side by side."""
         return tuple(t for o in self.operators for t in o.tolerances(kinematics))
 
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Those of the members, side by side."""
+        return tuple(unit for o in self.operators for unit in o.units(kinematics))
+
     def links(self) -> tuple[str, ...]:
         """All links of the members."""
         return tuple(dict.fromkeys(name for o in self.operators for name in o.links()))

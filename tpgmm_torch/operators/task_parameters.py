@@ -11,6 +11,7 @@ from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators.base import Linearization, Operator
+from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["TaskParameters"]
@@ -63,6 +64,12 @@ class TaskParameters(Operator):
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """The tolerance, for every column of A."""
         return (self.tolerance,) * self.dimension(kinematics)
+
+    def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
+        """Those of what a square A maps; nothing is known of other columns."""
+        if self.size is not None:
+            return super().units(kinematics)
+        return Canonical().units(kinematics) if self.link is None else ("m",) * 3
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``A^+ J (q - q_{t-1}) = mu + A^+ (b - x_{t-1})``, with J = I for the joints."""

@@ -291,6 +291,8 @@ class Kinematics(Tabular, abc.ABC):
         Where unit quaternions start in the joint vector; robots have none.
     lengths : tuple of int, default=()
         Which coordinates are lengths [m]; others are angles, or numbers of another kind.
+    angles : tuple of int, default=()
+        Which coordinates are known to be angles [rad].
 
     Examples
     --------
@@ -319,6 +321,7 @@ class Kinematics(Tabular, abc.ABC):
     without_limits: tuple[str, ...] = ()
     quaternion_starts: tuple[int, ...] = ()
     lengths: tuple[int, ...] = ()
+    angles: tuple[int, ...] = ()
 
     @property
     def n_joints(self) -> int:

@@ -285,6 +285,7 @@ class Robot(Kinematics):
         self.lengths = tuple(
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
+        self.angles = tuple(i for i in column.values() if i not in self.lengths)
         tree = reduce(model, *_wanted(model, config), column, config["locked"])
         if max(len(self.joint_names), len(tree.frames)) > MOST_JOINTS:
             raise DataError(

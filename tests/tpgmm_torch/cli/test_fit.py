@@ -160,7 +160,7 @@ def test_fit_finds_operators_and_says_why(dataset, tmp_path):
 
 
 def test_fit_finds_the_number_of_components(dataset, tmp_path):
-    steady = ("--rate", 2, "--alignment", "linear", *CALMLY)
+    steady = ("--rate", 4, "--alignment", "linear", *CALMLY)
     options = ("--operator", "canonical", "--n-components", "auto", *steady)
     printed = output("fit", dataset, *UPPER_BODY, *options, "--out", tmp_path / "model")
     model = TaskParameterizedGMM.load(tmp_path / "model")

@@ -29,6 +29,7 @@ from tpgmm_torch.exceptions import (
     ShapeError,
 )
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture, fit_subsets
+from tpgmm_torch.mixture.variance_moderation import moderated_variances
 
 BATTERY = """
 import json, warnings
@@ -732,3 +733,24 @@ def test_too_few_rows_are_refused():
     members[1, :3] = True
     with pytest.raises(DataError, match=r"n_components=6, but the data hold only 3 distinct"):
         together(X, members)
+
+
+def test_units_of_other_data_say_which_variances_are_moderated():
+    X = movements(200)
+    blocks, n = FOLD_WIDTHS, sum(FOLD_WIDTHS)
+    settings = {"n_components": 2, "blocks": blocks, "covariance_shrinkage": "auto"}
+    settings |= {"n_demonstrations": 3, "random_state": 0}
+    plain = BlockGaussianMixture(**settings).fit(X)
+    alone = BlockGaussianMixture(**settings, column_units=[None] * n).fit(X)
+    alike = BlockGaussianMixture(**settings, column_units=["m"] * n).fit(X)
+    for before, same, after in zip(
+        plain.covariances_, alone.covariances_, alike.covariances_, strict=True
+    ):
+        torch.testing.assert_close(same, before)
+        variances = before.diagonal(dim1=1, dim2=2)
+        if variances.shape[-1] > 1:
+            torch.testing.assert_close(
+                after.diagonal(dim1=1, dim2=2), moderated_variances(variances, 2)
+            )
+    with pytest.raises(ShapeError, match=f"1 units, but the data have {n} columns"):
+        BlockGaussianMixture(**settings, column_units=["m"]).fit(X)

@@ -17,6 +17,7 @@ from tpgmm_torch import (
     Stack,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.joint_space import JointSpace
 
 
 class BothHandsLaws(RelativeLaws, OrientationLaws):
@@ -135,3 +136,15 @@ def test_joints_stacked_with_joints_keep_their_type(dtype):
     assert torch.equal(at.jacobian, torch.cat((identity, identity)).expand(2, -1, -1))
     assert torch.equal(at.matrix, torch.block_diag(identity, identity).expand(2, -1, -1))
     assert torch.equal(at.displacement, -torch.cat((state.joints, state.joints), dim=-1))
+
+
+def test_the_units_of_its_coordinates_are_those_of_its_members():
+    robot = upper_body()
+    turn = RelativeOrientation(LEFT, OBJECT)
+    stack = Stack(RelativePosition(LEFT, OBJECT), turn, Canonical())
+    assert stack.units(robot) == ("m",) * 3 + (None,) * 4 + ("rad",) * 17
+    tangent = RelativeOrientation(LEFT, OBJECT, geometry="tangent")
+    assert Stack(tangent).units(robot) == ("rad",) * 3
+    hands = Poses([LEFT, RIGHT])  # of quaternions no coordinate is like another
+    assert Canonical().units(hands) == (*("m",) * 3, *(None,) * 4) * 2
+    assert Canonical().units(JointSpace(["knee", "gripper"])) == (None, None)  # not known

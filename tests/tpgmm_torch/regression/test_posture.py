@@ -88,16 +88,17 @@ def test_what_is_reached_is_left_to_the_regression():
     assert torch.equal(wanted, estimate.joints) and not bool(begun.active)
 
 
-@pytest.mark.parametrize("place", [[0.28, 0.0, 0.4], [0.12, 0.11, 0.55]])
-def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
+@pytest.mark.parametrize(
+    ("place", "creeps"), [([0.28, 0.0, 0.4], 3e-3), ([0.12, 0.11, 0.55], 1e-3)]
+)
+def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place, creeps):
     frame = Frame(torch.tensor(place, dtype=torch.float64))
-    found, search = searched(frame, neutral(), 120)
+    found, search = searched(frame, neutral(), 350)
     lower, upper = limits()
     assert all(bool(((q >= lower) & (q <= upper)).all()) for q in found)
-    assert float((found[-1] - found[-6]).abs().max()) < 1e-3
+    assert float((found[-1] - found[-6]).abs().max()) < creeps  # the first's valley is long
     assert bool(search.active)
-    # the best of many starts, within 12 % of its distance: after 1,400 ticks one of both is
-    # within 5 %, the other still at 9
+    # the best of many starts, within 5 % of its distance
     generator = torch.Generator().manual_seed(1)
     many = torch.rand(1, 60, 17, generator=generator, dtype=torch.float64)
     many, damping = lower + (upper - lower) * many, torch.zeros(1, 60, dtype=torch.float64)
@@ -105,7 +106,7 @@ def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
         cost = costs(frame, many[0])
         many, damping, height, _ = _descended(cost, many, damping, lower, upper)
     here = float(costs(frame, found[-1][None])(found[-1][None, None])[0])
-    assert here <= 1.12**2 * float(height.min())
+    assert here <= 1.05**2 * float(height.min())
 
 
 def test_a_robot_does_not_depend_on_its_batch():
