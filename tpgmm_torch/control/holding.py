@@ -26,9 +26,11 @@ MOVED, TURNED = 0.01, math.radians(5)
 PERHAPS = 0.7
 #: It rests if it has moved by less than this share of the link's motion, once that is so large.
 RESTS, STIRRED = 0.5, 0.1
-#: How fast what is seen elsewhere than it was taken to be is followed [s], and how slow a link
-#: must be for it, as a multiple of MOVED and TURNED per second: what is seen may be late.
-SETTLING, SLOW = 1.0, 2.0
+#: How fast what is seen elsewhere than it was taken to be is followed [s].
+SETTLING = 1.0
+#: What is seen may be late: it counts by half where a link is by this share of MOVED or TURNED
+#: from where it was in the mean of so many seconds.
+BEHIND, LATELY = 0.4, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ class Held:
         Where the link was when the object was last seen not to move with it: NaN if it was not
         seen since it was taken, infinite once it moves with the link; None if so for all.
     link : Frame, optional
-        Where the link was first since it took it; at the last look, once it moves with it.
+        Where the link was first since it took it; in the mean of late, once it moves with it.
     first, last : Frame, optional
         Where it was seen first since it was taken, and last.
     rests : bool, or Tensor of bool, of shape (...)
@@ -75,7 +77,7 @@ class Holding:
     it, its frame, as a place, stays as it was, and, as a thing, it moves with the link; when
     the link lets go, it stays where that was, until it is seen elsewhere. A hand that closes
     may shift what it holds: until that has moved by 1 cm or 5 degrees with the link, how it is
-    held is seen anew. Afterwards what is seen is followed within a second, while the link
+    held is seen anew. Afterwards what is seen is followed within seconds, while the link
     hardly moves: two hands that come together may have moved alike, and what is held may slip.
     While it is seen to rest although the link moves, the joints do not move it: it is not held
     yet, whatever the skill's time says.
@@ -313,14 +315,15 @@ class Holding:
         """The same after a look at what is held, for robots that see it."""
         assert held.grasp is not None and held.stood is not None
         grasp, moving = held.grasp, held.stood.position.isinf().all(-1)
-        share, links = torch.as_tensor(dt / SETTLING).clamp(max=1.0), held.link
+        dt, links = torch.as_tensor(dt, dtype=grasp.position.dtype), held.link
         for index in _indices(held.carrier) if bool(moving.any()) else ():
             link = state.pose(self.kinematics.links[index])
-            before = link if held.link is None else held.link
+            before = link if links is None else links
             here = live & moving & torch.as_tensor(held.carrier == index)
-            rests = here & (before.change(link, MOVED, TURNED) < SLOW * torch.as_tensor(dt))
-            grasp = choose(rests, between(held.grasp, seen.seen_from(link), share), grasp)
-            links = link if links is None else choose(here, link, links)
+            behind = before.change(link, MOVED, TURNED) / BEHIND
+            share = (dt / SETTLING).clamp(max=1.0) / (1 + behind.square())
+            grasp = choose(here, between(grasp, seen.seen_from(link), share), grasp)
+            links = choose(here, between(before, link, (dt / LATELY).clamp(max=1.0)), before)
         held = replace(held, grasp=grasp, link=links)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
             return held

@@ -107,11 +107,11 @@ def test_how_it_is_held_is_mended_while_the_hand_rests():
     grasp = held.held["bottle"].grasp
     assert float((grasp.position - slipped.position).norm()) < 5e-4  # noise 3.5 mm
     assert float(grasp.change(slipped, 1.0, 1.0)) < 2e-3
-    # while the hand moves, what is seen may be late: 0.1 s here
+    # while the hand moves, by half a metre, what is seen may be late: 0.1 s here
     for k in range(1, 100):
         late = hand(still + 0.004 * (k - 10)).compose(slipped)
         held = held.advance(3.0, still + 0.004 * k, {"bottle": late}, dt=dt)
-    assert_at(held.held["bottle"].grasp, grasp)
+    assert float((held.held["bottle"].grasp.position - grasp.position).norm()) < 1e-3
 
 
 def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
