@@ -555,7 +555,8 @@ class LocalizingProgress(WaitingProgress):
     @property
     def relocalized(self) -> Tensor:
         """See :attr:`Progress.relocalized`."""
-        return torch.as_tensor(self.moved, device=self.regression.kinematics.lower.device)
+        moved = np.asarray(self.moved)  # of numpy's scalars, old versions make no tensors
+        return torch.as_tensor(moved, device=self.regression.kinematics.lower.device)
 
     @property
     def belief(self) -> Tensor:

@@ -192,8 +192,8 @@ def load_exported(path: str | Path) -> ExportedController:
                 f"{value!r}: export the model again here"
             )
     try:
-        package = torch._C._aoti.AOTIModelPackageLoader(str(path), "model", False, 1, -1)
-    except RuntimeError as error:
+        package = torch._inductor.aoti_load_package(str(path)).loader
+    except (AssertionError, RuntimeError) as error:  # PyTorch 2.7 asserts that it ends in .pt2
         raise ModelFileError(f"{path} cannot be loaded: {error}") from error
     return ExportedController(package, contents)
 

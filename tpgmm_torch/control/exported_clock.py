@@ -343,10 +343,11 @@ class _Localizing(_Waiting):
             torch.zeros(n, dtype=double),
             torch.zeros(n_frames, 7, dtype=double),
         )
-        program = torch.export.export(_Look(self.look), given)
+        program = torch.export.export(_Look(self.look), given, strict=False)
         for name, constant in program.constants.items():
             program.constants[name] = constant.clone()  # which may not share their memory
-        self._look = program.module()
+        module = program.module()  # without its hooks, which PyTorch 2.7 does not trace
+        self._look = torch.fx.GraphModule(module, module.graph)
 
     def look(
         self,
