@@ -69,7 +69,7 @@ from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.conditioning import Conditioning
-from tpgmm_torch.regression.prior import PRIOR_STD, prior_widths
+from tpgmm_torch.regression.prior import PRIOR_STD, given_widths, prior_widths
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.joint_space import JointSpace
@@ -2034,7 +2034,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def _kinematics_for(
         self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
     ) -> Kinematics:
-        return kinematics_for(demonstrations, operators, self.robot, self.dtype, self.device)
+        found = kinematics_for(demonstrations, operators, self.robot, self.dtype, self.device)
+        given_widths(self.prior_std, found.joint_names)  # refused now, not after learning
+        return found
 
     def _shared_settings(
         self,

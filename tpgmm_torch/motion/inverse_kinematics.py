@@ -8,6 +8,7 @@ bases and locked joints count.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +19,13 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    PlausibilityWarning,
+    ShapeError,
+    UnknownNameError,
+)
 from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["follow_poses", "reach"]
@@ -38,8 +45,9 @@ def follow_poses(
     rate: float,
     posture: Any = None,
     orientations: bool = True,
+    tolerance: float = 0.01,
 ) -> Tensor:
-    """Joints with which links follow poses, shape (T, n_joints).
+    """Joints with which links follow poses, shape (T, n_joints), as near as they can.
 
     Parameters
     ----------
@@ -56,6 +64,14 @@ def follow_poses(
         once.
     orientations : bool, default=True
         False lets links turn as they like.
+    tolerance : float, default=0.01
+        How far from its poses a link may be [m and rad] before a warning says so; infinity
+        for none.
+
+    Warns
+    -----
+    PlausibilityWarning
+        If a link is farther from a pose than that: where it is worst, and by how much.
 
     Raises
     ------
@@ -98,7 +114,18 @@ def follow_poses(
         if ways is not None:
             solver.seek(ways[step])
         joints.append(solver.step({link: frame[step] for link, frame in poses.items()}))
-    return torch.stack(joints)
+    found = torch.stack(joints)
+    left = _left(robot, found, poses, orientations)
+    if told := [
+        _told(link, *errors) for link, errors in left.items() if _worst(*errors) > tolerance
+    ]:
+        warnings.warn(
+            f"the poses are missed: {', '.join(told)}. They are out of reach, faster than the "
+            f"joints may move, or far from the start",
+            PlausibilityWarning,
+            stacklevel=2,
+        )
+    return found
 
 
 def reach(
@@ -139,14 +166,11 @@ def reach(
     solver = _Solver(robot, poses, start, posture, STEP, orientations)
     for _ in range(MOST_STEPS):
         left = _left(robot, solver.joints, poses, orientations)
-        if max(max(error) for error in left.values()) <= tolerance:
+        if max(_worst(*errors) for errors in left.values()) <= tolerance:
             break
         solver.step(poses)
     else:
-        told = [
-            f"{link!r} is {1e3 * away:.1f} mm, {math.degrees(turn):.1f} deg away"
-            for link, (away, turn) in left.items()
-        ]
+        told = [_told(link, *errors) for link, errors in left.items()]
         raise DataError(
             f"the poses are not reached from this start: {', '.join(told)}. Start nearer, ask "
             "for positions alone (orientations=False), or for poses within reach"
@@ -156,16 +180,29 @@ def reach(
 
 def _left(
     robot: Robot, joints: Tensor, poses: Mapping[str, Frame], orientations: bool
-) -> dict[str, tuple[float, float]]:
-    """How far each link is from its pose [m and rad]."""
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """How far each link is from its poses [m and rad]."""
     state, left = robot.state(joints), {}
     for link, pose in poses.items():
+        away = (pose.position.to(joints) - state.position(link)).norm(dim=-1)
         turn = quaternions.product(
-            pose.orientation, quaternions.conjugate(state.orientation(link))
+            pose.orientation.to(joints), quaternions.conjugate(state.orientation(link))
         )
-        angle = float(quaternions.log(turn).norm()) if orientations else 0.0
-        left[link] = float((pose.position - state.position(link)).norm()), angle
+        angle = quaternions.log(turn).norm(dim=-1)
+        left[link] = away, angle if orientations else torch.zeros_like(angle)
     return left
+
+
+def _worst(away: Tensor, turn: Tensor) -> float:
+    return float(torch.maximum(away, turn).max())
+
+
+def _told(link: str, away: Tensor, turn: Tensor) -> str:
+    """How far a link is from its pose, or from the one of many that it misses by most."""
+    number = int(torch.maximum(away, turn).argmax())
+    of = f" from pose {number} of {len(away)}" if away.ndim else ""
+    far = 1e3 * float(away.flatten()[number]), math.degrees(float(turn.flatten()[number]))
+    return f"{link!r} is {far[0]:.1f} mm, {far[1]:.1f} deg away{of}"
 
 
 class _Solver:

@@ -14,7 +14,7 @@ from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["PRIOR_STD", "prior_widths"]
+__all__ = ["PRIOR_STD", "given_widths", "prior_widths"]
 
 #: The default, [rad] or times the learned positions' size.
 PRIOR_STD = 10.0
@@ -53,14 +53,7 @@ def prior_widths(
         of theirs.
     """
     names, like = kinematics.joint_names, weights.detach()
-    if not isinstance(prior_std, Real | Mapping):
-        given = as_tensor(prior_std, "prior_std").to(like)
-        if given.shape != (len(names),):
-            raise ShapeError(
-                f"prior_std has one value for each of the joints {list(names)}, got shape "
-                f"{tuple(given.shape)}"
-            )
-        return _positive(given)
+    given = given_widths(prior_std, names)
     number = prior_std if isinstance(prior_std, Real) else PRIOR_STD
     widths = like.new_full((len(names),), float(number))
     lengths = list(kinematics.lengths)
@@ -68,17 +61,50 @@ def prior_widths(
         widths[lengths] = widths[lengths] * _size(
             kinematics, operators, weights, means, covariances
         )
-    if isinstance(prior_std, Mapping):
-        for name, value in prior_std.items():
+    for name, value in given.items():
+        widths[names.index(name)] = value.to(like)
+    return widths
+
+
+def given_widths(prior_std: Any, names: Sequence[str]) -> dict[str, Tensor]:
+    """What is given joint by joint, checked: nothing of a number, which is for all of them.
+
+    Parameters
+    ----------
+    prior_std : float, mapping of str to float, or array-like of shape (n_joints,)
+        As for :func:`prior_widths`.
+    names : sequence of str
+        The joints.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        As for :func:`prior_widths`.
+    """
+    if isinstance(prior_std, Real):
+        widths = {}
+        values = [float(prior_std)]
+    elif isinstance(prior_std, Mapping):
+        for name in prior_std:
             if name not in names:
                 raise UnknownNameError("joint", name, "the model", names)
-            widths[names.index(name)] = as_tensor(value, f"prior_std of {name!r}").to(like)
-    return _positive(widths)
-
-
-def _positive(widths: Tensor) -> Tensor:
-    if not bool((widths > 0).all()):
-        raise DataError(f"prior_std must be positive, got {widths.tolist()}")
+        widths = {n: as_tensor(v, f"prior_std of {n!r}") for n, v in prior_std.items()}
+        for name, width in widths.items():
+            if width.ndim:
+                raise ShapeError(
+                    f"prior_std of {name!r} is one number, got shape {tuple(width.shape)}"
+                )
+        values = [float(width) for width in widths.values()]
+    else:
+        array = as_tensor(prior_std, "prior_std")
+        if array.shape != (len(names),):
+            raise ShapeError(
+                f"prior_std has one value for each of the joints {list(names)}, got shape "
+                f"{tuple(array.shape)}"
+            )
+        widths, values = dict(zip(names, array, strict=True)), array.tolist()
+    if not all(value > 0 for value in values):
+        raise DataError(f"prior_std must be positive, got {values}")
     return widths
 
 

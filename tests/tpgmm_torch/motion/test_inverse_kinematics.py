@@ -10,7 +10,13 @@ import torch
 from tests.support.robot_zoo import HANDS, random_joints, upper_body, zoo
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Frame, quaternions
-from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import (
+    DataError,
+    DependencyError,
+    PlausibilityWarning,
+    ShapeError,
+    UnknownNameError,
+)
 from tpgmm_torch.motion.inverse_kinematics import follow_poses, reach
 from tpgmm_torch.robots.robot import Robot
 
@@ -91,6 +97,33 @@ def test_postures_go_with_the_poses() -> None:
     assert away[0] < 0.02 < away[1]
     with pytest.raises(ShapeError, match="60 poses need as many postures, or one; got 3"):
         follow_poses(skill.robot, poses, shown[0], rate=25, posture=bent.expand(3, -1))
+
+
+class TestMissing:
+    robot = upper_body(joints="l_*")
+    start = torch.tensor([0.5, 0.5, -0.3, -1.5, 0, 0, 0], dtype=torch.float64)
+
+    def poses(self, way: Any) -> dict[str, Frame]:
+        here = self.robot.state(self.start).pose("l_hand")
+        return {"l_hand": Frame(here.position + way, here.orientation.expand(len(way), 4))}
+
+    def test_poses_out_of_reach_are_named(self) -> None:
+        way = torch.zeros(30, 3, dtype=torch.float64)
+        way[:, 0] = torch.linspace(0, 1.5, 30)
+        with pytest.warns(
+            PlausibilityWarning, match=r"'l_hand' is .* mm, .* from pose 29 of 30"
+        ):
+            joints = follow_poses(self.robot, self.poses(way), self.start, rate=10)
+        assert joints.isfinite().all()
+
+    def test_a_start_elsewhere_is_a_miss(self) -> None:
+        way = torch.full((30, 3), 0.03, dtype=torch.float64)
+        with pytest.warns(PlausibilityWarning, match=r"'l_hand' is 52\.0 mm, .* pose 0 of 30"):
+            follow_poses(self.robot, self.poses(way), self.start, rate=10)
+
+    def test_as_much_as_is_allowed_is_no_miss(self) -> None:
+        way = torch.full((30, 3), 0.03, dtype=torch.float64)
+        follow_poses(self.robot, self.poses(way), self.start, rate=10, tolerance=0.06)
 
 
 class TestRefusing:

@@ -114,10 +114,13 @@ def test_every_form_is_saved_and_serves(tmp_path):
         ({"left.x": float("nan")}, DataError, "NaN"),
         ([1.0, 2.0], ShapeError, r"got shape \(2,\)"),
         ([0.0] * 14, DataError, "must be positive"),
+        ({"left.x": [1.0, 2.0]}, ShapeError, "one number"),
     ],
 )
 def test_what_is_no_width_is_refused(prior_std, error, message):
-    model = hands_model(prior_std=prior_std).fit(handlings())
+    with pytest.raises(error, match=message):
+        hands_model(prior_std=prior_std).fit(handlings())
+    model = hands_model().fit(handlings()).set_params(prior_std=prior_std)
     with pytest.raises(error, match=message):
         model.regression()
 

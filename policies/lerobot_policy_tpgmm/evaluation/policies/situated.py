@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
@@ -188,7 +189,9 @@ class MovesPolicy(SituatedPolicy):
             link: minimum_jerk_path(here[link], [pose], [SOLVED], rows)
             for link, pose in targets.items()
         }
-        return follow_poses(self.robot, paths, near, rate=SOLVED, posture=near)[-1]
+        return follow_poses(
+            self.robot, paths, near, rate=SOLVED, posture=near, tolerance=math.inf
+        )[-1]
 
 
 @PreTrainedConfig.register_subclass("key_poses")
@@ -240,7 +243,10 @@ class KeyPosesPolicy(MovesPolicy):
         wanted = faded(joints, self.mean[move.begin :], self.mean[move.begin], fps)
         posture = wanted[np.round(rows).astype(int)] if self.config.posture else start
         rate = (len(rows) - 1) / length * fps
-        solved = follow_poses(self.robot, paths, start, rate=rate, posture=posture)
+        # what it misses shows in its episodes
+        solved = follow_poses(
+            self.robot, paths, start, rate=rate, posture=posture, tolerance=math.inf
+        )
         spline = CubicSpline(rows, as_array(solved), bc_type="clamped")
         after = np.arange(step, move.end) - move.begin
         references = torch.from_numpy(spline(after.clip(0, length)))
