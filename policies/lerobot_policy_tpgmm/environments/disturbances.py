@@ -248,7 +248,8 @@ class Moved(Disturbance):
         On the table, in a random direction [m].
     angle : float, default=20 degrees
         About the vertical, to either side [rad]. Of the directions and sides those are taken
-        that leave the object where the task is meant for.
+        that leave the object where the task is meant for; where there are none, both are
+        shortened by tenths until there are.
     seconds : float, default=0
         How long it takes; 0 is a jump.
     moment : float, default=NaN
@@ -269,11 +270,12 @@ class Moved(Disturbance):
     ) -> Self:
         """On the way to the object, and within its usual places if it is in one of them."""
         drawn = self._moment(rng, FIRST, course.grasp - APPROACH - self.seconds)
-        for _ in range(1000):
+        # where its usual places are narrower than the step, none of whole length may be left
+        for share in np.repeat(np.linspace(1, 0.1, 10), 1000):
             way = rng.uniform(-math.pi, math.pi)
             turn = self.angle * rng.choice((-1, 1))
             level = self.distance * np.array((math.cos(way), math.sin(way), 0.0))
-            step = np.concatenate((level, (0.0, 0.0, turn)))
+            step = share * np.concatenate((level, (0.0, 0.0, turn)))
             if usual(step) or not usual(np.zeros(6)):
                 break
         return drawn if self.step is not None else dataclasses.replace(drawn, step=step)

@@ -215,6 +215,18 @@ def test_all_other_conditions_are_offered():
         assert observation["environment_state"].shape == (14,)
 
 
+def test_where_an_object_may_not_be_turned_as_far_it_is_moved_less():
+    env = SuiteEnv("lid", fps=FPS, condition="moved")
+    shares = []
+    for seed in range(20):
+        env.reset(seed=seed)
+        [part] = env._drawn
+        assert env._task.usual(displaced(env._first, part.step))
+        shares.append(np.linalg.norm(part.step[:3]) / part.distance)
+        assert abs(part.step[5]) == pytest.approx(shares[-1] * part.angle)
+    assert 0.3 < min(shares) < 1
+
+
 def test_the_first_object_is_moved_before_it_is_held_and_within_its_places(motion):
     for seed in range(20):
         env = SuiteEnv("handover", fps=FPS, condition="moved")
