@@ -68,11 +68,6 @@ def follow_poses(
         How far from its poses a link may be [m and rad] before a warning says so; infinity
         for none.
 
-    Warns
-    -----
-    PlausibilityWarning
-        If a link is farther from a pose than that: where it is worst, and by how much.
-
     Raises
     ------
     DependencyError
@@ -82,6 +77,11 @@ def follow_poses(
     DataError, ShapeError
         If the robot cannot be given to mink (joints that follow others), or poses and postures
         are not T each.
+
+    Warns
+    -----
+    PlausibilityWarning
+        If a link is farther from a pose than that: where it is worst, and by how much.
 
     Examples
     --------
