@@ -935,7 +935,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             end=float(self.time_[-1]),
             blend=self.blend,
             bounds=bounds,
-            clock=parse_clock(clock) if isinstance(clock, str) else clock,
+            clock=parse_clock(clock),
         )
 
     def controller(
@@ -1000,7 +1000,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             frames,
             begin=float(self.time_[0]),
             end=float(self.time_[-1]),
-            clock=parse_clock(clock) if isinstance(clock, str) else clock,
+            clock=parse_clock(clock),
             blend=self.blend,
             bounds=bounds if self.keep_limits else None,
             trust=trust,

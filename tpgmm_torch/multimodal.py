@@ -288,7 +288,7 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             As there, and if there are several robots.
         """
         self._check_fitted()
-        clock = parse_clock(clock) if isinstance(clock, str) else clock
+        clock = parse_clock(clock)
         return MultimodalController(self, joints, frames or {}, clock, settings)
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:

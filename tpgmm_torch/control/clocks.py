@@ -842,14 +842,14 @@ CLOCKS: Mapping[str, type[EvenClock] | type[WaitingClock]] = {
 }
 
 
-def parse_clock(text: str) -> Clock:
+def parse_clock(text: str | Clock) -> Clock:
     """The clock that a text stands for.
 
     Parameters
     ----------
-    text : str
+    text : str or Clock
         A kind, ``even``, ``waiting`` or ``localizing``; with options
-        behind a colon, separated by commas.
+        behind a colon, separated by commas. A clock stands for itself.
 
     Raises
     ------
@@ -864,6 +864,12 @@ def parse_clock(text: str) -> Clock:
     >>> parse_clock("waiting:tolerance=3,lag=0.05").lag
     0.05
     """
+    if isinstance(text, Clock):
+        return text
+    if not isinstance(text, str):
+        raise DataError(
+            f"a clock is one of {list(CLOCKS)}, as text or as an object, got {text!r}"
+        )
     kind, colon, options = text.partition(":")
     clock = CLOCKS.get(kind.strip())
     if clock is None:

@@ -519,7 +519,7 @@ def test_robots_in_more_dimensions_and_on_hold(shaking):
     ],
 )
 def test_texts_and_clocks_are_each_others_inverse(text, clock):
-    assert parse_clock(text) == clock
+    assert parse_clock(text) == parse_clock(clock) == clock
     assert format_clock(clock) == text
 
 
@@ -541,6 +541,8 @@ def test_texts_and_clocks_are_each_others_inverse(text, clock):
         ("waiting:lag=-1", r"lag of WaitingClock must be positive, got -1.0"),
         ("localizing:initial=here", r"one of \['beginning', 'anywhere'\], got 'here'"),
         ("even:speed=nan", r"speed of EvenClock must be positive, got nan"),
+        (3, r"one of \['even', 'waiting', 'localizing'\], as text or as an object, got 3"),
+        (EvenClock, "as text or as an object, got <class"),
     ],
 )
 def test_texts_that_are_no_clock_are_refused(text, message):
