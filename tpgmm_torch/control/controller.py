@@ -40,6 +40,8 @@ __all__ = ["Controller"]
 
 #: For so long a robot that was moved is remembered to have been [s].
 PUSH_MEMORY = 0.5
+#: The share of the usual lead of robots that hold something.
+CAREFUL = 1 / 3
 #: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
 #: another one for each size, ends there, before whoever follows enlarges it.
 GRID = 2.0**32
@@ -497,6 +499,7 @@ class Controller:
         self._velocity = torch.where(joints, 0.0, self._velocity)
         if self._follower is not None:
             self._follower = self._follower.put(joints, self.reference)
+        self._search = self._search.ended(robots)
         if self._gap_before is not None:
             rows = joints.numpy(force=True)
             self._gap_before = np.where(rows, 0.0, self._gap_before)
@@ -519,7 +522,9 @@ class Controller:
         # what holds them is not fought, and joints go on together, as a held object needs it
         way = wanted - measured
         size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
-        lead = way * (self._trust.lead / size.clamp(min=self._trust.lead))
+        full = self.holding.busy(waits).to(way) * (CAREFUL - 1) + 1
+        most = self._trust.lead * full.unsqueeze(-1)
+        lead = way * (most / torch.maximum(size, most))
         return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + lead, wanted)
 
     def _checked(self, joints: Any) -> Tensor | None:

@@ -208,6 +208,15 @@ class Holding:
         carrier = self.held.get(name, FREE).carrier
         return torch.as_tensor(carrier, device=like.device).expand(like.shape) < 0
 
+    def busy(self, like: Tensor) -> Tensor:
+        """Which robots hold something: bool, of the shape of ``like``."""
+        return torch.stack(
+            [
+                torch.zeros_like(like, dtype=torch.bool),
+                *(~self.free(n, like) for n in self.held),
+            ]
+        ).any(0)
+
     def taken(self, name: str, index: int, where: Tensor, place: Frame, grasp: Frame) -> Self:
         """A link holds an object that was at a place before, as if that had been told.
 

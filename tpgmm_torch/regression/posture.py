@@ -22,7 +22,7 @@ several minima, others are looked for meanwhile, from a few fixed postures in tu
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Self
 
@@ -135,6 +135,13 @@ class PostureSearch:
         joints = torch.lerp(wanted, estimate.joints, trust.unsqueeze(-1))
         joints = torch.where((trust < 1).unsqueeze(-1), joints, estimate.joints)
         return joints, type(self)(rows & (asked | (trust < 1)), *state)
+
+    def ended(self, robots: Tensor) -> Self:
+        """The same without the searches of robots (...) that were brought elsewhere."""
+        active = None if self.active is None else self.active & ~robots
+        if active is None or not bool(active.any()):
+            return type(self)()
+        return replace(self, active=active)
 
     def _searched(
         self,

@@ -65,7 +65,8 @@ class Trust:
     lag : float
         How late a servo may be: on top of that, what the reference moves in this time [s].
     lead : float
-        How far the reference of a robot that is waited for is ahead of it [rad or m].
+        How far the reference of a robot that is waited for is ahead of it [rad or m]; a third
+        of that if it holds something, which it would lose with a jerk when it is let go.
     longest_step : float
         A loop that stood for longer goes on as if it had stood for that long [s].
 

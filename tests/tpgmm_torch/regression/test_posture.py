@@ -124,3 +124,24 @@ def test_states_may_be_given():
     given, _ = searched(HIGH, neutral(), 3, state_at=small_bottle().kinematics_.state)
     plain, _ = searched(HIGH, neutral(), 3)
     assert all(torch.equal(one, other) for one, other in zip(given, plain, strict=True))
+
+
+def test_a_search_that_ended_begins_anew_where_the_robot_is():
+    start = torch.stack((neutral(), neutral() + 0.05))
+    _, search = searched(REACHED, start, 3)
+    elsewhere = start - 0.2
+    one = search.ended(torch.tensor([True, False]))
+    assert one.active is not None and one.active.tolist() == [False, True]
+    regression = small_bottle().regression()
+    estimate = regression.tick(TIME, elsewhere, {"bottle": REACHED}, limits())
+    asked = torch.ones(2, dtype=torch.bool)
+    steps = [
+        before.advance(
+            regression, TIME, elsewhere, {"bottle": REACHED}, estimate, limits(), asked
+        )[0]
+        for before in (one, PostureSearch(), search)
+    ]
+    torch.testing.assert_close(steps[0][0], steps[1][0], rtol=0, atol=1e-12)
+    torch.testing.assert_close(steps[0][1], steps[2][1], rtol=0, atol=1e-12)
+    assert float((steps[0][0] - steps[2][0]).abs().max()) > 1e-3
+    assert search.ended(asked).active is None and PostureSearch().ended(asked).active is None
