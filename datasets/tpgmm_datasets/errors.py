@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "summed_up"]
+__all__ = ["CHECKS", "DatasetError", "DatasetWarning", "UnknownUnitsError", "summed_up"]
 
 #: The checks that ``relax`` may name, with what each of them refuses.
 CHECKS = {
@@ -57,6 +57,10 @@ class DatasetError(DataError):
         ]
         place = ", ".join(part for part in where if part)
         super().__init__(f"{place}: {message}" if place else message)
+
+
+class UnknownUnitsError(DatasetError):
+    """Nobody said in which units values are, and they do not tell."""
 
 
 class DatasetWarning(UserWarning):

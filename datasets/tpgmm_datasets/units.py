@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.errors import DatasetError, UnknownUnitsError
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.pose_names import is_gripper
@@ -205,7 +205,7 @@ def _check_angles(
         unsure += [f"{told[i]}: not either)" for i in auto if i not in large]
     if unsure:
         because = f", because {others[0]} and joints have one unit" if others else ""
-        raise DatasetError(
+        raise UnknownUnitsError(
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
             "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...}; "
             "'raw' takes them as they are",

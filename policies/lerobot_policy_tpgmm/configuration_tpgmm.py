@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.events.text import parse_event
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.plausibility import Shown
@@ -290,6 +291,14 @@ class TPGMMConfig(StatePolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        try:
+            self._check()
+        except TPGMMError as error:
+            # LeRobot's parser of commands drops the words of a ValueError
+            logging.getLogger(__name__).error("%s", error)
+            raise
+
+    def _check(self) -> None:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise DataError(

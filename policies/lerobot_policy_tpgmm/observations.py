@@ -73,8 +73,9 @@ class JointFeatures(nn.Module):
         if extra:
             raise DataError(
                 f"the action has the entries {extra}, which are no joints of the model; it has "
-                f"{list(joint_names)}. Learn them too; what moves no link of the URDF, like a "
-                "gripper, is one of the robot's coordinates"
+                f"{list(joint_names)}. Learn them too (--policy.joints; what moves no link of "
+                "the URDF, like a gripper, is in --policy.coordinates), or make a set without "
+                "them: tpgmm dataset convert SET NEW --robot ROBOT --robot-joint PATTERN"
             )
         names = {*state_names, *action_names, *joint_names}
         if isinstance(units, Mapping) and (unknown := sorted(set(units) - names)):

@@ -3,8 +3,10 @@
 import copy
 import inspect
 
+import draccus
 import pytest
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_policy
@@ -123,6 +125,12 @@ def test_a_value_that_is_none_is_refused(field, value):
 def test_a_setting_of_the_controller_that_cannot_be_is_refused(options, message):
     with pytest.raises(DataError, match=message):
         TPGMMConfig(device="cpu", **options)
+
+
+def test_what_lerobots_parser_drops_is_told_before(caplog):
+    with pytest.raises(ParsingError):
+        draccus.parse(TPGMMConfig, args=["--clock=foo"])
+    assert "clock 'foo': there is no 'foo'; there are ['even', 'waiting'" in caplog.text
 
 
 def test_a_policy_without_anything_to_learn_from_is_refused():

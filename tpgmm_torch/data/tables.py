@@ -36,6 +36,8 @@ __all__ = [
 ]
 
 EVENT, COVARIANCE = "event.", "covariance."
+#: The column that may be missing.
+EPISODE = "episode"
 #: Where pandas keeps which columns are joints, among the attributes of a table.
 JOINTS = "joints"
 #: Fewer rows do not show that a column counts them.
@@ -126,7 +128,7 @@ def demonstrations_from_frame(
     *,
     joints: Sequence[str] | None = None,
     time: str = "time",
-    episode: str = "episode",
+    episode: str = EPISODE,
 ) -> list[Demonstration]:
     """The demonstrations in a table.
 
@@ -142,7 +144,8 @@ def demonstrations_from_frame(
     time : str, default="time"
         Column of the time [s].
     episode : str, default="episode"
-        Column that tells episodes apart, by numbers or names; without it there is one.
+        Column that tells episodes apart, by numbers or names; a table without a column
+        ``episode`` is one.
 
     Returns
     -------
@@ -187,7 +190,7 @@ def trajectories_from_frame(
     *,
     joints: Sequence[str] | None = None,
     time: str = "time",
-    episode: str = "episode",
+    episode: str = EPISODE,
 ) -> list[Trajectory]:
     """The trajectories in a table as :func:`trajectories_to_frame` makes it.
 
@@ -341,11 +344,14 @@ def _each[Motion](
     episode: str,
 ) -> list[Motion]:
     """What is made of each episode; errors say which."""
+    if not hasattr(table, "columns"):
+        raise DataError(f"a table is a pandas DataFrame, got {type(table).__name__}")
     table = table.rename(columns=str)
     twice = table.columns[table.columns.duplicated()]
     if len(twice):
         raise DataError(f"the table has columns of one name: {sorted(set(twice))}")
-    for name in (time, *(joints or ())):
+    told = () if episode == EPISODE else (episode,)
+    for name in (time, *told, *(joints or ())):
         if name not in table.columns:
             raise UnknownNameError("column", name, "the table", table.columns)
     if not len(table):

@@ -70,7 +70,7 @@ def check(
     the robot, for example. What is unlikely is listed; with --strict it fails too.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import DatasetError, summed_up
+    from tpgmm_datasets.errors import DatasetError, UnknownUnitsError, summed_up
     from tpgmm_datasets.reader import open_recording
 
     description = describe_lerobot(path)
@@ -88,9 +88,12 @@ def check(
     recording = open_recording(path, **recordings.options)
     try:
         report = recording.examine(recording.demonstrations(tell=False))
-    except DatasetError as error:  # units that nobody said are no fault of the set
+    except UnknownUnitsError as error:  # no fault of the set
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
+    except DatasetError as error:
+        typer.echo(f"error: {error}")
+        raise typer.Exit(1) from error
     for finding in report:
         typer.echo(f"{finding.severity}: {finding}")
     if report.errors() or (strict and len(report)):

@@ -1,6 +1,7 @@
 """``tpgmm dataset``: data sets looked at, generated and converted."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -258,6 +259,18 @@ def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, gener
     assert "cannot say whether it is plausible: " in text and "not radians" in text
     result = run("dataset", "check", tmp_path / "degrees", "--units", "rad", *robot)
     assert result.exit_code == 2 and "is none of the values" in result.stderr
+
+
+def test_what_cannot_be_loaded_is_no_good_set(tmp_path, generated):
+    root = tmp_path / "stretched"
+    shutil.copytree(generated, root)
+
+    def stretch(poses):
+        return np.concatenate((poses[:, :3], 1.3 * poses[:, 3:]), axis=1)
+
+    change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", stretch))
+    result = run("dataset", "check", root)
+    assert result.exit_code == 1 and "norm of a quaternion" in result.stdout
 
 
 def write_degrees(folder):

@@ -277,3 +277,13 @@ def test_the_table_given_is_not_changed():
     copy = table.copy(deep=True)
     demonstrations_from_frame(table)
     pd.testing.assert_frame_equal(table, copy)
+
+
+def test_an_episode_column_that_is_asked_for_is_there():
+    table = pd.DataFrame({"run": [1, 1], "time": [0.0, 0.1], "slide": [0.0, 0.2]})
+    [shown] = demonstrations_from_frame(table, episode="run")
+    assert shown.joint_names == ("slide",)
+    with pytest.raises(UnknownNameError, match="column 'rnu' is not in the table; it has"):
+        demonstrations_from_frame(table, episode="rnu")
+    with pytest.raises(DataError, match="a pandas DataFrame, got list"):
+        demonstrations_from_frame([1])
