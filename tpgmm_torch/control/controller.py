@@ -522,8 +522,8 @@ class Controller:
         # what holds them is not fought, and joints go on together, as a held object needs it
         way = wanted - measured
         size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
-        full = self.holding.busy(waits).to(way) * (CAREFUL - 1) + 1
-        most = self._trust.lead * full.unsqueeze(-1)
+        most = way.new_full(waits.shape, self._trust.lead)
+        most = torch.where(self.holding.busy(waits), CAREFUL * most, most).unsqueeze(-1)
         lead = way * (most / torch.maximum(size, most))
         return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + lead, wanted)
 

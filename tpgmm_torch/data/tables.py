@@ -308,7 +308,7 @@ def _columns(
     """Episode, time, joints and frames."""
     rows, joints = len(motion), as_array(motion.joints)
     names = _joint_names(motion)
-    columns = [("episode", np.full(rows, episode)), ("time", as_array(motion.time))]
+    columns = [(EPISODE, np.full(rows, episode)), ("time", as_array(motion.time))]
     columns += zip(names, joints.T, strict=True)
     for name, frame in frames.items():
         pose = as_array(torch.cat((frame.position, frame.orientation), -1))

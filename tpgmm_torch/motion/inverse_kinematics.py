@@ -121,7 +121,7 @@ def follow_poses(
     ]:
         warnings.warn(
             f"the poses are missed: {', '.join(told)}. They are out of reach, faster than the "
-            f"joints may move, or far from the start",
+            "joints may move, or far from the start",
             PlausibilityWarning,
             stacklevel=2,
         )

@@ -63,6 +63,7 @@ def prior_widths(
         )
     for name, value in given.items():
         widths[names.index(name)] = value.to(like)
+    _check_positive(widths.tolist())  # what was learned may be NaN
     return widths
 
 
@@ -82,9 +83,9 @@ def given_widths(prior_std: Any, names: Sequence[str]) -> dict[str, Tensor]:
         As for :func:`prior_widths`.
     """
     if isinstance(prior_std, Real):
-        widths = {}
-        values = [float(prior_std)]
-    elif isinstance(prior_std, Mapping):
+        _check_positive([float(prior_std)])
+        return {}
+    if isinstance(prior_std, Mapping):
         for name in prior_std:
             if name not in names:
                 raise UnknownNameError("joint", name, "the model", names)
@@ -94,7 +95,6 @@ def given_widths(prior_std: Any, names: Sequence[str]) -> dict[str, Tensor]:
                 raise ShapeError(
                     f"prior_std of {name!r} is one number, got shape {tuple(width.shape)}"
                 )
-        values = [float(width) for width in widths.values()]
     else:
         array = as_tensor(prior_std, "prior_std")
         if array.shape != (len(names),):
@@ -102,10 +102,14 @@ def given_widths(prior_std: Any, names: Sequence[str]) -> dict[str, Tensor]:
                 f"prior_std has one value for each of the joints {list(names)}, got shape "
                 f"{tuple(array.shape)}"
             )
-        widths, values = dict(zip(names, array, strict=True)), array.tolist()
-    if not all(value > 0 for value in values):
-        raise DataError(f"prior_std must be positive, got {values}")
+        widths = dict(zip(names, array, strict=True))
+    _check_positive([float(width) for width in widths.values()])
     return widths
+
+
+def _check_positive(widths: Sequence[float]) -> None:
+    if not all(width > 0 for width in widths):
+        raise DataError(f"prior_std must be positive, got {widths}")
 
 
 def _size(

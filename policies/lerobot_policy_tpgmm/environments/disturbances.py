@@ -270,13 +270,14 @@ class Moved(Disturbance):
     ) -> Self:
         """On the way to the object, and within its usual places if it is in one of them."""
         drawn = self._moment(rng, FIRST, course.grasp - APPROACH - self.seconds)
+        anywhere = not usual(np.zeros(6))
         # where its usual places are narrower than the step, none of whole length may be left
         for share in np.repeat(np.linspace(1, 0.1, 10), 1000):
             way = rng.uniform(-math.pi, math.pi)
             turn = self.angle * rng.choice((-1, 1))
             level = self.distance * np.array((math.cos(way), math.sin(way), 0.0))
             step = share * np.concatenate((level, (0.0, 0.0, turn)))
-            if usual(step) or not usual(np.zeros(6)):
+            if anywhere or usual(step):
                 break
         return drawn if self.step is not None else dataclasses.replace(drawn, step=step)
 

@@ -129,3 +129,10 @@ def test_a_number_that_is_no_width_is_refused_at_once():
     for wrong in (0.0, -1.0, "wide"):
         with pytest.raises(InvalidParameterError, match="prior_std"):
             hands_model(prior_std=wrong).fit(handlings())
+
+
+def test_what_was_learned_to_be_nan_is_no_unit_of_lengths():
+    model = hands_model().fit(handlings())
+    model.means_ = [mean * torch.nan for mean in model.means_]
+    with pytest.raises(DataError, match="must be positive"):
+        widths(10.0, model.kinematics_, model)
