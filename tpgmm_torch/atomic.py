@@ -52,6 +52,8 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
 
     Raises
     ------
+    NotADirectoryError
+        If one of the folders above it is a file.
     TimeoutError
         If another process writes the same path for more than ten minutes.
 
@@ -68,6 +70,8 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     if path.name in ("", ".."):  # "." has no name of its own
         path = path.resolve()
     made = [folder for folder in path.parents if not folder.exists()]
+    if (there := path.parents[len(made)]).is_file():
+        raise NotADirectoryError(f"{path} cannot be written: {there} is a file, not a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     with _alone(path):
         _recover(path)

@@ -18,6 +18,7 @@ CHECKS = {
     "metadata": "lengths, names, rates and tasks that contradict each other",
     "missing": "a parquet file that is absent, truncated or corrupted",
     "nan": "values that are NaN, infinite or null",
+    "poses": "quaternions whose norm is not 1",
     "time": "time that does not increase",
 }
 

@@ -44,11 +44,18 @@ def value_names(names: Any, width: int, distinct: bool = True) -> tuple[str, ...
     return tuple(names)
 
 
-JOINT_NAMES = "Give joint_names={'name in the data set': 'joint of the robot', ...}"
+JOINT_NAMES = (
+    "Give joint_names={'name in the data set': 'joint of the robot', ...} (--joint-name "
+    "STORED=JOINT)"
+)
 
 
 def match_names(
-    wanted: Sequence[str], present: Sequence[str], column: str, remedy: str = JOINT_NAMES
+    wanted: Sequence[str],
+    present: Sequence[str],
+    column: str,
+    remedy: str = JOINT_NAMES,
+    kind: str = "the robot's joint",
 ) -> dict[str, str]:
     """Find each wanted name among those present, whatever the spelling.
 
@@ -72,7 +79,7 @@ def match_names(
         if len(fits) != 1:
             what = f"fits several values, {fits}" if fits else "is none of the values"
             raise DatasetError(
-                f"the robot's joint {name!r} {what}; they are called {list(present)}. {remedy}",
+                f"{kind} {name!r} {what}; they are called {list(present)}. {remedy}",
                 column=column,
             )
         matched[fits[0]] = name

@@ -81,9 +81,10 @@ class Recording:
                 try:
                     demonstration = self.assembly.demonstration(rows)
                 except DatasetError as problem:
-                    if problem.check != "events":
-                        raise
-                    lost.append(problem)
+                    if problem.check == "events":
+                        lost.append(problem)
+                    else:
+                        policy(problem)
                     continue
                 read += 1
                 yield demonstration
@@ -165,6 +166,16 @@ def open_recording(
     if calibration is not None:
         units = _calibrated(feature, calibration, joint_names, units)
     columns = JointColumns.choose(feature, joint_names, units, robot)
+    unknown = [
+        n for n, u in zip(feature.names or (), columns.units, strict=False) if u == "auto"
+    ]
+    if calibration is not None and unknown:
+        raise DatasetError(
+            f"the calibration has no motor for {unknown}: give their units, "
+            f"units={{{unknown[0]!r}: 'deg', ...}} (--units {unknown[0]}=deg); 'raw' for what "
+            "is no joint",
+            column=feature.key,
+        )
     sources = frame_sources(layout, frames)
     stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
     assembly = Assembly(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -55,24 +55,29 @@ class Signals:
         robot: Any = None,
         *,
         frames: Mapping[str, FrameSource] | None = None,
+        joint_names: Mapping[str, str] | Sequence[str] | None = None,
         **options: Any,
     ) -> Self:
         """Read the metadata of a data set.
 
         Parameters
         ----------
-        path, robot, frames, **options
-            What :func:`load_lerobot` was given; frames at links are left out.
+        path, robot, frames, joint_names, **options
+            What :func:`load_lerobot` was given; frames at links are left out. Entries are
+            called as ``joint_names`` says.
 
         Raises
         ------
         DatasetError
             If the data set cannot be read, or states and actions have different units.
         """
+        options["joint_names"] = joint_names
         assembly = open_recording(path, robot=robot, **options).assembly
         layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
-        state = layout.features.get(STATE, source)
+        called = joint_names if isinstance(joint_names, Mapping) else {}
+        state = _renamed(layout.features.get(STATE, source), called)
         action = layout.features.get(ACTION)
+        action = action and _renamed(action, called)
         environment = layout.features.get(ENVIRONMENT)
         scales = {
             name: as_scale(unit, source.key)
@@ -80,7 +85,7 @@ class Signals:
             if robot is None or name in robot.joint_names
         }
         for feature in (state, action):
-            if feature is not None and feature is not source:
+            if feature is not None and feature.key != source.key:
                 _check_units(feature, scales)
         places = {
             name: tuple(pose.select(name, environment))
@@ -95,6 +100,11 @@ class Signals:
             {n: (s.factor, s.offset) for n, s in scales.items() if s != Scale(1.0)},
             places,
         )
+
+
+def _renamed(feature: Feature, called: Mapping[str, str]) -> Feature:
+    names = feature.names and tuple(called.get(name, name) for name in feature.names)
+    return replace(feature, names=names)
 
 
 def _plain(pose: FramePose) -> bool:

@@ -173,7 +173,7 @@ def convert(
             raise DatasetError(
                 f"{name!r} goes from {values[:, i].min():.4g} to {values[:, i].max():.4g}, but "
                 f"is to be normalised to {low:g} ... {high:g}: was it recorded in degrees "
-                "(use_degrees)? Then units='deg', without a calibration",
+                "(use_degrees)? Then units='deg' (--units deg), without a calibration",
                 column=column,
                 **where,
             )
@@ -207,8 +207,9 @@ def _check_angles(
         because = f", because {others[0]} and joints have one unit" if others else ""
         raise UnknownUnitsError(
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
-            "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...}; "
-            "'raw' takes them as they are",
+            "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...} (in "
+            "commands --units deg, NAME=deg or LeRobot's calibration file; in training "
+            "--policy.units); 'raw' takes them as they are",
             column=column,
             **where,
         )

@@ -35,6 +35,16 @@ def test_signals_of_a_data_set(stored):
     assert told.environment_names[7] == "cup.x"
 
 
+def test_entries_are_called_as_the_joints_are(stored):
+    class Other:
+        joint_names = ("wrist", "elbow")
+
+    names = {"a.pos": "elbow", "b.pos": "wrist"}
+    told = Signals.of(stored, Other(), units="deg", joint_names=names)
+    assert told.state_names == told.action_names == ("elbow", "wrist")
+    assert set(told.units) == {"elbow", "wrist"}
+
+
 def test_frames_that_no_policy_could_observe_are_left_out(stored):
     frames = {
         "here": FramePose(ENVIRONMENT, slice(3, 10)),

@@ -70,6 +70,14 @@ def exchange(request, monkeypatch):
         monkeypatch.setattr(atomic, "_swap", lambda one, other: False)
 
 
+def test_a_file_cannot_be_a_folder_above(tmp_path):
+    (tmp_path / "model").write_text("kept")
+    inside = replacing(tmp_path / "model" / "new" / "one")
+    with pytest.raises(NotADirectoryError, match=r"model is a file, not a folder"), inside:
+        pass
+    assert (tmp_path / "model").read_text() == "kept"
+
+
 def test_a_file_is_replaced_and_its_folders_are_made(tmp_path):
     path = tmp_path / "a" / "b" / "notes.txt"
     for text in ("old", "new"):

@@ -55,6 +55,7 @@ def correct(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     plausibility: options.Plausibility = "warn",
 ) -> None:
@@ -71,7 +72,16 @@ def correct(
     fitted = TaskParameterizedGMM.load(model, device="cpu")
     robot = fitted.robot
     recordings = options.recordings(
-        dataset, robot, frame, episodes, units, joints, rate, plausibility, event
+        dataset,
+        robot,
+        frame,
+        episodes,
+        units,
+        joints,
+        rate,
+        plausibility,
+        event,
+        joint_name,
     )
     shown = recordings.corrections()
     if placed:

@@ -58,6 +58,7 @@ def fit(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     plausibility: options.Plausibility = "warn",
     alignment: options.AlignmentMethod = "dtw",
@@ -236,7 +237,16 @@ def fit(
     given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     kinematics = options.read_robot(robot, link, robot_joint, coordinate, poses)
     recordings = options.recordings(
-        dataset, kinematics, frame, episodes, units, joints, rate, plausibility, event
+        dataset,
+        kinematics,
+        frame,
+        episodes,
+        units,
+        joints,
+        rate,
+        plausibility,
+        event,
+        joint_name,
     )
     links = kinematics.links if kinematics is not None else ()
     state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)

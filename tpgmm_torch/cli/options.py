@@ -83,6 +83,14 @@ Joints = Annotated[
         metavar="FEATURE",
     ),
 ]
+JointNames = Annotated[
+    list[str] | None,
+    of_data(
+        "What the robot calls a stored joint, repeatable, where the names do not tell.",
+        "--joint-name",
+        metavar="STORED=JOINT",
+    ),
+]
 Rate = Annotated[float | None, of_data("Resample to so many steps per second.", min=1e-3)]
 Plausibility = Annotated[
     Literal["warn", "error", "ignore"],
@@ -134,6 +142,7 @@ def recordings(
     rate: float | None,
     plausibility: str = "warn",
     events: Sequence[str] | None = None,
+    joint_names: Sequence[str] | None = None,
 ) -> plugins.Recordings:
     """The ``dataset`` of which the options say the rest, not yet read.
 
@@ -143,11 +152,11 @@ def recordings(
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, episodes, units, joints, rate, plausibility, events
+    frames, episodes, units, joints, rate, plausibility, events, joint_names
         The options as they were given.
     """
     reader = plugins.required(plugins.READERS, "lerobot")
-    given = frames, episodes, units, joints, rate, plausibility, events
+    given = frames, episodes, units, joints, rate, plausibility, events, joint_names
     opened: plugins.Recordings = reader(dataset, robot, *given)
     return opened
 

@@ -46,6 +46,7 @@ def plot(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     alignment: options.AlignmentMethod = "dtw",
 ) -> None:
@@ -67,7 +68,15 @@ def plot(
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
     recordings = options.recordings(
-        dataset, kinematics, frame, episodes, units, joints, rate, events=event
+        dataset,
+        kinematics,
+        frame,
+        episodes,
+        units,
+        joints,
+        rate,
+        events=event,
+        joint_names=joint_name,
     )
     demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
     situation = Situation.of(demonstrations[0])

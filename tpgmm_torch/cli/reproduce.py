@@ -49,6 +49,7 @@ def reproduce(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     via: Annotated[
         list[str] | None,
@@ -73,7 +74,7 @@ def reproduce(
     from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.exceptions import DataError, UnknownNameError
     from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
     from tpgmm_torch.persistence import MODES
 
@@ -91,22 +92,36 @@ def reproduce(
         fitted = one = TaskParameterizedGMM.load(model, device="cpu")
         kinematics = one.kinematics_
     if dataset is not None:
-        wanted = [
-            Situation.of(demonstration)
-            for demonstration in options.recordings(
-                dataset, kinematics, frame, episodes, units, joints, rate, events=event
-            ).demonstrations()
-        ]
+        recordings = options.recordings(
+            dataset,
+            kinematics,
+            frame,
+            episodes,
+            units,
+            joints,
+            rate,
+            events=event,
+            joint_names=joint_name,
+        )
+        wanted = [Situation.of(shown) for shown in recordings.demonstrations()]
     elif situations is not None:
         wanted = read_situations(situations, kinematics.joint_names)
     if via:
         fitted = one.with_via_points(via, fade)
     choices: list[ModeChoice] = []
-    if isinstance(fitted, MultimodalTaskParameterizedGMM):
-        choices = fitted.choose(wanted)
-        trajectories = fitted.predict(wanted, candidates=False, choices=choices)
-    else:
-        trajectories = fitted.predict(wanted, candidates=False)
+    try:
+        if isinstance(fitted, MultimodalTaskParameterizedGMM):
+            choices = fitted.choose(wanted)
+            trajectories = fitted.predict(wanted, candidates=False, choices=choices)
+        else:
+            trajectories = fitted.predict(wanted, candidates=False)
+    except UnknownNameError as error:
+        if error.kind != "frame" or dataset is None:
+            raise
+        raise DataError(
+            f"{error}. Say where it is in the data set, as to 'tpgmm fit': --frame "
+            f"{error.name}=FEATURE or --frame {error.name}=LINK@EVENT"
+        ) from error
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")

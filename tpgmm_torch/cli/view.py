@@ -73,6 +73,7 @@ def view(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     meshes: Annotated[
         Path | None,
@@ -126,7 +127,15 @@ def view(
     demonstrations = []
     if dataset is not None:
         demonstrations = options.recordings(
-            dataset, fitted.kinematics_, frame, episodes, units, joints, rate, events=event
+            dataset,
+            fitted.kinematics_,
+            frame,
+            episodes,
+            units,
+            joints,
+            rate,
+            events=event,
+            joint_names=joint_name,
         ).demonstrations()
     if situations is not None:
         wanted = read_situations(situations, fitted.kinematics_.joint_names)

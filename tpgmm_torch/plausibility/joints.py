@@ -105,7 +105,7 @@ def _ranges(
             "error",
             f"joints are in radians (metres, where they slide), these cannot be: {places}",
             "Are they in degrees? If one joint is, all are: convert the whole joint vector "
-            "(np.deg2rad; load_lerobot(..., units='deg'))",
+            "(np.deg2rad; load_lerobot(..., units='deg'); --units deg)",
             about,
             value=worst,
         )

@@ -409,8 +409,12 @@ def _locked(
     values = {name: value for name, value in locked.items() if name in model.joint}
     for name in locked:
         if name not in model.joint:
-            fits = _joints_named(model, [name], ())
-            values = {n: locked[name] for n in fits if n not in columns} | values
+            fits = [n for n in _joints_named(model, [name], ()) if n not in columns]
+            if not fits:
+                raise DataError(
+                    f"locked has {name!r}, and all joints that it names are in the joint vector"
+                )
+            values = dict.fromkeys(fits, locked[name]) | values
     return values
 
 

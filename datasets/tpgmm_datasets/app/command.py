@@ -47,6 +47,7 @@ def page(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
     host: Annotated[
         str, serving("Address to listen on; who reaches it can have anything learned.")
@@ -71,7 +72,15 @@ def page(
 
     def told() -> Shown:
         given = options.recordings(
-            str(dataset), kinematics, frame, episodes, units, joints, rate, events=event
+            str(dataset),
+            kinematics,
+            frame,
+            episodes,
+            units,
+            joints,
+            rate,
+            events=event,
+            joint_names=joint_name,
         )
         return given.demonstrations(), kinematics
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -60,6 +61,7 @@ def check(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Fail for what is only unlikely, too.")
     ] = False,
@@ -70,7 +72,13 @@ def check(
     the robot, for example. What is unlikely is listed; with --strict it fails too.
     """
     from tpgmm_datasets.description import describe_lerobot
-    from tpgmm_datasets.errors import DatasetError, UnknownUnitsError, summed_up
+    from tpgmm_datasets.errors import (
+        CHECKS,
+        DatasetError,
+        DatasetWarning,
+        UnknownUnitsError,
+        summed_up,
+    )
     from tpgmm_datasets.reader import open_recording
 
     description = describe_lerobot(path)
@@ -83,20 +91,34 @@ def check(
     )
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
     recordings = Recordings(
-        path, kinematics, frame, episodes, units, joints, None, events=event
+        path,
+        kinematics,
+        frame,
+        episodes,
+        units,
+        joints,
+        None,
+        events=event,
+        joint_names=joint_name,
     )
-    recording = open_recording(path, **recordings.options)
+    # all that can be told of in one go, not the first
+    recording = open_recording(path, **recordings.options, relax=CHECKS)
     try:
-        report = recording.examine(recording.demonstrations(tell=False))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always", DatasetWarning)
+            report = recording.examine(recording.demonstrations(tell=False))
     except UnknownUnitsError as error:  # no fault of the set
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
     except DatasetError as error:
         typer.echo(f"error: {error}")
         raise typer.Exit(1) from error
+    bad = [str(one.message) for one in told if issubclass(one.category, DatasetWarning)]
+    for problem in bad:
+        typer.echo(f"error: {problem}")
     for finding in report:
         typer.echo(f"{finding.severity}: {finding}")
-    if report.errors() or (strict and len(report)):
+    if bad or report.errors() or (strict and len(report)):
         raise typer.Exit(1)
 
 
@@ -109,6 +131,7 @@ def plot(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
 ) -> None:
     """Draw the joints and the positions of the frames over time, a line per episode."""
@@ -116,7 +139,9 @@ def plot(
 
     from tpgmm_torch.plotting import figure, save
 
-    recordings = Recordings(path, None, frame, episodes, units, joints, rate, events=event)
+    recordings = Recordings(
+        path, None, frame, episodes, units, joints, rate, events=event, joint_names=joint_name
+    )
     demonstrations = recordings.demonstrations()
     first = demonstrations[0]
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
@@ -183,6 +208,7 @@ def convert(
     episodes: options.Episodes = None,
     units: options.Units = None,
     joints: options.Joints = None,
+    joint_name: options.JointNames = None,
     rate: options.Rate = None,
 ) -> None:
     """Write a data set anew: layout v3.0, joints in radians, episodes and joints as chosen.
@@ -196,7 +222,15 @@ def convert(
 
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
     recordings = Recordings(
-        source, kinematics, frame, episodes, units, joints, None, events=event
+        source,
+        kinematics,
+        frame,
+        episodes,
+        units,
+        joints,
+        None,
+        events=event,
+        joint_names=joint_name,
     )
     recording = open_recording(source, **recordings.options)
     demonstrations = list(recording.demonstrations())

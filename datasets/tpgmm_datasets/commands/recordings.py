@@ -15,7 +15,14 @@ if TYPE_CHECKING:
     from tpgmm_torch.large_data.processes import Processes
     from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Recordings", "parse_episodes", "parse_events", "parse_frames", "parse_units"]
+__all__ = [
+    "Recordings",
+    "parse_episodes",
+    "parse_events",
+    "parse_frames",
+    "parse_joint_names",
+    "parse_units",
+]
 
 #: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
 FRAME = re.compile(
@@ -41,8 +48,8 @@ class Recordings(plugins.Recordings):
         None.
     joints, rate, plausibility
         As for :func:`tpgmm_datasets.load_lerobot`.
-    events
-        What :func:`parse_events` takes, or None.
+    events, joint_names
+        What :func:`parse_events` and :func:`parse_joint_names` take, or None.
 
     Raises
     ------
@@ -61,6 +68,7 @@ class Recordings(plugins.Recordings):
         rate: float | None,
         plausibility: str = "warn",
         events: Sequence[str] | None = None,
+        joint_names: Sequence[str] | None = None,
     ) -> None:
         self.dataset = dataset
         self.options: dict[str, Any] = {
@@ -70,6 +78,7 @@ class Recordings(plugins.Recordings):
             "episodes": parse_episodes(episodes),
             **parse_units(units or ()),
             "joints": joints,
+            "joint_names": parse_joint_names(joint_names or ()),
             "rate": rate,
             "plausibility": plausibility,
         }
@@ -174,6 +183,23 @@ def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
             raise DataError(f"event {text!r} {problem}, as in close=closing:*gripper*")
         events[name] = parse_event(how)
     return events or None
+
+
+def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | None:
+    """What ``load_lerobot`` takes as ``joint_names``; None if nothing was given.
+
+    Each text is ``STORED=JOINT``; a DataError says so of any other.
+    """
+    from tpgmm_torch.exceptions import DataError
+
+    names: dict[str, str] = {}
+    for text in texts:
+        stored, _, joint = (part.strip() for part in text.rpartition("="))
+        if not stored or not joint or stored in names:
+            problem = "is given twice" if stored in names else "is not STORED=JOINT"
+            raise DataError(f"joint name {text!r} {problem}, as in main_elbow=elbow_flex")
+        names[stored] = joint
+    return names or None
 
 
 def parse_episodes(text: str | None) -> slice | list[int] | str | None:

@@ -83,9 +83,10 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
     for key in usual[joints]:
         if key in layout.features and not layout.features[key].is_camera:
             return key
+    wanted = "joints" if joints is None else f"{joints} joints"
     raise DatasetError(
-        f"none of {list(usual[joints])} is a column; say which holds the joints, joints=..., "
-        f"of {sorted(layout.features)}",
+        f"there are no {wanted}: none of {list(usual[joints])} is a column. Say which holds "
+        f"them, joints=... (--joints), of {sorted(layout.features)}",
         file="meta/info.json",
     )
 

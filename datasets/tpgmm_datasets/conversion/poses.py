@@ -124,6 +124,7 @@ class FramePose:
                 raise DatasetError(
                     f"the norm of a quaternion is off by {float(off):.3g}; are the columns "
                     f"and their order right? The rotation is read as {self.rotation!r}",
+                    check="poses",
                     column=self.feature,
                     **where,
                 )

@@ -23,7 +23,11 @@ __all__ = ["Calibration", "calibrated_units"]
 Calibration = str | Path | Mapping[str, str | Path]
 
 FIELDS = ("drive_mode", "range_min", "range_max")
-REMEDY = "Name the values as the motors are, joint_names=..., or give the units of each"
+REMEDY = (
+    "Two arms have a file each, by what stands before their names: calibration={'left_': ..., "
+    "'right_': ...} (--units left_=FILE.json). Else name the values as the motors are, "
+    "joint_names=..., or give the units of each"
+)
 
 
 def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[str, Scale]:
@@ -46,7 +50,8 @@ def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[s
     Raises
     ------
     DatasetError
-        If a file cannot be read or is no calibration, or a motor is not among the names.
+        If it is no file, a file cannot be read or is no calibration, or a motor is not among
+        the names.
 
     Examples
     --------
@@ -61,11 +66,14 @@ def calibrated_units(calibration: Calibration, names: tuple[str, ...]) -> dict[s
     files = calibration if isinstance(calibration, Mapping) else {"": calibration}
     motors: dict[str, Scale] = {}
     for prefix, file in files.items():
+        if not isinstance(file, str | Path):
+            raise DatasetError(
+                f"a calibration is the path of LeRobot's JSON file, or several by prefix; got "
+                f"{calibration!r}"
+            )
         motors |= {f"{prefix}{name}": _scale(name, motor, file) for name, motor in _read(file)}
-    return {
-        value: motors[name]
-        for value, name in match_names(list(motors), names, "calibration", REMEDY).items()
-    }
+    matched = match_names(list(motors), names, "calibration", REMEDY, "the motor")
+    return {value: motors[name] for value, name in matched.items()}
 
 
 def _read(file: str | Path) -> list[tuple[str, Any]]:

@@ -37,8 +37,10 @@ def local_folder(path: str | Path) -> Path:
     DependencyError
         If it is on the hub and huggingface_hub is not installed.
     """
-    asked = re.fullmatch(rf"{HUB}({REPO_ID})", str(path)) if isinstance(path, str) else None
-    if asked:
+    if isinstance(path, str) and "://" in path:
+        asked = re.fullmatch(rf"{HUB}({REPO_ID})", path)
+        if asked is None:
+            raise DatasetError(f"{path!r} is neither a folder nor {HUB}OWNER/NAME")
         return _fetch(asked[1])
     folder = Path(path)
     recover(folder)

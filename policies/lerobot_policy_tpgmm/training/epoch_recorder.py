@@ -171,8 +171,9 @@ class EpochRecorder:
         n_episodes, n_frames = len(self.episodes), self._expected
         if not n_episodes:
             return "no frame has come yet"
+        needed = math.ceil(n_frames / self._batch_size)
         return (
             f"{int(self._seen.sum())} of the {n_frames} frames of {n_episodes} episodes have "
             f"come: with batch_size={self._batch_size} an epoch takes at least "
-            f"{math.ceil(n_frames / self._batch_size)} steps"
+            f"{needed} step{'s' * (needed != 1)}"
         )

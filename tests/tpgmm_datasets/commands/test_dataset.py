@@ -24,6 +24,7 @@ from tests.support.lerobot_sets import (
 )
 from tpgmm_datasets import describe_lerobot, load_lerobot, resample, save_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.errors import DatasetError, DatasetWarning
 from tpgmm_torch import Demonstration
 
 RATE = 10
@@ -271,6 +272,52 @@ def test_what_cannot_be_loaded_is_no_good_set(tmp_path, generated):
     change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", stretch))
     result = run("dataset", "check", root)
     assert result.exit_code == 1 and "norm of a quaternion" in result.stdout
+    assert "and 1 more like it: episode 1" in result.stdout
+
+
+def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, generated):
+    root = tmp_path / "one"
+    shutil.copytree(generated, root)
+
+    def stretch(poses):
+        return np.concatenate((poses[:1, :3], 1.3 * poses[:1, 3:]), axis=1), poses[1:]
+
+    change_table(
+        root,
+        DATA,
+        lambda t: set_column(
+            t, "observation.environment_state", lambda poses: np.concatenate(stretch(poses))
+        ),
+    )
+    result = run("dataset", "check", root)
+    assert result.exit_code == 1 and "error: left out or not checked: " in result.stdout
+    assert "episode 0" in result.stdout
+    with pytest.raises(DatasetError, match="norm of a quaternion"):
+        load_lerobot(root)
+    with pytest.warns(DatasetWarning, match="norm of a quaternion"):
+        [second] = load_lerobot(root, relax=["poses"])
+    assert_same([second], load_lerobot(generated)[1:])
+
+
+def test_a_stored_joint_is_called_as_the_robot_does(tmp_path):
+    names = ["base", *(f"motor_{n}" for n in range(2, 7))]
+    time = np.arange(20) / 10
+    joints = 0.1 * np.sin(time[:, None] + np.arange(6)) + 0.3
+    root = save_lerobot(
+        [Demonstration(time, joints + 0.01 * n, joint_names=names) for n in range(2)],
+        tmp_path / "motors",
+        fps=10,
+        task="t",
+    )
+    robot = ("--robot", "so101", "--link", "gripper_frame_link")
+    told = run("dataset", "check", root, *robot)
+    assert told.exit_code == 2 and "--joint-name STORED=JOINT" in told.stderr
+    called = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
+    pairs = zip(names, [*called, "gripper"], strict=True)
+    given = [part for pair in pairs for part in ("--joint-name", "=".join(pair))]
+    assert "no problems in 2 episodes" in output("dataset", "check", root, *robot, *given)
+    output("dataset", "convert", root, tmp_path / "named", *robot, *given)
+    assert load_lerobot(tmp_path / "named")[0].joint_names == (*called, "gripper")
 
 
 def write_degrees(folder):

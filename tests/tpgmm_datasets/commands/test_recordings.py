@@ -6,6 +6,7 @@ from tpgmm_datasets.commands.recordings import (
     parse_episodes,
     parse_events,
     parse_frames,
+    parse_joint_names,
     parse_units,
 )
 from tpgmm_torch.events.movement import Stop
@@ -41,6 +42,19 @@ def test_episodes_units_and_frames_are_read_from_text():
 def test_a_frame_that_is_none_is_refused(texts):
     with pytest.raises(DataError, match="is none of NAME, NAME=FEATURE"):
         parse_frames(texts)
+
+
+def test_joint_names_are_read_from_text():
+    assert parse_joint_names([]) is None
+    found = parse_joint_names(["main=arm = elbow", "b=c"])  # the last sign parts them
+    assert found == {"main=arm": "elbow", "b": "c"}
+    for texts, told in [
+        (["a"], "not STORED=JOINT"),
+        (["=a"], "not"),
+        (["a=b", "a=c"], "twice"),
+    ]:
+        with pytest.raises(DataError, match=told):
+            parse_joint_names(texts)
 
 
 def test_events_are_read_from_text():

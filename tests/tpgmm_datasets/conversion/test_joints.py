@@ -48,3 +48,9 @@ def test_the_joint_feature_is_found_or_chosen(root):
         root, lambda i: i["features"].update(state=i["features"].pop("observation.state"))
     )
     assert_equal(joints_of(load_lerobot(root)), expected)
+
+
+def test_commanded_joints_need_actions(root):
+    change_info(root, lambda info: info["features"].pop("action"))
+    with pytest.raises(DatasetError, match=r"there are no commanded joints.*--joints"):
+        load_lerobot(root, joints="commanded")

@@ -97,7 +97,11 @@ def test_two_arms_have_a_file_each_and_units_by_name_come_first(root, file):
         ("[]", "a calibration is a JSON object of motors"),
         ({"shoulder_pan": {"id": 1}}, "'shoulder_pan' needs whole numbers"),
         ({"shoulder_pan": motor(1, (5, 5))}, "'shoulder_pan' needs whole numbers .* a range"),
-        ({"elbow": motor(1, (0, 9))}, r"'elbow' is none of the values.*joint_names="),
+        ({"elbow": motor(1, (0, 9))}, r"the motor 'elbow' is none of the val.*joint_names="),
+        (
+            {"wrist_roll": motor(1, (0, 9))},
+            r"no motor for \['shoulder_pan\.pos', 'gripper\.pos'\].*--units shoulder_pan",
+        ),
         (
             {"wrist_roll": motor(1, (0, 9), drive_mode=1)},
             r"'wrist_roll' has the drive mode 1.*Scale\.calibrated\(0, 9",
@@ -108,6 +112,17 @@ def test_what_is_no_calibration_of_the_set_is_refused(arm, file, content, messag
     file.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(DatasetError, match=message):
         load_lerobot(arm, joints="arm", calibration=file)
+
+
+@pytest.mark.parametrize("calibration", [3, {"left_": None}])
+def test_a_calibration_is_a_file_or_several_by_prefix(arm, calibration):
+    with pytest.raises(DatasetError, match="several by prefix; got"):
+        load_lerobot(arm, joints="arm", calibration=calibration)
+
+
+def test_a_prefix_that_no_motor_has_is_told(arm, file):
+    with pytest.raises(DatasetError, match=r"the motor 'lft_\w+' is none.*--units left_=FILE"):
+        load_lerobot(arm, joints="arm", calibration={"lft_": file})
 
 
 def test_values_in_degrees_and_units_for_all_are_refused(arm, file):

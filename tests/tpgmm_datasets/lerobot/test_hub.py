@@ -68,6 +68,12 @@ def test_an_exchange_that_was_killed_is_undone(tmp_path):
     assert len(load_lerobot(root)) == 1
 
 
+@pytest.mark.parametrize("path", ["hf://someone/bottles", "s3://bucket/bottles"])
+def test_an_address_that_is_none_of_the_hub_is_refused(path):
+    with pytest.raises(DatasetError, match="is neither a folder nor hf://datasets/OWNER/NAME"):
+        load_lerobot(path)
+
+
 def test_a_folder_that_is_not_there_is_refused(root):
     shutil.rmtree(root)
     assert_refused(root, "missing")

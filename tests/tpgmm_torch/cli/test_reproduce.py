@@ -51,6 +51,15 @@ def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp
     np.testing.assert_array_equal(again["time"], model.time_)
 
 
+def test_a_frame_that_the_data_set_does_not_tell_is_asked_for(dataset, fitted, tmp_path):
+    told = refusal(
+        "reproduce", fitted[0], "--dataset", dataset, "--frame", "cup=observation."
+        "environment_state[0:7]", "--out", tmp_path / "r.csv",
+    )  # fmt: skip
+    assert "frame 'bottle' is not in" in told and "--frame bottle=LINK@EVENT" in told
+    assert not (tmp_path / "r.csv").exists()
+
+
 def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
     skill, file, out = BottleShaking(), tmp_path / "situations.json", tmp_path / "r.npz"
     situations = skill.situations(2)

@@ -167,6 +167,8 @@ class TestSettings:
         )
         with pytest.raises(UnknownNameError, match=r"joint 'm_\*' is not in the movable"):
             upper_body(locked={"m_*": 0.0})
+        with pytest.raises(DataError, match=r"'l_\*'.* are in the joint vector"):
+            upper_body(joints="l_*", locked={"l_*": 0.3})
 
     @pytest.mark.parametrize("kind", ["fixed", "revolute"])
     def test_a_description_of_thousands_of_links_is_read_at_once(self, kind: str) -> None:
