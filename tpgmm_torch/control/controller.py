@@ -23,7 +23,7 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower
-from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.motion.trajectory_generator import Seconds
 from tpgmm_torch.novelty import Novelty
@@ -169,6 +169,7 @@ class Controller:
         none = torch.zeros(shape, dtype=torch.bool, device=self.reference.device)
         self._led, self._brought = none, none
         self._gap, self._since = self._velocity, torch.full_like(self._velocity[..., 0], -1.0)
+        self._lasting = torch.full_like(self._since, blend)
         self._fading = blend > 0
 
     @property
@@ -561,8 +562,11 @@ class Controller:
         if bool(fresh.any()):
             gap = self.reference - estimate
             self._gap = torch.where(fresh.unsqueeze(-1), gap.nan_to_num(0.0), self._gap)
+            if self.command is not None:
+                lasting = fading_time(self._gap, self._blend)
+                self._lasting = torch.where(fresh, lasting, self._lasting)
         self._since = torch.where(fresh, 0.0, self._since + _of_each(dt, estimate))
-        left = 1 - minimum_jerk(self._since / self._blend)
+        left = 1 - minimum_jerk(self._since / self._lasting)
         self._fading = bool((left > 0).any())
         return left.unsqueeze(-1) * self._gap
 

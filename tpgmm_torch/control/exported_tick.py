@@ -28,7 +28,7 @@ from tpgmm_torch.control.exported import FORMAT, here
 from tpgmm_torch.control.exported_clock import exported_clock
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.motion.follower import CRUISE, HASTE, MEMORY, ROUNDING
-from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -37,8 +37,8 @@ from tpgmm_torch.robots.robot import Robot
 __all__ = ["BrakingLaw", "ExportedTick", "export"]
 
 #: Numbers of a state that are not of a joint: progress, status, whether it has begun, the last
-#: tick's duration, time since the robot went on.
-SCALARS = 5
+#: tick's duration, time since the robot went on, time in which its gap fades.
+SCALARS = 6
 #: Numbers of each joint: position, velocity and acceleration of the motion, first and second
 #: difference of the references, the wanted posture and its drift, whether the joint is behind
 #: it, the gap that fades. Behind them are the last covariance and what the clock remembers.
@@ -127,7 +127,7 @@ class ExportedTick(torch.nn.Module):
         timely, heard = (dt > 0) & dt.isfinite(), joints.isfinite().all()
         norms = torch.linalg.vector_norm(frames[:, 3:], dim=-1, keepdim=True)
         heard = heard & frames.isfinite().all() & (norms > 0).all()
-        before, _, begun, last_dt, since = state[:SCALARS].unbind()
+        before, _, begun, last_dt, since, lasting = state[:SCALARS].unbind()
         begun = begun > 0
         count = len(joints)
         rows, last, memory = state[SCALARS:].split(
@@ -161,7 +161,9 @@ class ExportedTick(torch.nn.Module):
         since = torch.where(fades, since + passed, 0.0)
         wanted = mean
         if self._blend > 0:
-            wanted = mean + (1 - minimum_jerk(since / self._blend)) * gap
+            faster = torch.where(moved, fading_time(gap, self._blend), lasting)
+            lasting = torch.where(begun, faster, self._blend)
+            wanted = mean + (1 - minimum_jerk(since / lasting)) * gap
         wanted = torch.where(ended, rows[5], wanted)
         known = wanted.isfinite().all()
         moves = heard & known
@@ -179,7 +181,8 @@ class ExportedTick(torch.nn.Module):
         after = torch.where(begun, followed, rows[:8]).flatten()
         starts = heard & known & ~begun
         after_dt = torch.where(begun, dt, 0.0)
-        scalars = torch.stack((time, status, (begun | starts).to(time), after_dt, since))
+        began = (begun | starts).to(time)
+        scalars = torch.stack((time, status, began, after_dt, since, lasting))
         gap = torch.where(known, gap, 0.0)
         new = torch.cat((scalars, after, gap, covariance.flatten(), memory))
         halted = torch.cat((state[:1], status[None], state[2:]))

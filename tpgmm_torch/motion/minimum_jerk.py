@@ -2,7 +2,11 @@
 
 from torch import Tensor
 
-__all__ = ["minimum_jerk"]
+__all__ = ["fading_time", "minimum_jerk"]
+
+#: How fast a gap fades in the mean [rad/s or m/s], where that takes less time than a blend;
+#: the least share of the blend that it takes.
+FADING, SHORTEST = 0.03, 0.1
 
 
 def minimum_jerk(fraction: Tensor) -> Tensor:
@@ -21,3 +25,12 @@ def minimum_jerk(fraction: Tensor) -> Tensor:
     """
     u = fraction.clamp(0, 1)
     return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def fading_time(gap: Tensor, blend: float) -> Tensor:
+    """Seconds in which the gap (..., n) of robots that go on fades, shape (...).
+
+    A robot that was held stands a few milliradians from its reference: where it presses on
+    something, it should soon press again.
+    """
+    return (gap.abs().amax(-1) / FADING).clamp(SHORTEST * blend, blend)
