@@ -7,11 +7,15 @@ demonstrations, and the demonstration whose situation is nearest.
 
     python examples/leave_one_out.py path/to/g1_bottle --set g1
     python examples/leave_one_out.py path/to/honeytea_bimanual --set honeytea
+    python examples/leave_one_out.py path/to/so101_record --set so101 --likelihood
 
 ``g1``: a Unitree G1 picks up a bottle with its right hand and puts it down; two arms of seven
 joints, with the URDF of the package ``example-robot-data``, and the right hand's six fingers
 as coordinates without kinematics. ``honeytea``: two tracked hands, no robot; the left brings
-the cup, the right pours honey into it.
+the cup, the right pours honey into it. ``so101``: a small arm, joints alone.
+
+``--likelihood`` asks instead how likely the held-out episodes are, with several numbers of
+Gaussians and settings of ``covariance_shrinkage``.
 
 What the numbers say, and what they do not
 ------------------------------------------
@@ -73,6 +77,7 @@ from tpgmm_torch.alignment import (
     LinearTimeNormalization,
 )
 from tpgmm_torch.alignment.base import Alignment
+from tpgmm_torch.robots.joint_space import JointSpace
 
 G1_URDF = (
     "cmeel.prefix/share/example-robot-data/robots/g1_description/urdf/g1_29dof_rev_1_0.urdf"
@@ -93,6 +98,9 @@ ALIGNMENTS: Mapping[str, Callable[[Kinematics], Alignment]] = {
     "linear": lambda robot: LinearTimeNormalization(robot=robot),
     "events": lambda robot: EventAlignment(robot=robot),
 }
+
+#: What ``--likelihood`` compares.
+SHRINKAGES, NUMBERS = (0.0, 0.1, 1.0, "auto"), (5, 7, 10, 13)
 
 COLUMNS = ("event [mm]", "event [deg]", "path [mm]", "path [deg]", "joints [deg]")
 COLUMNS += ("before it [mm]",)
@@ -165,7 +173,14 @@ def load_honeytea(folder: Path) -> Recording:
     return Recording(demonstrations, robot, "right", "pour", "cup", models, 8, ())
 
 
-RECORDINGS = {"g1": load_g1, "honeytea": load_honeytea}
+def load_so101(folder: Path) -> Recording:
+    """Four times moving a small arm."""
+    demonstrations = load_lerobot(folder, units="raw")
+    robot, models = JointSpace(demonstrations[0].joint_names or ()), {"joints": (Canonical(),)}
+    return Recording(demonstrations, robot, "", "end", "", models, 8, ())
+
+
+RECORDINGS = {"g1": load_g1, "honeytea": load_honeytea, "so101": load_so101}
 
 
 def mean_joints(demonstrations: Sequence[Demonstration], robot: Kinematics) -> Tensor:
@@ -275,6 +290,33 @@ def leave_one_out(
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
+def likelihoods(
+    recording: Recording, alignment: str = "dtw", folds: Sequence[int] | None = None
+) -> dict[str, np.ndarray]:
+    """Mean log-likelihood per step of held-out episodes, arrays of shape (folds, K)."""
+    operators = next(iter(recording.models.values()))
+    found: dict[str, list[list[float]]] = {str(setting): [] for setting in SHRINKAGES}
+    for fold in range(len(recording.demonstrations)) if folds is None else folds:
+        test = recording.demonstrations[fold]
+        clock = ALIGNMENTS[alignment](recording.robot)
+        aligned = clock.fit_transform(
+            [one for one in recording.demonstrations if one is not test]
+        )
+        wanted = clock.transform([test])
+        for setting in SHRINKAGES:
+            model = TaskParameterizedGMM(
+                operators=operators,
+                robot=recording.robot,
+                covariance_shrinkage=setting,
+                random_state=0,
+            )
+            scores = [
+                model.set_params(n_components=k).fit(aligned).score(wanted) for k in NUMBERS
+            ]
+            found[str(setting)].append(scores)
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
 def table(results: Mapping[str, np.ndarray]) -> str:
     """Median and 90th percentile over the folds, one line per method."""
     lines = [f"{'median / 90th percentile':26}" + "".join(f"{c:>16}" for c in COLUMNS)]
@@ -314,6 +356,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--covariance", choices=("full", "diag"), default="full")
     parser.add_argument("--alignment", choices=ALIGNMENTS, default="dtw")
     parser.add_argument("--folds", type=int, help="hold out only so many, evenly spread")
+    parser.add_argument("--likelihood", action="store_true", help="of K and shrinkages")
     options = parser.parse_args(arguments)
     recording = RECORDINGS[options.set](options.folder)
     parameters = {
@@ -326,6 +369,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{options.set}: {len(folds)} of {n_episodes} episodes held out, {parameters}, "
         f"alignment {options.alignment}; {recording.link} at {recording.event!r}"
     )
+    if options.likelihood:
+        print(f"{'covariance_shrinkage':24}" + "".join(f"{f'K = {k}':>9}" for k in NUMBERS))
+        for name, values in likelihoods(recording, options.alignment, folds).items():
+            print(f"{name:24}" + "".join(f"{mean:9.1f}" for mean in values.mean(axis=0)))
+        return
     results = leave_one_out(recording, options.alignment, folds, **parameters)
     print(table(results), intervals(results), sep="\n\n")
 
