@@ -72,16 +72,7 @@ def correct(
     fitted = TaskParameterizedGMM.load(model, device="cpu")
     robot = fitted.robot
     recordings = options.recordings(
-        dataset,
-        robot,
-        frame,
-        episodes,
-        units,
-        joints,
-        rate,
-        plausibility,
-        event,
-        joint_name,
+        dataset, robot, frame, event, episodes, units, joints, joint_name, rate, plausibility
     )
     shown = recordings.corrections()
     if placed:

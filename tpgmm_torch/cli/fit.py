@@ -240,13 +240,13 @@ def fit(
         dataset,
         kinematics,
         frame,
+        event,
         episodes,
         units,
         joints,
+        joint_name,
         rate,
         plausibility,
-        event,
-        joint_name,
     )
     links = kinematics.links if kinematics is not None else ()
     state = None if checkpoint is None else Checkpoint(checkpoint, checkpoint_every)

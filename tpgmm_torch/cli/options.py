@@ -136,13 +136,13 @@ def recordings(
     dataset: str,
     robot: Kinematics | None,
     frames: Sequence[str] | None,
+    events: Sequence[str] | None,
     episodes: str | None,
     units: Sequence[str] | None,
     joints: str | None,
+    joint_names: Sequence[str] | None,
     rate: float | None,
     plausibility: str = "warn",
-    events: Sequence[str] | None = None,
-    joint_names: Sequence[str] | None = None,
 ) -> plugins.Recordings:
     """The ``dataset`` of which the options say the rest, not yet read.
 
@@ -152,11 +152,11 @@ def recordings(
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, episodes, units, joints, rate, plausibility, events, joint_names
+    frames, events, episodes, units, joints, joint_names, rate, plausibility
         The options as they were given.
     """
     reader = plugins.required(plugins.READERS, "lerobot")
-    given = frames, episodes, units, joints, rate, plausibility, events, joint_names
+    given = frames, events, episodes, units, joints, joint_names, rate, plausibility
     opened: plugins.Recordings = reader(dataset, robot, *given)
     return opened
 

@@ -68,15 +68,7 @@ def plot(
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
     recordings = options.recordings(
-        dataset,
-        kinematics,
-        frame,
-        episodes,
-        units,
-        joints,
-        rate,
-        events=event,
-        joint_names=joint_name,
+        dataset, kinematics, frame, event, episodes, units, joints, joint_name, rate
     )
     demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
     situation = Situation.of(demonstrations[0])

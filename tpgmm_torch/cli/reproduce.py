@@ -93,15 +93,7 @@ def reproduce(
         kinematics = one.kinematics_
     if dataset is not None:
         recordings = options.recordings(
-            dataset,
-            kinematics,
-            frame,
-            episodes,
-            units,
-            joints,
-            rate,
-            events=event,
-            joint_names=joint_name,
+            dataset, kinematics, frame, event, episodes, units, joints, joint_name, rate
         )
         wanted = [Situation.of(shown) for shown in recordings.demonstrations()]
     elif situations is not None:

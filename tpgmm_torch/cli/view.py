@@ -127,15 +127,7 @@ def view(
     demonstrations = []
     if dataset is not None:
         demonstrations = options.recordings(
-            dataset,
-            fitted.kinematics_,
-            frame,
-            episodes,
-            units,
-            joints,
-            rate,
-            events=event,
-            joint_names=joint_name,
+            dataset, fitted.kinematics_, frame, event, episodes, units, joints, joint_name, rate
         ).demonstrations()
     if situations is not None:
         wanted = read_situations(situations, fitted.kinematics_.joint_names)

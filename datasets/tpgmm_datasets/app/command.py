@@ -72,15 +72,7 @@ def page(
 
     def told() -> Shown:
         given = options.recordings(
-            str(dataset),
-            kinematics,
-            frame,
-            episodes,
-            units,
-            joints,
-            rate,
-            events=event,
-            joint_names=joint_name,
+            str(dataset), kinematics, frame, event, episodes, units, joints, joint_name, rate
         )
         return given.demonstrations(), kinematics
 

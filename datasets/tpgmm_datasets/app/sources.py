@@ -67,8 +67,7 @@ def uploaded(
     if kinds == {".zip"} and len(paths) == 1:
         with TemporaryDirectory() as place:
             folder = _unpacked(paths[0], Path(place))
-            given = Recordings(str(folder), robot, frames or None, None, None, None, None)
-            return given.demonstrations()
+            return Recordings(str(folder), robot, frames or None).demonstrations()
     if not paths or not kinds <= set(TABLES):
         raise DataError(
             "give one .zip of a LeRobot data set's folder, or tables (.csv, .parquet); got "

@@ -90,17 +90,7 @@ def check(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    recordings = Recordings(
-        path,
-        kinematics,
-        frame,
-        episodes,
-        units,
-        joints,
-        None,
-        events=event,
-        joint_names=joint_name,
-    )
+    recordings = Recordings(path, kinematics, frame, event, episodes, units, joints, joint_name)
     # all that can be told of in one go, not the first
     recording = open_recording(path, **recordings.options, relax=CHECKS)
     try:
@@ -139,9 +129,7 @@ def plot(
 
     from tpgmm_torch.plotting import figure, save
 
-    recordings = Recordings(
-        path, None, frame, episodes, units, joints, rate, events=event, joint_names=joint_name
-    )
+    recordings = Recordings(path, None, frame, event, episodes, units, joints, joint_name, rate)
     demonstrations = recordings.demonstrations()
     first = demonstrations[0]
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
@@ -222,15 +210,7 @@ def convert(
 
     kinematics = options.read_robot(robot, link, robot_joint, coordinate)
     recordings = Recordings(
-        source,
-        kinematics,
-        frame,
-        episodes,
-        units,
-        joints,
-        None,
-        events=event,
-        joint_names=joint_name,
+        source, kinematics, frame, event, episodes, units, joints, joint_name
     )
     recording = open_recording(source, **recordings.options)
     demonstrations = list(recording.demonstrations())

@@ -43,13 +43,10 @@ class Recordings(plugins.Recordings):
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, episodes, units
-        What :func:`parse_frames`, :func:`parse_episodes` and :func:`parse_units` take, or
-        None.
+    frames, events, episodes, units, joint_names
+        What :func:`parse_frames` and the others of these names take, or None.
     joints, rate, plausibility
         As for :func:`tpgmm_datasets.load_lerobot`.
-    events, joint_names
-        What :func:`parse_events` and :func:`parse_joint_names` take, or None.
 
     Raises
     ------
@@ -61,14 +58,14 @@ class Recordings(plugins.Recordings):
         self,
         dataset: str,
         robot: Kinematics | None,
-        frames: Sequence[str] | None,
-        episodes: str | None,
-        units: Sequence[str] | None,
-        joints: str | None,
-        rate: float | None,
-        plausibility: str = "warn",
+        frames: Sequence[str] | None = None,
         events: Sequence[str] | None = None,
+        episodes: str | None = None,
+        units: Sequence[str] | None = None,
+        joints: str | None = None,
         joint_names: Sequence[str] | None = None,
+        rate: float | None = None,
+        plausibility: str = "warn",
     ) -> None:
         self.dataset = dataset
         self.options: dict[str, Any] = {
@@ -173,16 +170,9 @@ def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
     any other.
     """
     from tpgmm_torch.events.text import parse_event
-    from tpgmm_torch.exceptions import DataError
 
-    events: dict[str, Any] = {}
-    for text in texts:
-        name, equals, how = (part.strip() for part in text.partition("="))
-        if not name or not equals or name in events:
-            problem = "is given twice" if name in events else "is not NAME=HOW"
-            raise DataError(f"event {text!r} {problem}, as in close=closing:*gripper*")
-        events[name] = parse_event(how)
-    return events or None
+    pairs = _pairs(texts, "event", "NAME=HOW", "close=closing:*gripper*")
+    return {name: parse_event(how) for name, how in pairs.items()} or None
 
 
 def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | None:
@@ -190,16 +180,20 @@ def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | None:
 
     Each text is ``STORED=JOINT``; a DataError says so of any other.
     """
+    return _pairs(texts, "joint name", "STORED=JOINT", "main_elbow=elbow_flex") or None
+
+
+def _pairs(texts: Sequence[str], kind: str, form: str, example: str) -> dict[str, str]:
     from tpgmm_torch.exceptions import DataError
 
-    names: dict[str, str] = {}
+    pairs: dict[str, str] = {}
     for text in texts:
-        stored, _, joint = (part.strip() for part in text.rpartition("="))
-        if not stored or not joint or stored in names:
-            problem = "is given twice" if stored in names else "is not STORED=JOINT"
-            raise DataError(f"joint name {text!r} {problem}, as in main_elbow=elbow_flex")
-        names[stored] = joint
-    return names or None
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not name or not value or name in pairs:
+            problem = "is given twice" if name in pairs else f"is not {form}"
+            raise DataError(f"{kind} {text!r} {problem}, as in {example}")
+        pairs[name] = value
+    return pairs
 
 
 def parse_episodes(text: str | None) -> slice | list[int] | str | None:
