@@ -18,6 +18,7 @@ from tests.support.lerobot_sets import (
     undeclared,
 )
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
+from tpgmm_datasets.errors import DatasetWarning
 from tpgmm_datasets.units import as_scale, convert, guess_unit, with_pose_units
 
 
@@ -39,7 +40,8 @@ def test_declared_units_are_believed(root):
 
 def test_a_unit_of_one_value_leaves_the_others(root):
     plain = joints_of(load_lerobot(root))
-    found = joints_of(load_lerobot(root, units={"gripper": Scale(2.0, 1.0)}))
+    with pytest.warns(DatasetWarning, match="declares 'gripper' in 'rad', not Scale"):
+        found = joints_of(load_lerobot(root, units={"gripper": Scale(2.0, 1.0)}))
     for a, b in zip(found, plain, strict=True):
         torch.testing.assert_close(a[:, :2], b[:, :2])
         torch.testing.assert_close(a[:, 2], 2 * b[:, 2] + 1)

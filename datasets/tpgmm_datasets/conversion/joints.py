@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.errors import DatasetError, DatasetWarning
 from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import match_names
-from tpgmm_datasets.units import Unit, Units, convert
+from tpgmm_datasets.units import Unit, Units, as_scale, convert
 
 __all__ = ["JointColumns", "joint_feature"]
 
@@ -141,6 +142,20 @@ def _units(
             f"units names {unknown}; the values are called {list(stored)}", column=feature.key
         )
     chosen = [given.get(f, given.get(o, "auto")) for o, f in zip(stored, final, strict=True)]
+    others = [
+        f"{name!r} in {declares!r}, not {unit!r}"
+        for name, unit, declares in zip(stored, chosen, declared, strict=True)
+        if unit != "auto"
+        and declares not in ("auto", "raw")
+        and as_scale(unit, feature.key) != as_scale(declares, feature.key)
+    ]
+    if others:
+        warnings.warn(
+            f"column {feature.key!r}: the set declares {', '.join(others)}; what was given "
+            "counts",
+            DatasetWarning,
+            stacklevel=2,
+        )
     chosen = [d if c == "auto" else c for c, d in zip(chosen, declared, strict=True)]
     if robot is not None:
         # other values are only seen by functions that find events

@@ -81,7 +81,8 @@ class FramePose:
             if name not in stored:
                 raise DatasetError(
                     f"frame {name!r} is not stored there, {sorted(stored)} are. To take one of "
-                    "them by another name, give FramePose(..., columns=[...])",
+                    "them by another name, give FramePose(..., columns=[...]) (--frame "
+                    "NAME=FEATURE[7:14])",
                     column=self.feature,
                 )
             places = list(stored[name])
