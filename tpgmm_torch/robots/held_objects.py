@@ -15,7 +15,12 @@ __all__ = ["held_objects"]
 
 
 def held_objects(
-    state: RobotState, time: Tensor, frames: Mapping[str, Frame], holds: Sequence[Hold]
+    state: RobotState,
+    time: Tensor,
+    frames: Mapping[str, Frame],
+    holds: Sequence[Hold],
+    *,
+    attached: bool = False,
 ) -> tuple[RobotState, dict[str, Frame]]:
     """Objects that were held as links of the state, and as the places where they were free.
 
@@ -30,6 +35,8 @@ def held_objects(
         held, from where the link that holds it carries it.
     holds : sequence of Hold
         In the order of time.
+    attached : bool, default=False
+        Whether the joints move what is held; else their Jacobians are zero.
 
     Returns
     -------
@@ -43,7 +50,8 @@ def held_objects(
     places = dict(frames)
     for name in dict.fromkeys(hold.frame for hold in holds):
         recorded, pose = bool(frames[name].batch_shape), frames[name].expand(time.shape)
-        last_free, free = torch.arange(len(time), device=time.device), -1
+        instants = torch.arange(len(time), device=time.device)
+        last_free, free, held = instants.clone(), -1, []
         for hold in holds:
             # the first instants that are not before
             begin, end = (int((time < at).sum()) for at in (hold.begin, hold.end))
@@ -52,7 +60,10 @@ def held_objects(
                 last_free[begin:end] = last_free[begin - 1] if begin == free else begin
                 free = end
                 pose = pose if recorded else _carried(state, pose, hold.link, begin, end)
+                held.append((hold.link, (instants >= begin) & (instants < end)))
         state = state.with_link(name, None, pose)
+        for link, where in held if attached else ():
+            state = state.with_link(name, link, pose.seen_from(state.pose(link)), where)
         places[name] = pose[last_free]
     return state, places
 

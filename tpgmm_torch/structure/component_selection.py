@@ -227,7 +227,7 @@ class ComponentSelection(BaseEstimator):  # type: ignore[misc]
         state = kinematics.state(motion.joints.to(like))
         frames = {name: frame.to(like) for name, frame in motion.frames.items()}
         if holds:
-            state, frames = held_objects(state, time, frames, holds)
+            state, frames = held_objects(state, time, frames, holds, attached=True)
         with torch.no_grad():
             estimate = regression.step(time, state, frames)
             step = (estimate.joints - state.joints)[..., None]

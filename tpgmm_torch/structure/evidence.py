@@ -181,7 +181,8 @@ def gather_evidence(
         state = kinematics.state(joints[index])
         frames = {name: f.to(time) for name, f in demonstration.frames.items()}
         if holds:
-            state, frames = held_objects(state, demonstration.time.to(time), frames, holds)
+            there = demonstration.time.to(time)
+            state, frames = held_objects(state, there, frames, holds, attached=True)
         others = [other for other in range(number) if other != index]
         column = 0
         for j, operator in enumerate(operators):

@@ -94,7 +94,8 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     ----------
     candidates : sequence of Operator, optional
         By default :func:`candidate_operators`: the joints; positions and orientations of all
-        links in the base frame, seen from all frames, and of one link seen from another.
+        links in the base frame, seen from all frames, and of one link seen from another; of
+        what is held, seen from the other frames.
     robot : Kinematics, optional
         What the candidates act on, as in :class:`TaskParameterizedGMM`.
     tolerance : float, default=0.005
@@ -215,11 +216,12 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         given = self.candidates
         if given is None:
             given = candidate_operators(self.robot, demonstrations[0])
+            # what is held is a thing of its own, to be brought to a place
+            _, holds = self._held(demonstrations, given)
+            carried = list(dict.fromkeys(hold.frame for hold in holds))
+            given = candidate_operators(self.robot, demonstrations[0], carried)
         operators = check_operators(given)
-        kinematics = kinematics_for(
-            demonstrations, operators, self.robot, self.dtype, self.device
-        )
-        holds = holds_for(self.holds, demonstrations, operators, kinematics)
+        kinematics, holds = self._held(demonstrations, operators)
         if self.robust:
             outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
             left_out = {one.episode for one in outlying}
@@ -241,6 +243,15 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         self.operators_ = arranged([operators[j] for j in chosen])
         self._judge(evidence, chosen, joints, kinematics)
         return self
+
+    def _held(
+        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
+    ) -> tuple[Kinematics, tuple[Hold, ...]]:
+        """What moves, and what it held."""
+        kinematics = kinematics_for(
+            demonstrations, operators, self.robot, self.dtype, self.device
+        )
+        return kinematics, holds_for(self.holds, demonstrations, operators, kinematics)
 
     def get_support(self, indices: bool = False) -> NDArray[Any]:
         """Which candidates matter, as scikit-learn's selectors say it.
@@ -376,7 +387,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
 
 
 def candidate_operators(
-    kinematics: Kinematics | None, demonstration: Demonstration
+    kinematics: Kinematics | None, demonstration: Demonstration, held: Sequence[str] = ()
 ) -> list[Operator]:
     """What :class:`OperatorSelection` chooses from where nothing is named.
 
@@ -386,6 +397,8 @@ def candidate_operators(
         Whose links are seen: in the base frame, from every frame, and from one another.
     demonstration : Demonstration
         Whose frames there are. Task parameters (:class:`Affine`) are none of them.
+    held : sequence of str, default=()
+        Frames of objects that links hold at times: they are seen from the other frames, too.
 
     Examples
     --------
@@ -405,6 +418,7 @@ def candidate_operators(
     frames = [n for n, f in demonstration.frames.items() if not isinstance(f, Affine)]
     pairs = [(link, frame) for frame in frames for link in links]
     pairs += [(link, other) for other, link in combinations(links, 2)]
+    pairs += [(thing, frame) for thing in held for frame in frames if frame != thing]
     for pair in pairs:
         candidates += [RelativePosition(*pair), RelativeOrientation(*pair)][: 1 + turns]
     return candidates

@@ -74,6 +74,28 @@ def test_from_hand_to_hand_it_is_not_free_between(frames):
     assert torch.equal(places["bottle"].position[handed:end], recorded[handed].expand(20, 3))
 
 
+def test_the_joints_move_what_is_attached():
+    state, frames = held_objects(STATE, SHOWN.time, SHOWN.frames, [HELD], attached=True)
+    loose, same = held_objects(STATE, SHOWN.time, SHOWN.frames, [HELD])
+    torch.testing.assert_close(state.position("bottle"), loose.position("bottle"))
+    assert torch.equal(frames["bottle"].position, same["bottle"].position)
+    jacobian = state.linear_jacobian("bottle")
+    assert (jacobian[:BEGIN] == 0).all() and (jacobian[END:] == 0).all()
+    assert (loose.linear_jacobian("bottle") == 0).all()
+    middle, step = (BEGIN + END) // 2, 1e-6
+    grasp = state.pose("bottle")[middle].seen_from(STATE.pose(HAND)[middle])
+    for joint in range(STATE.joints.shape[-1]):
+        ahead, behind = STATE.joints[middle].clone(), STATE.joints[middle].clone()
+        ahead[joint] += step
+        behind[joint] -= step
+        there, here = (
+            upper_body().state(joints).pose(HAND).compose(grasp).position
+            for joints in (ahead, behind)
+        )
+        moved = (there - here) / (2 * step)
+        torch.testing.assert_close(jacobian[middle, :, joint], moved, rtol=0, atol=1e-8)
+
+
 def test_local_data_follow_the_same_rule():
     place, thing = RelativePosition(HAND, "bottle"), RelativePosition(HAND, "bottle", held=True)
     robot = upper_body()

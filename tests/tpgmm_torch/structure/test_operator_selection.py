@@ -8,8 +8,10 @@ import torch
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
+from tests.support.carrying import carries
 from tests.support.planted import HAND, PlantedTask, told
 from tests.support.skills import handlings, hands_model, waves
+from tests.support.worlds import upper_body
 from tpgmm_torch import (
     AbsolutePosition,
     Affine,
@@ -151,6 +153,15 @@ def test_one_hand_seen_from_the_other_is_found():
     ]
 
 
+def test_what_a_hand_carries_is_found_as_a_thing():
+    """However it was grasped, the bottle stands in the same place on the tray."""
+    found = OperatorSelection(robot=upper_body()).fit(list(carries(6)))
+    assert {"position:bottle@tray", "position:l_hand@bottle"} <= relative(found)
+    assert "position:l_hand@tray" not in relative(found)
+    free = OperatorSelection(robot=upper_body(), holds=None).fit(list(carries(6)))
+    assert not any("bottle@tray" in format_operator(one) for one in free.candidates_)
+
+
 def test_joints_that_matter_are_found_in_groups():
     """One joint repeats its motion, the other wanders."""
     rng, time = np.random.default_rng(0), torch.linspace(0, 2, 60, dtype=torch.float64)
@@ -179,6 +190,8 @@ def test_candidates_are_all_links_in_all_frames(task):
     kinds = ("position", "orientation")
     places = ("l", "r", "l@a", "r@a", "r@l")
     assert texts == ["canonical", *(f"{kind}:{place}" for place in places for kind in kinds)]
+    held = candidate_operators(Poses(["l", "r"]), shown, ["a", "b"])[len(texts) :]
+    assert [format_operator(one) for one in held] == [f"{kind}:b@a" for kind in kinds]
     points = candidate_operators(Poses(["l"], orientation=False), shown)
     assert points == [Canonical(), AbsolutePosition("l"), RelativePosition("l", "a")]
     assert candidate_operators(None, shown) == [Canonical()]
