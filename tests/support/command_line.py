@@ -14,7 +14,7 @@ def run(*arguments):
 
 def output(*arguments):
     result = run(*arguments)
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 0, result.output or repr(result.exception)
     return result.stdout
 
 

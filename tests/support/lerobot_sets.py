@@ -150,9 +150,10 @@ def stuck(values):
 
 
 def undeclared(root, factor):
-    """The joints multiplied, and no units in the metadata."""
-    change_table(root, DATA, lambda t: set_column(t, "observation.state", lambda x: x * factor))
-    change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
+    """The joints multiplied, measured and commanded, and no units in the metadata."""
+    for feature in ("observation.state", "action"):
+        change_table(root, DATA, lambda t, f=feature: set_column(t, f, lambda x: x * factor))
+        change_info(root, lambda i, f=feature: i["features"][f].pop("info"))
 
 
 def assert_refused(root, check, file=None, episode=None, column=None):

@@ -28,9 +28,16 @@ def minimum_jerk(fraction: Tensor) -> Tensor:
 
 
 def fading_time(gap: Tensor, blend: float) -> Tensor:
-    """Seconds in which the gap (..., n) of robots that go on fades, shape (...).
+    """Seconds in which the gap of robots that go on fades, shape (...).
 
     A robot that was held stands a few milliradians from its reference: where it presses on
     something, it should soon press again.
+
+    Parameters
+    ----------
+    gap : Tensor
+        From the reference, shape (..., n) [rad or m].
+    blend : float
+        The longest that it takes [s]; a tenth of it is the shortest.
     """
     return (gap.abs().amax(-1) / FADING).clamp(SHORTEST * blend, blend)

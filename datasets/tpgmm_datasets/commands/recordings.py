@@ -43,9 +43,13 @@ class Recordings(plugins.Recordings):
         A folder, or a name on the hub, as for ``load_lerobot``.
     robot : Kinematics or None
         Gives the order of the joints.
-    frames, events, episodes, units, joint_names
+    frames, events, episodes, units
         What :func:`parse_frames` and the others of these names take, or None.
-    joints, rate, plausibility
+    joints
+        As for :func:`tpgmm_datasets.load_lerobot`.
+    joint_names
+        What :func:`parse_joint_names` takes, or None.
+    rate, plausibility
         As for :func:`tpgmm_datasets.load_lerobot`.
 
     Raises
