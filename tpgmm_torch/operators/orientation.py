@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Self
 
@@ -196,6 +196,7 @@ class AbsoluteOrientation(_Orientation):
     """
 
     link: str
+    _: KW_ONLY
     gain: float = 2.0
     tolerance: float = 0.0
     geometry: str = "quaternion"
@@ -259,6 +260,7 @@ class RelativeOrientation(_Orientation):
 
     link: str
     frame: str
+    _: KW_ONLY
     gain: float = 2.0
     held: bool = False
     tolerance: float = 0.0

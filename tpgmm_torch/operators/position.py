@@ -1,7 +1,7 @@
 """Position constraints in task space: section III-A, eqs (3) to (6)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import torch
 from torch import Tensor
@@ -37,6 +37,7 @@ class AbsolutePosition(Operator):
     """
 
     link: str
+    _: KW_ONLY
     tolerance: float = 0.0
 
     def dimension(self, kinematics: Kinematics | None) -> int:
@@ -103,6 +104,7 @@ class RelativePosition(Operator):
 
     link: str
     frame: str
+    _: KW_ONLY
     held: bool = False
     tolerance: float = 0.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, combinations
+from itertools import chain, combinations, permutations
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -95,7 +95,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     candidates : sequence of Operator, optional
         By default :func:`candidate_operators`: the joints; positions and orientations of all
         links in the base frame, seen from all frames, and of one link seen from another; of
-        what is held, seen from the other frames.
+        what is held, seen from the other frames, and from one another as they are held.
     robot : Kinematics, optional
         What the candidates act on, as in :class:`TaskParameterizedGMM`.
     tolerance : float, default=0.005
@@ -398,7 +398,8 @@ def candidate_operators(
     demonstration : Demonstration
         Whose frames there are. Task parameters (:class:`Affine`) are none of them.
     held : sequence of str, default=()
-        Frames of objects that links hold at times: they are seen from the other frames, too.
+        Frames of objects that links hold at times: they are seen from the other frames, too,
+        and from one another as they are held.
 
     Examples
     --------
@@ -421,6 +422,9 @@ def candidate_operators(
     pairs += [(thing, frame) for thing in held for frame in frames if frame != thing]
     for pair in pairs:
         candidates += [RelativePosition(*pair), RelativeOrientation(*pair)][: 1 + turns]
+    for pair in permutations(held, 2):  # each in a hand of its own
+        both = [RelativePosition(*pair, held=True), RelativeOrientation(*pair, held=True)]
+        candidates += both[: 1 + turns]
     return candidates
 
 

@@ -433,3 +433,11 @@ def test_gradients_pass_through_operators_of_ones_own(operator, fusion):
         return regression.step(NOW, regression.kinematics.state(joints), {}).joints
 
     assert torch.autograd.gradcheck(step, Q.clone().requires_grad_())
+
+
+@pytest.mark.parametrize("kind", [RelativePosition, RelativeOrientation])
+def test_what_is_no_name_is_given_by_name(kind):
+    """The third value was ``held`` of one and the gain of the other."""
+    with pytest.raises(TypeError, match="positional"):
+        kind(LEFT, OBJECT, True)
+    assert kind(LEFT, OBJECT, held=True).links() == (LEFT, OBJECT)

@@ -22,14 +22,14 @@ from tpgmm_torch.operators.pose_terms import pose_terms
 
 STACKS = {
     "one": Stack(RelativePosition("l_hand", "cup")),
-    "absolute": Stack(AbsoluteOrientation("r_hand", 1.0), AbsolutePosition("l_hand")),
+    "absolute": Stack(AbsoluteOrientation("r_hand", gain=1.0), AbsolutePosition("l_hand")),
     "two frames": Stack(
         Stack(RelativeOrientation("r_hand", "lid"), RelativePosition("l_hand", "cup")),
-        RelativeOrientation("l_hand", "cup", 1.1),
+        RelativeOrientation("l_hand", "cup", gain=1.1),
         AbsolutePosition("r_hand"),
     ),
     "hand to hand": Stack(
-        RelativeOrientation("r_hand", "l_hand", 1.2),
+        RelativeOrientation("r_hand", "l_hand", gain=1.2),
         RelativePosition("l_hand", "cup"),
         RelativePosition("r_hand", "l_hand"),
     ),

@@ -191,7 +191,10 @@ def test_candidates_are_all_links_in_all_frames(task):
     places = ("l", "r", "l@a", "r@a", "r@l")
     assert texts == ["canonical", *(f"{kind}:{place}" for place in places for kind in kinds)]
     held = candidate_operators(Poses(["l", "r"]), shown, ["a", "b"])[len(texts) :]
-    assert [format_operator(one) for one in held] == [f"{kind}:b@a" for kind in kinds]
+    places = ("b@a", "a@held:b", "b@held:a")  # of two that are held, each seen from the other
+    assert [format_operator(one) for one in held] == [
+        f"{k}:{at}" for at in places for k in kinds
+    ]
     points = candidate_operators(Poses(["l"], orientation=False), shown)
     assert points == [Canonical(), AbsolutePosition("l"), RelativePosition("l", "a")]
     assert candidate_operators(None, shown) == [Canonical()]

@@ -213,9 +213,15 @@ class PegInHole(SuiteTask):
         Without what is held, one hand from the other in place of the peg from the block.
         """
         kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-        things = ("peg", "block", True) if held else ("r_hand", "l_hand")
-        pairs = (("r_hand", "peg"), ("l_hand", "block"), things)
-        return [*(Stack(*(kind(*pair) for kind in kinds)) for pair in pairs), Canonical()]
+        grasps = [
+            Stack(*(kind(*pair) for kind in kinds))
+            for pair in (("r_hand", "peg"), ("l_hand", "block"))
+        ]
+        if held:
+            together = Stack(*(kind("peg", "block", held=True) for kind in kinds))
+        else:
+            together = Stack(*(kind("r_hand", "l_hand") for kind in kinds))
+        return [*grasps, together, Canonical()]
 
 
 class _Judge(Judge):

@@ -15,6 +15,7 @@ from lerobot_policy_tpgmm.environments.suite.peg_in_hole import (
 )
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tests.support.suite_expert import replay, start_of, tick
+from tpgmm_torch.operators.text import format_operator
 
 FPS = 25
 TASK = suite_task("peg_in_hole")
@@ -41,6 +42,11 @@ def test_experts_insert_the_peg(motions, env):
         assert info["is_success"] and not failing(info)
         assert 36 < info["depth_mm"] < 42  # it leads 40 mm in, and arms give way
         assert info["inserted_s"] > 1.2 and info["force_n"] < 20
+
+
+def test_the_peg_is_seen_from_the_block_as_it_is_carried():
+    *_, together, _ = map(format_operator, TASK.operators())
+    assert together == "position:peg@held:block + orientation:peg@held:block"
 
 
 def test_half_the_way_is_not_deep_enough(motions, env):
