@@ -50,6 +50,7 @@ from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks, demonstrate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.persistence import CONFIG, MODEL, MODES, TENSORS, decode, encode
 from tpgmm_torch.plausibility.check import (
     episodes_report,
@@ -58,6 +59,7 @@ from tpgmm_torch.plausibility.check import (
     summarized,
 )
 from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Finding, Report
+from tpgmm_torch.plausibility.likeness import check_carried_things
 from tpgmm_torch.plausibility.outlying_demonstrations import (
     Outlying,
     left_out,
@@ -88,7 +90,6 @@ from tpgmm_torch.structure.parts import (
     chained,
     check_cuts,
     components_of_parts,
-    leaves,
     matters,
     part_of,
     stretches,
@@ -583,7 +584,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 leave_out=leave_out if self.robust else None,
             )  # fmt: skip
             everyone = list(chain.from_iterable(processes.gather(episodes)))
-            examined = self._examine(everyone, outlying, operators, kinematics, processes.rank)
+            examined = self._examine(
+                everyone, outlying, operators, kinematics, holds, processes.rank
+            )
             self._learn(gathered, operators, kinematics, checkpoint, holds)
             self.shown_, self.demonstration_weights_ = examined
         return self._set_peaks(*seen.result(processes))
@@ -1992,9 +1995,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         family = self.covariance_type, self.covariance_shrinkage
         report = learning_report(episodes, operators, kinematics, *family)
         weights, holds = torch.ones(len(demonstrations), dtype=torch.float64), None
-        if self.robust and (not report.errors() or self.plausibility == "ignore"):
+        if not report.errors() or self.plausibility == "ignore":
             holds = holds_for(self.holds, demonstrations, operators, kinematics)
-            outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
+            report = report.and_also(*check_carried_things(operators, kinematics, holds))
+            outlying = self.robust and outlying_demonstrations(
+                demonstrations, operators, kinematics, holds
+            )
             if outlying:
                 report = report.and_also(left_out(outlying, len(demonstrations)))
                 weights[[one.episode for one in outlying]], holds = 0.0, None
@@ -2008,12 +2014,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         outlying: Sequence[Outlying],
         operators: Sequence[Operator],
         kinematics: Kinematics,
+        holds: Sequence[Hold],
         rank: int,
     ) -> tuple[Shown, Tensor]:
         """The same of demonstrations in batches: what they showed, and their weights (M,)."""
         report = learning_report(
             episodes, operators, kinematics, self.covariance_type, self.covariance_shrinkage
         )
+        report = report.and_also(*check_carried_things(operators, kinematics, holds))
         weights = torch.ones(len(episodes), dtype=torch.float64)
         if outlying:
             report = report.and_also(left_out(outlying, len(episodes)))

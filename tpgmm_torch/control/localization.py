@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators import Operator, Stack
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.regression import Estimate, Regression
 from tpgmm_torch.robots.kinematics import RobotState
@@ -178,13 +179,13 @@ class Instants:
         self._followers: list[tuple[Operator, Coordinates]] = []  # along paths
         self._times = times
         for operator, one in zip(regression.operators, regression.conditionals, strict=True):
-            leaves = operator.leaves if isinstance(operator, Stack) else (operator,)
-            sizes = [leaf.dimension(kinematics) for leaf in leaves]
-            there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in leaves]
-            seen = [leaf for leaf, known in zip(leaves, there, strict=True) if known]
+            members = leaves([operator])
+            sizes = [leaf.dimension(kinematics) for leaf in members]
+            there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
+            seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
             if not seen:
                 continue
-            if len(seen) < len(leaves):
+            if len(seen) < len(members):
                 operator = Stack(*seen)
                 columns = torch.from_numpy(np.flatnonzero(np.repeat(there, sizes)))
                 one = one.marginal(columns)

@@ -13,12 +13,19 @@ from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.notebook import Tabular
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Linearization", "Operator", "Reference", "carried_objects", "frame_names"]
+__all__ = [
+    "Linearization",
+    "Operator",
+    "Reference",
+    "carried_objects",
+    "check_pair",
+    "frame_names",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,6 +291,27 @@ class Operator(Tabular, ABC):
                     "the demonstration alone, it is a link of the robot too: rename the frame",
                     frames,
                 )
+
+
+def check_pair(link: str, frame: str, held: object) -> None:
+    """Check what a relative operator is told.
+
+    Parameters
+    ----------
+    link, frame : str
+        What is seen, and from where.
+    held : object
+        Whether the frame is a thing.
+
+    Raises
+    ------
+    DataError
+        If something is seen from itself, or ``held`` is neither True nor False.
+    """
+    if link == frame:
+        raise DataError(f"{link!r} seen from itself never changes: name another frame")
+    if not isinstance(held, bool):
+        raise DataError(f"held is True or False, got {held!r}")
 
 
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:

@@ -19,9 +19,11 @@ a position in tangent space, whose Jacobian is exact, not only where little is l
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
+from numbers import Real
 from typing import Self
 
 import torch
@@ -30,7 +32,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators.base import Linearization, Operator, Reference
+from tpgmm_torch.operators.base import Linearization, Operator, Reference, check_pair
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["AbsoluteOrientation", "RelativeOrientation"]
@@ -53,6 +55,9 @@ class _Orientation(Operator):
     def __post_init__(self) -> None:
         if self.geometry not in GEOMETRIES:
             raise DataError(f"geometry is one of {list(GEOMETRIES)}, got {self.geometry!r}")
+        number = isinstance(self.gain, Real) and not isinstance(self.gain, bool)
+        if not (number and 0 < self.gain < math.inf):
+            raise DataError(f"gain is a positive number, got {self.gain!r}")
         if self.geometry == "tangent" and self.gain != 2.0:
             raise DataError(
                 f"gain={self.gain} is for geometry='quaternion': rotation vectors need none"
@@ -266,6 +271,10 @@ class RelativeOrientation(_Orientation):
     tolerance: float = 0.0
     geometry: str = "quaternion"
     path: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_pair(self.link, self.frame, self.held)
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``."""

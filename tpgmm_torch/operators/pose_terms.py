@@ -226,8 +226,8 @@ def pose_terms(
     Parameters
     ----------
     operators : tuple of Operator
-        Position and orientation operators; others, those in tangent space, and those that
-        refer to their own link speak for themselves.
+        Position and orientation operators; others, and those in tangent space, speak for
+        themselves.
     links : tuple of str
     dtype : torch.dtype
     device : torch.device
@@ -241,9 +241,6 @@ def pose_terms(
             return None
         if operator.rotation_vector_starts(None):
             return None  # logarithms and their Jacobians are not bilinear
-        link, *references = *operator.links(), *operator.references()
-        if link in references:
-            return None
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):
         return PoseTerms(operators, links, dtype, device)

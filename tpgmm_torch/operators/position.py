@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.operators.base import Linearization, Operator, Reference
+from tpgmm_torch.operators.base import Linearization, Operator, Reference, check_pair
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["AbsolutePosition", "RelativePosition"]
@@ -107,6 +107,9 @@ class RelativePosition(Operator):
     _: KW_ONLY
     held: bool = False
     tolerance: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_pair(self.link, self.frame, self.held)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """Three [m]."""

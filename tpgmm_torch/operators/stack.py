@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,7 +16,7 @@ from tpgmm_torch.operators.base import Linearization, Operator
 from tpgmm_torch.operators.pose_terms import pose_terms
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Stack"]
+__all__ = ["Stack", "leaves"]
 
 
 @dataclass(frozen=True, init=False)
@@ -58,11 +58,7 @@ class Stack(Operator):
     @cached_property
     def leaves(self) -> tuple[Operator, ...]:
         """The members, and those of members that are stacks themselves, in their order."""
-        return tuple(
-            leaf
-            for operator in self.operators
-            for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
-        )
+        return leaves(self.operators)
 
     def dimension(self, kinematics: Kinematics | None) -> int:
         """The sum of the dimensions."""
@@ -171,3 +167,12 @@ class Stack(Operator):
 
     def __repr__(self) -> str:
         return f"Stack({', '.join(map(repr, self.operators))})"
+
+
+def leaves(operators: Sequence[Operator]) -> tuple[Operator, ...]:
+    """The members of stacks, and what is no stack, of some ``operators`` in their order."""
+    return tuple(
+        leaf
+        for operator in operators
+        for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
+    )

@@ -82,9 +82,9 @@ class Report:
         """The report with errors first."""
         return cls(tuple(sorted(findings, key=lambda f: f.severity != "error")), subject)
 
-    def and_also(self, finding: Finding) -> Report:
-        """The report with one more finding."""
-        return Report.of([*self.findings, finding], self.subject)
+    def and_also(self, *findings: Finding) -> Report:
+        """The report with more findings."""
+        return Report.of([*self.findings, *findings], self.subject)
 
     def __iter__(self) -> Iterator[Finding]:
         """One finding after the other."""

@@ -6,14 +6,17 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.outliers import outliers
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["check_freedom", "check_likeness"]
+__all__ = ["check_carried_things", "check_freedom", "check_likeness"]
 
 #: Paths that differ by less of the joints' ranges, on average, are like each other.
 LIKE = 0.5
@@ -117,4 +120,44 @@ def check_freedom(
             "coordinates would have to tell all apart",
             "Show the skill 5 times or more, or learn with covariance_shrinkage='auto'",
             value=2.0,
+        )
+
+
+def check_carried_things(
+    operators: Sequence[Operator], kinematics: Kinematics, holds: Sequence[Hold]
+) -> Iterator[Finding]:
+    """Operators that say nothing at any time: what they look at never moves with the joints.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+        What is learned.
+    kinematics : Kinematics
+        Whose links move.
+    holds : sequence of Hold
+        What links carry.
+
+    Yields
+    ------
+    Finding
+    """
+    moved = {*kinematics.links, *(hold.frame for hold in holds)}
+    silent = [
+        operator
+        for operator in leaves(operators)
+        if operator.links()
+        and moved.isdisjoint(operator.links())
+        and not set(operator.references()) & set(kinematics.links)
+    ]
+    if silent:
+        names = tuple(dict.fromkeys(name for operator in silent for name in operator.links()))
+        texts = [format_operator(operator) for operator in silent]
+        yield Finding(
+            "holds",
+            "unlikely",
+            f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
+            f"Say who holds what, holds=[Hold({names[0]!r}, LINK, BEGIN, END)] "
+            f"(--hold {names[0]}@LINK:BEGIN-END), or leave such operators out; holds='auto' "
+            "finds them where poses of objects are recorded over time",
+            names,
         )

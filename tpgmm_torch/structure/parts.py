@@ -26,6 +26,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.operators import Operator, Stack
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
@@ -33,7 +34,6 @@ __all__ = [
     "chained",
     "check_cuts",
     "components_of_parts",
-    "leaves",
     "matters",
     "parse_parts",
     "part_of",
@@ -105,15 +105,6 @@ def stretches(
         ]
         for number in range(len(parts))
     ]
-
-
-def leaves(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """The members of stacks, and what is no stack, of some ``operators`` in their order."""
-    return tuple(
-        leaf
-        for operator in operators
-        for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
-    )
 
 
 def united(lists: Sequence[Sequence[Operator]]) -> tuple[Operator, ...]:

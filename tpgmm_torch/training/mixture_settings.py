@@ -15,6 +15,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -33,7 +34,7 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
     Raises
     ------
     DataError
-        If there are none, or something else is among them.
+        If there are none, something else is among them, or one is there twice.
     """
     checked = (Canonical(),) if operators is None else tuple(operators)
     if not checked:
@@ -41,6 +42,10 @@ def check_operators(operators: Any) -> tuple[Operator, ...]:
     for operator in checked:
         if not isinstance(operator, Operator):
             raise DataError(f"operators holds Operator objects, got {operator!r}")
+    every = leaves(checked)
+    for number, leaf in enumerate(every):
+        if leaf in every[:number]:
+            raise DataError(f"operators has {leaf!r} twice: it would count twice")
     return checked
 
 

@@ -1,6 +1,8 @@
 """What all operators share: names, errors, values; and operators of a user's own."""
 
+import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -48,6 +50,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators.base import Reference, carried_objects, frame_names
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.training.mixture_settings import check_operators
 
 WORLDS = pytest.mark.parametrize("world", [OnRobot(), OnPoses()], ids=["robot", "poses"])
 
@@ -441,3 +444,24 @@ def test_what_is_no_name_is_given_by_name(kind):
     with pytest.raises(TypeError, match="positional"):
         kind(LEFT, OBJECT, True)
     assert kind(LEFT, OBJECT, held=True).links() == (LEFT, OBJECT)
+    with pytest.raises(DataError, match="held is True or False, got 'no'"):
+        kind(LEFT, OBJECT, held="no")
+    with pytest.raises(DataError, match=f"'{LEFT}' seen from itself"):
+        kind(LEFT, LEFT)
+
+
+@pytest.mark.parametrize("gain", [math.nan, math.inf, 0.0, -2.0, True, "2"])
+def test_a_gain_is_a_positive_number(gain):
+    for make in (
+        partial(AbsoluteOrientation, LEFT),
+        partial(RelativeOrientation, LEFT, OBJECT),
+    ):
+        with pytest.raises(DataError, match="gain is a positive number, got"):
+            make(gain=gain)
+
+
+def test_nothing_counts_twice():
+    one, other = AbsolutePosition(LEFT), Canonical()
+    with pytest.raises(DataError, match="twice"):
+        check_operators([Stack(one, AbsolutePosition(RIGHT)), one, other])
+    assert check_operators([one, other]) == (one, other)

@@ -1,15 +1,35 @@
-"""Copies, strangers, and too few."""
+"""Copies, strangers, too few, and operators that look at what nobody carries."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.support.skills import HANDLING, HANDS, handlings, waves
-from tpgmm_torch import Canonical
+from tpgmm_torch import (
+    AbsolutePosition,
+    Canonical,
+    Demonstration,
+    Frame,
+    Hold,
+    Poses,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+    TaskParameterizedGMM,
+)
+from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.plausibility.check import summarize
-from tpgmm_torch.plausibility.likeness import check_freedom, check_likeness
+from tpgmm_torch.plausibility.likeness import (
+    check_carried_things,
+    check_freedom,
+    check_likeness,
+)
 from tpgmm_torch.robots.joint_space import JointSpace
+
+HAND = Poses(["hand"], orientation=False)
+PUT = RelativePosition("cup", "tray")
 
 
 def found(items):
@@ -62,3 +82,48 @@ def test_freedom(n, correlated, told):
 
 def test_one_joint_alone_is_learned_from_two():
     assert list(check_freedom(2, [Canonical()], JointSpace(("a",)), correlated=True)) == []
+
+
+@pytest.mark.parametrize(
+    ("operator", "says"),
+    [
+        (PUT, False),
+        (AbsolutePosition("cup"), False),
+        (RelativeOrientation("cup", "tray", held=True), False),
+        (RelativePosition("cup", "hand"), True),  # the hand moves
+        (RelativePosition("hand", "cup"), True),
+        (RelativePosition("hand", "cup", held=True), True),
+        (Canonical(), True),
+    ],
+)
+def test_what_never_moves_says_nothing_until_it_is_held(operator, says):
+    operators = [Stack(operator, RelativePosition("hand", "tray"))]
+    found = list(check_carried_things(operators, HAND, []))
+    assert bool(found) != says
+    assert not list(check_carried_things(operators, HAND, [Hold("cup", "hand")]))
+
+
+def shown(carried):
+    """A hand that goes to a cup and, perhaps, takes it to a tray."""
+    time, rng, found = np.linspace(0, 2, 61), np.random.default_rng(0), []
+    there = np.clip(time, 0, 1)[:, None]
+    back = np.clip(time - 1, 0, 1)[:, None]
+    for _ in range(5):
+        cup, tray = rng.uniform(-0.3, 0.3, (2, 3))
+        path = there * cup + back * (tray - cup) + 1e-4 * rng.normal(size=(61, 3))
+        pose = np.where(time[:, None] <= 1, cup, path) if carried else np.tile(cup, (61, 1))
+        frames = {"cup": Frame(pose), "tray": Frame(tray)}
+        found.append(Demonstration(time, path, frames))
+    return found
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_fit_tells(robust):
+    model = TaskParameterizedGMM(4, [PUT, Canonical()], HAND, robust=robust, random_state=0)
+    with pytest.warns(PlausibilityWarning, match=r"no link holds cup: position:cup@tray says"):
+        model.fit(shown(carried=False))
+    model.fit(shown(carried=True))  # warnings are errors
+    [hold] = model.holds_
+    assert (hold.frame, hold.link) == ("cup", "hand") and math.isclose(
+        hold.begin, 1, abs_tol=0.1
+    )
