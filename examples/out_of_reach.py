@@ -7,9 +7,9 @@ from its nearest point as a draw says. The robots of a batch
    changes its sign with more than 1 rad/s before and after, and ticks beyond the bounds of
    speed and acceleration;
 2. run it up to the grasp, where time stands for some seconds more, so that they come to rest as
-   near to the bottle as they get. Their distance is sqrt(2 F), that of the fused Gaussian, in
-   units of what demonstrations allow; it is compared with the best of many starts, drawn
-   between the limits of the joints, from each of which the same cost is minimised.
+   near to the bottle as they get. Their distance is sqrt(2 F), F the mean cost of the fused
+   Gaussians, in units of what demonstrations allow; it is compared with the best of many
+   starts, drawn between the limits of the joints, from each of which it is minimised.
 
     python examples/out_of_reach.py --bottles 200
 
@@ -19,7 +19,7 @@ nearest posture is more than 100 standard deviations away.
 
 import argparse
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +31,11 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.clocks import EvenProgress
-from tpgmm_torch.regression.posture import _Cost, _descended
+from tpgmm_torch.regression.posture import NEGLIGIBLE, _Cost, _descended
 from tpgmm_torch.regression.regression import Regression
 
+#: Cost, downhill gradient and precision of postures.
+Costs = tuple[Tensor, Tensor, Tensor]
 #: When the hands are at the bottle, shortly before it is moved [s].
 GRASP = 4.4
 DT = 0.01
@@ -110,11 +112,28 @@ def distances(
     """Where robots are (n,), and the least from many starts (n,)."""
     regression, robot = model.regression(), BottleShaking().robot
     time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
-    heaviest = regression.tick(time, joints, frames).activation.argmax(-1).expand(len(joints))
+    activation = regression.tick(time, joints, frames).activation
+    index = (activation > NEGLIGIBLE).nonzero()[:, 0]
+    weights = activation[index] / activation[index].sum()
 
-    def cost(count: int) -> _Cost:
-        index = heaviest.expand(count, -1)
-        return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
+    def cost(count: int) -> Callable[[Tensor], Costs]:
+        costs = [
+            _Cost(
+                regression, i.expand(count, len(joints)), time, joints, frames,
+                regression.kinematics.state,
+            )
+            for i in index
+        ]  # fmt: skip
+
+        def mean(postures: Tensor) -> Costs:
+            of_each = [one(postures) for one in costs]
+            height, vector, precision = (
+                sum(w * one[part] for w, one in zip(weights, of_each, strict=True))
+                for part in range(3)
+            )
+            return height, vector, precision
+
+        return mean
 
     generator = torch.Generator().manual_seed(1)
     share = torch.rand(starts, *joints.shape, generator=generator, dtype=torch.float64)

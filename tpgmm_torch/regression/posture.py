@@ -13,17 +13,19 @@ where r_ij is the displacement that operator j asks for at q, with Jacobian ``-J
     q* = sum_i h_i(t) q_i*,   q_i* = argmin F_i(q)  such that  lower <= q <= upper,
 
 the components' minima mixed as the regression mixes their means: to first order it is the
-regression's estimate. The minima are found by Levenberg's and Marquardt's method with steps
-that keep within the limits exactly, taken only where the cost falls, from where the last tick
-ended: what cannot be reached is approached, and then nothing moves. Where the limits leave
-several minima, others are looked for meanwhile, from a few fixed postures in turn.
+regression's estimate. Out of reach, where these minima lie apart and nothing between them is
+near, it is that of their mean cost, ``argmin sum_i h_i(t) F_i(q)``. Minima are found by
+Levenberg's and Marquardt's method with steps that keep within the limits exactly, taken only
+where the cost falls, from where the last tick ended: what cannot be reached is approached, and
+then nothing moves. Where the limits leave several minima, others are looked for meanwhile, from
+a few fixed postures in turn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Self
 
 import torch
@@ -73,9 +75,9 @@ class PostureSearch:
     ----------
     active : Tensor of bool, of shape (...), optional
         Robots whose regression is not trusted; None if there are none.
-    minima, damping : Tensor of shape (K + 1, ..., n_joints) and (K + 1, ...), optional
-        Where the components' searches are; behind them one that looks elsewhere for a lower
-        cost of the heaviest.
+    minima, damping : Tensor of shape (K + 2, ..., n_joints) and (K + 2, ...), optional
+        Where the components' searches are; behind them that for the lowest mean cost, and one
+        that looks elsewhere for a lower one.
     age : Tensor of int, of shape (...), optional
         Ticks since each robot's search began.
     """
@@ -161,10 +163,11 @@ class PostureSearch:
         weights = estimate.activation.expand(*batch, -1)[where]
         weights = torch.where(weights > NEGLIGIBLE, weights, 0.0).mT  # (K, R)
         count, index = len(weights), weights.any(-1).nonzero()[:, 0]
+        weights = weights[index] / weights.sum(0)
         lower, upper = (bound.expand_as(like)[where] for bound in bounds)
         # a search begins where the robot stands
-        minima = reference.expand(count + 1, *batch, -1)
-        damping = like.new_zeros(count + 1, *batch)
+        minima = reference.expand(count + 2, *batch, -1)
+        damping = like.new_zeros(count + 2, *batch)
         age = torch.zeros(batch, dtype=torch.long, device=like.device)
         if self.active is not None and self.minima is not None:
             assert self.damping is not None and self.age is not None
@@ -179,18 +182,19 @@ class PostureSearch:
             everyone[(slice(None), *where)] = joints
             return state_at(everyone)[(slice(None), *where)]
 
-        # rows: the components' searches, a look elsewhere and a step from where the robot
-        # stands, both of the heaviest component
-        size, here, heaviest = len(index), age[where], weights.argmax(0, keepdim=True)
-        places = torch.cat((index, index.new_tensor([count])))
+        # rows: a step of the heaviest component from where the robot stands, the components'
+        # searches, that of their mean cost, and the same from elsewhere
+        here, heaviest = age[where], weights.argmax(0, keepdim=True)
+        places = torch.cat((index, index.new_tensor([count, count + 1])))
         found, damped = minima[places][of_all], damping[places][of_all]
         begins = here % LOOK == 0
         starts = _starts(here // LOOK, lower, upper)
-        found[size] = torch.where(begins.unsqueeze(-1), starts, found[size])
-        damped[size] = torch.where(begins, 0.0, damped[size])
+        found[-1] = torch.where(begins.unsqueeze(-1), starts, found[-1])
+        damped[-1] = torch.where(begins, 0.0, damped[-1])
+        every = index.unsqueeze(-1).expand(-1, len(here))
         cost = _Cost(
             regression,
-            torch.cat((index.unsqueeze(-1).expand(-1, len(here)), heaviest, heaviest)),
+            torch.cat((every.gather(0, heaviest), every, every, every)),
             time.expand(batch)[where] if time.ndim else time,
             reference[where],
             {name: frame.expand(batch)[where] for name, frame in frames.items()},
@@ -198,38 +202,54 @@ class PostureSearch:
         )
         begun = torch.clamp(reference[where], lower, upper)
         found, damped, height, stepped = _descended(
-            cost,
-            torch.cat((found, begun.unsqueeze(0))),
-            torch.cat((damped, torch.zeros_like(damped[:1]))),
+            partial(_with_means, cost, weights),
+            torch.cat((begun.unsqueeze(0), found)),
+            torch.cat((torch.zeros_like(damped[:1]), damped)),
             lower,
             upper,
         )
-        # the heaviest component decides for all whether it is better elsewhere
-        chosen = torch.searchsorted(index, heaviest)
-        low, other = height.gather(0, chosen), height[size]
-        better = (here % LOOK == LOOK - 1) & (other < BETTER * low[0] - SLACK)
-        nearest = torch.where(better.unsqueeze(-1), found[size], found[:size])
-        goal = nearest.gather(0, chosen.unsqueeze(-1).expand(1, *begun.shape))[0]
-        shares = (weights[index] / weights.sum(0)).unsqueeze(-1)
-        mixed = torch.clamp((shares * nearest).sum(0), lower, upper)
+        found, damped, height = found[1:], damped[1:], height[1:]
+        low = height.gather(0, heaviest)[0]
+        reached, least = low < SLACK, BETTER * height[-2] - SLACK
+        better = (here % LOOK == LOOK - 1) & (height[-1] < least) & ~reached
+        nearest = torch.where(better.unsqueeze(-1), found[-1], found[:-1])
+        # out of reach the components' minima lie apart, and what is between them is none
+        mixed = torch.clamp((weights.unsqueeze(-1) * nearest[:-1]).sum(0), lower, upper)
+        share = torch.clamp(low / SLACK - 1, 0, 1).unsqueeze(-1)
+        sought = torch.lerp(mixed, nearest[-1], share)
         # how much nearer to its minimum one step of the linearised problem leads; out of
         # reach, where components of little weight may lead astray, of the whole mixture
-        reached = (low[0] < SLACK).unsqueeze(-1)
-        goal = torch.where(reached, goal, mixed)
-        step = torch.where(reached, stepped[size + 1], estimate.joints[where])
+        goal = nearest.gather(0, heaviest.unsqueeze(-1).expand(1, *begun.shape))[0]
+        goal = torch.where(reached.unsqueeze(-1), goal, sought)
+        step = torch.where(reached.unsqueeze(-1), stepped[0], estimate.joints[where])
         away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
         trust = like.new_ones(batch)
         trust[where] = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
         wanted = like.clone()
-        wanted[where] = mixed
+        wanted[where] = sought
         # a component that counts only later begins where the others are
-        counts = (weights[index] > 0).unsqueeze(-1)
-        minima = wanted.expand(count + 1, *batch, -1).clone()
+        counts = (weights > 0).unsqueeze(-1)
+        own = torch.where(counts, nearest[:-1], sought)
+        minima = wanted.expand(count + 2, *batch, -1).clone()
         damping = torch.zeros_like(damping)
         rows_of = (places[:, None], *where) if batch else (places, None)
-        minima[rows_of] = torch.cat((torch.where(counts, nearest, mixed), found[size:-1]))
-        damping[rows_of] = damped[:-1]
+        minima[rows_of] = torch.cat((own, nearest[-1:], found[-1:]))
+        damping[rows_of] = damped
         return wanted, trust, minima, damping, age + 1
+
+
+def _with_means(cost: _Cost, weights: Tensor, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Costs of the heaviest component, of each one, and with all ``weights`` (S, R), (A, R)."""
+    alone = 1 + len(weights)
+    means = joints[alone:].repeat_interleave(len(weights), 0)
+
+    def mixed(values: Tensor) -> Tensor:
+        every = values[alone:].unflatten(0, (-1, len(weights)))
+        shares = weights.reshape(weights.shape + (1,) * (every.ndim - 3))
+        return torch.cat((values[:alone], (shares * every).sum(1)))
+
+    height, vector, precision = map(mixed, cost(torch.cat((joints[:alone], means))))
+    return height, vector, precision
 
 
 def _starts(number: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
@@ -251,7 +271,11 @@ def _shares(n_joints: int) -> Tensor:
 
 
 def _descended(
-    cost: _Cost, joints: Tensor, damping: Tensor, lower: Tensor, upper: Tensor
+    cost: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]],
+    joints: Tensor,
+    damping: Tensor,
+    lower: Tensor,
+    upper: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """A few steps downhill within bounds from joints (A, ..., n) with damping (A, ...).
 

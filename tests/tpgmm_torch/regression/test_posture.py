@@ -31,11 +31,12 @@ def searched(frame, start, ticks, time=TIME, asked=True, **options):
     return found, search
 
 
-def costs(frame, joints, time=TIME):
-    """Of the heaviest component, for joints (N, n)."""
+def costs(frame, joints, time=TIME, component=None):
+    """Of a component, the heaviest if none is named, for joints (N, n)."""
     regression = small_bottle().regression()
-    estimate = regression.tick(time, joints[0], {"bottle": frame})
-    index = estimate.activation.argmax().expand(1, len(joints))
+    if component is None:
+        component = regression.tick(time, joints[0], {"bottle": frame}).activation.argmax()
+    index = torch.as_tensor(component).expand(1, len(joints))
     frames = {"bottle": frame.expand(joints.shape[:1])}
     return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
 
@@ -107,6 +108,32 @@ def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place, cree
         many, damping, height, _ = _descended(cost, many, damping, lower, upper)
     here = float(costs(frame, found[-1][None])(found[-1][None, None])[0])
     assert here <= 1.05**2 * float(height.min())
+
+
+def test_between_two_components_what_cannot_be_reached_is_approached_too():
+    frame = Frame(torch.tensor([0.3, 0.1, 0.5], dtype=torch.float64))
+    times = torch.linspace(3, 5, 201, dtype=torch.float64)
+    regression = small_bottle().regression()
+    shares = torch.stack(
+        [regression.tick(t, neutral(), {"bottle": frame}).activation for t in times]
+    )
+    time = times[shares.amax(-1).argmin()]
+    weights = shares[shares.amax(-1).argmin()]
+    assert float(weights.max()) < 0.7
+    [*_, here], _ = searched(frame, neutral(), 350, time)
+    lower, upper = limits()
+
+    def mean(joints):
+        of_each = [costs(frame, joints[0], time, i)(joints) for i in weights.nonzero()[:, 0]]
+        return [
+            sum(w * c[k] for w, c in zip(weights[weights > 0], of_each, strict=True))
+            for k in range(3)
+        ]
+
+    joints, damping = here[None, None], torch.zeros(1, 1, dtype=torch.float64)
+    for _ in range(40):
+        joints, damping, height, _ = _descended(mean, joints, damping, lower, upper)
+    assert float(mean(here[None, None])[0]) <= 1.02**2 * float(height)
 
 
 def test_a_robot_does_not_depend_on_its_batch():
