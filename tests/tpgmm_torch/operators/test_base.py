@@ -465,3 +465,10 @@ def test_nothing_counts_twice():
     with pytest.raises(DataError, match="twice"):
         check_operators([Stack(one, AbsolutePosition(RIGHT)), one, other])
     assert check_operators([one, other]) == (one, other)
+
+    @dataclass(frozen=True)
+    class Weighted(AbsolutePosition):
+        weights: np.ndarray | None = None
+
+    own = [Weighted(LEFT, weights=np.full(3, weight)) for weight in (1.0, 2.0)]
+    assert all(x is y for x, y in zip(check_operators(own), own, strict=True))
