@@ -15,6 +15,7 @@ from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     Perceptron,
     TaskParameterized,
+    of_one_kind,
     paced,
     switches,
 )
@@ -132,6 +133,19 @@ def test_events_are_the_switches_that_all_demonstrations_have():
     assert float(first.time[-1]) == pytest.approx(59 / 80 / 0.5)
     once.references[30:, -1] = 1.0  # never closed: nothing is common
     assert not any(one.events for one in paced([once, twice], 0.5))
+
+
+def test_second_tries_are_not_learned_from():
+    episodes = [reaching(seed) for seed in range(6)]
+    episodes[1].references[50:, -1] = 1.0  # opened again
+    episodes[4] = reaching(4, 90)
+    kept = [episodes[i] for i in (0, 2, 3, 5)]
+    assert of_one_kind(episodes, longest=1.4, fewest=3) == kept
+    assert of_one_kind(episodes, longest=1.6, fewest=3) == [*kept[:3], episodes[4], kept[3]]
+    assert of_one_kind(episodes, longest=1.4, fewest=5) == episodes
+    # as many of one as of the other kind: those with fewer switches
+    assert of_one_kind(episodes[:2], longest=1.4, fewest=1) == episodes[:1]
+    assert of_one_kind(episodes[1::-1], longest=1.4, fewest=1) == episodes[:1]
 
 
 def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
