@@ -123,7 +123,7 @@ class TaskParameterized:
         target as fast as Meta-World lets them: at their own pace, what differs from them falls
         behind, and cuts the corners and the depth of a push.
     longest, at_least : float, int
-        What :func:`of_one_kind` keeps is learned from.
+        What ``of_one_kind`` keeps is learned from.
     steps_per_component : int
         How much of the skill one Gaussian is for, of at least ``fewest``.
     fewest : int
