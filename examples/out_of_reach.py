@@ -21,6 +21,7 @@ import argparse
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -31,11 +32,9 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.clocks import EvenProgress
-from tpgmm_torch.regression.posture import NEGLIGIBLE, _Cost, _descended
+from tpgmm_torch.regression.posture import NEGLIGIBLE, _Cost, _descended, _with_means
 from tpgmm_torch.regression.regression import Regression
 
-#: Cost, downhill gradient and precision of postures.
-Costs = tuple[Tensor, Tensor, Tensor]
 #: When the hands are at the bottle, shortly before it is moved [s].
 GRASP = 4.4
 DT = 0.01
@@ -114,26 +113,13 @@ def distances(
     time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
     activation = regression.tick(time, joints, frames).activation
     index = (activation > NEGLIGIBLE).nonzero()[:, 0]
-    weights = activation[index] / activation[index].sum()
+    weights = (activation[index] / activation[index].sum()).unsqueeze(-1)
 
-    def cost(count: int) -> Callable[[Tensor], Costs]:
-        costs = [
-            _Cost(
-                regression, i.expand(count, len(joints)), time, joints, frames,
-                regression.kinematics.state,
-            )
-            for i in index
-        ]  # fmt: skip
-
-        def mean(postures: Tensor) -> Costs:
-            of_each = [one(postures) for one in costs]
-            height, vector, precision = (
-                sum(w * one[part] for w, one in zip(weights, of_each, strict=True))
-                for part in range(3)
-            )
-            return height, vector, precision
-
-        return mean
+    def cost(count: int) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:
+        every = index.repeat(count).unsqueeze(-1).expand(-1, len(joints))
+        state = regression.kinematics.state
+        of_each = _Cost(regression, every, time, joints, frames, state)
+        return partial(_with_means, of_each, weights, 0)
 
     generator = torch.Generator().manual_seed(1)
     share = torch.rand(starts, *joints.shape, generator=generator, dtype=torch.float64)

@@ -19,7 +19,6 @@ a position in tangent space, whose Jacobian is exact, not only where little is l
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
@@ -30,6 +29,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.constraints import Interval
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.base import Linearization, Operator, Reference, check_pair
@@ -55,8 +55,7 @@ class _Orientation(Operator):
     def __post_init__(self) -> None:
         if self.geometry not in GEOMETRIES:
             raise DataError(f"geometry is one of {list(GEOMETRIES)}, got {self.geometry!r}")
-        number = isinstance(self.gain, Real) and not isinstance(self.gain, bool)
-        if not (number and 0 < self.gain < math.inf):
+        if self.gain not in Interval(Real, 0, None, closed="neither"):
             raise DataError(f"gain is a positive number, got {self.gain!r}")
         if self.geometry == "tangent" and self.gain != 2.0:
             raise DataError(

@@ -8,7 +8,7 @@ import numpy as np
 
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plausibility.findings import Finding, listed
@@ -141,16 +141,17 @@ def check_carried_things(
     ------
     Finding
     """
-    moved = {*kinematics.links, *(hold.frame for hold in holds)}
+    links = {*kinematics.links}
+    moved = links.union(hold.frame for hold in holds)
     silent = [
         operator
         for operator in leaves(operators)
         if operator.links()
         and moved.isdisjoint(operator.links())
-        and not set(operator.references()) & set(kinematics.links)
+        and links.isdisjoint(operator.references())
     ]
     if silent:
-        names = tuple(dict.fromkeys(name for operator in silent for name in operator.links()))
+        names = carried_objects(silent, kinematics)
         texts = [format_operator(operator) for operator in silent]
         yield Finding(
             "holds",

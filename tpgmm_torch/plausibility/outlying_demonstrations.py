@@ -15,7 +15,8 @@ from torch import Tensor
 
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.operators import Canonical, Operator, Stack
+from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.plausibility.findings import Finding, listed
 from tpgmm_torch.plausibility.outliers import CONSISTENT
@@ -161,7 +162,7 @@ def comparable_coordinates(
     column = 0
     for operator in operators:
         column += 1  # time
-        for leaf in operator.leaves if isinstance(operator, Stack) else (operator,):
+        for leaf in leaves([operator]):
             width = leaf.dimension(kinematics)
             local = data[..., column : column + width]
             column += width

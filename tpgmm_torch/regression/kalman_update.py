@@ -30,6 +30,7 @@ from tpgmm_torch.operators import (
     RelativePosition,
     Stack,
 )
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -95,8 +96,7 @@ class KalmanUpdate:
         if kinematics.quaternion_starts or not any(map(_whole, operators)):
             return False
         tasks = [operator for operator in operators if not _whole(operator)]
-        leaves = Stack(*tasks).leaves if tasks else ()
-        return all(type(leaf) in TASKS for leaf in leaves)
+        return all(type(leaf) in TASKS for leaf in leaves(tasks))
 
     def __call__(
         self,

@@ -38,9 +38,9 @@ from tpgmm_torch.operators import (
     Operator,
     RelativeOrientation,
     RelativePosition,
-    Stack,
 )
 from tpgmm_torch.operators.base import Reference
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.joint_limits import step_within
 from tpgmm_torch.regression.kalman_update import TASKS
 from tpgmm_torch.regression.regression import Estimate, Regression
@@ -202,7 +202,7 @@ class PostureSearch:
         )
         begun = torch.clamp(reference[where], lower, upper)
         found, damped, height, stepped = _descended(
-            partial(_with_means, cost, weights),
+            partial(_with_means, cost, weights, 1 + len(weights)),
             torch.cat((begun.unsqueeze(0), found)),
             torch.cat((torch.zeros_like(damped[:1]), damped)),
             lower,
@@ -238,9 +238,13 @@ class PostureSearch:
         return wanted, trust, minima, damping, age + 1
 
 
-def _with_means(cost: _Cost, weights: Tensor, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Costs of the heaviest component, of each one, and with all ``weights`` (S, R), (A, R)."""
-    alone = 1 + len(weights)
+def _with_means(
+    cost: _Cost, weights: Tensor, alone: int, joints: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Costs for joints (A, R, n): of one component each for ``alone`` rows, then means.
+
+    For each mean, ``cost`` has a row for each of the components with ``weights`` (S, R).
+    """
     means = joints[alone:].repeat_interleave(len(weights), 0)
 
     def mixed(values: Tensor) -> Tensor:
@@ -409,8 +413,8 @@ class Residual:
         like = kinematics.lower
         starts = operator.quaternion_starts(kinematics)
         blocks = quaternions.quaternion_blocks(starts, operator.dimension(kinematics)).to(like)
-        parts = operator.leaves if isinstance(operator, Stack) else (operator,)
-        rows, gains, leaves, row = [], [], [], 0
+        parts = leaves([operator])
+        rows, gains, relative, row = [], [], [], 0
         for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
             if leaf.rotation_vector_starts(kinematics):  # whose derivative is exact
                 row += 3
@@ -419,11 +423,11 @@ class Residual:
                 rows.append([row, row + 1, row + 2])
                 gains.append(leaf.gain / 2)
             if isinstance(leaf, RelativePosition | RelativeOrientation):
-                leaves.append((leaf, row))
+                relative.append((leaf, row))
             row += 3
         turns = torch.tensor(rows, device=like.device) if rows else None
         return cls(
-            operator, blocks if starts else None, turns, like.new_tensor(gains), tuple(leaves)
+            operator, blocks if starts else None, turns, like.new_tensor(gains), tuple(relative)
         )
 
     def __call__(

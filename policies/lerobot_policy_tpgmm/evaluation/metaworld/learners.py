@@ -60,11 +60,11 @@ def switches(references: Rows) -> list[int]:
     return [int(i) + 1 for i in np.flatnonzero(jumps)]
 
 
-def apart(steps: Sequence[int], n_steps: int) -> list[int]:
-    """Those of ``steps`` that are ``APART`` from the one before, the beginning and the end."""
+def apart(references: Rows) -> list[int]:
+    """The switches that are ``APART`` from the one before, the beginning and the end."""
     kept = [0]
-    for step in steps:
-        if step - kept[-1] >= APART and step + APART <= n_steps:
+    for step in switches(references):
+        if step - kept[-1] >= APART and step + APART <= len(references):
             kept.append(step)
     return kept[1:]
 
@@ -76,7 +76,7 @@ def of_one_kind(episodes: Sequence[Recorded], longest: float, fewest: int) -> li
     kind; what takes more than ``longest`` times their median is not. All, where fewer than
     ``fewest`` would be left.
     """
-    counts = [len(apart(switches(one.references), len(one.references))) for one in episodes]
+    counts = [len(apart(one.references)) for one in episodes]
     often = Counter(counts)
     usual = min(often, key=lambda count: (-often[count], count))
     alike = [one for one, count in zip(episodes, counts, strict=True) if count == usual]
@@ -91,7 +91,7 @@ def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     Switches count from the first: some experts take a second grip, and others do not need it.
     """
     demonstrations = [episode.demonstration() for episode in episodes]
-    found = [apart(switches(one.references), len(one.references)) for one in episodes]
+    found = [apart(one.references) for one in episodes]
     return [
         replace(
             one,
