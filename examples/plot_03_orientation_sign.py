@@ -6,7 +6,7 @@ A unit quaternion :math:`\epsilon` and its negative :math:`-\epsilon` are *the s
 Sensors and libraries return either, and may change their mind from one sample to the next. Who
 treats the four numbers as a plain vector averages :math:`\epsilon` with :math:`-\epsilon`, and
 gets nothing, or any rotation at all. Operators of orientation take care of this. Where
-demonstrations lie far apart, four coordinates are not enough of it: the second picture.
+demonstrations lie far apart that is not enough: :doc:`plot_16_orientations_far_apart`.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -107,52 +107,4 @@ for (name, error), color in zip(errors.items(), ("0.5", VERMILION), strict=True)
     right.plot(time, error, color=color, label=f"taken for {name}")
 right.set(title="error of the reproduction", xlabel="time [s]", ylabel="degrees")
 right.legend(fontsize="small", loc="center left")
-plt.show()
-
-# %%
-# Demonstrations that lie far apart
-# ---------------------------------
-# Eight recordings of the same turn, up to 179 degrees from each other. Between points of a
-# sphere that are far apart, averages of four numbers lie deep inside of it, and where no choice
-# of signs brings all recordings to one side, they are no averages at all. With
-# ``geometry="tangent"`` the local coordinates are three, the rotation vector from the mean
-# orientation at each instant. What a model of one operator should reproduce is that mean: the
-# rotation to which the squared angles of the recordings add up to the least.
-
-tilts = torch.from_numpy(0.8 * generator.standard_normal((8, 3)))
-tilts *= (2.6 / tilts.norm(dim=1, keepdim=True)).clamp(max=1)  # less than half a turn
-far = [tracked(turning(tilt), number) for number, tilt in enumerate(tilts)]
-poses = [Demonstration(time, torch.cat((still, recording), dim=1)) for recording in far]
-mean = quaternions.mean(torch.stack(far, dim=1))
-start = torch.cat((still[0], mean[0]))
-
-
-def between(a, b):
-    """Angles between orientations [deg]."""
-    turn = quaternions.product(quaternions.normalize(a), quaternions.conjugate(b))
-    return torch.rad2deg(quaternions.log(turn).norm(dim=-1))
-
-
-off = {}
-for geometry in ("quaternion", "tangent"):
-    model = TaskParameterizedGMM(
-        8,
-        [AbsoluteOrientation("hand", geometry=geometry)],
-        hand,
-        blend=0,
-        robust=False,  # they are meant to be far apart
-        random_state=0,
-    )
-    [found] = model.fit(poses).predict([Situation(start, time=time)])
-    off[geometry] = between(found.joints[:, 3:], mean)
-    print(f"{geometry}: off the mean by {off[geometry].mean():.2f} degrees")
-
-figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-for recording in far:
-    left.plot(time, between(recording, mean), color="0.5", linewidth=0.8)
-left.set(title="recordings, from their mean", xlabel="time [s]", ylabel="degrees")
-for (geometry, error), color in zip(off.items(), ("0.5", VERMILION), strict=True):
-    right.plot(time, error, color=color, label=f'geometry="{geometry}"')
-right.set(title="reproductions, from that mean", xlabel="time [s]", ylabel="degrees")
-right.legend(fontsize="small")
 plt.show()

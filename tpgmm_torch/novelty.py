@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -27,6 +27,8 @@ FEWEST = 3
 LEAST = 0.5
 #: So many demonstrations, evenly chosen, say how far one is from the others.
 MOST = 200
+#: Of the norm that joins distances: nearly the largest, and more where several are large.
+POWER = 4
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,13 @@ class Region:
 class Novelty:
     """Tells how new a situation is: its distance from those shown, calibrated on these.
 
-    The distance is the largest of those of the start posture, of each frame's position and of
-    each frame's orientation, there where the skill begins. Leaving out one demonstration after
-    another tells how far each is from the others; novelty is the distance in units of the
-    largest of these. Of N + 1 situations of one kind the new one is the furthest with the
-    chance 1 / (N + 1): so often novelty is above 1 for what is like the demonstrations.
+    The distance is the 4-norm of those of the start posture, of each frame's position and of
+    each frame's orientation, there where the skill begins: nearly the largest, and more where
+    several are unusual. Leaving out one demonstration after another tells how far each is from
+    the others; novelty is the distance in units of the largest of these. Of N + 1 situations of
+    one kind the new one is the furthest with the chance 1 / (N + 1): about so often, or less,
+    novelty is above 1 for what is like the demonstrations. Less, as those left out are compared
+    with one demonstration fewer than a new situation is.
 
     Parameters
     ----------
@@ -202,7 +206,7 @@ class Novelty:
         array of shape (...)
             From 0 on.
         """
-        found: list[Array] = [np.zeros(())]
+        found: list[Array] = []
         if joints is not None and len(self.compared):
             starts = as_array(torch.as_tensor(joints))
             found.append(self.start.distance(starts[..., self.compared]))
@@ -215,20 +219,27 @@ class Novelty:
                 self.places[name].distance(as_array(frame.position)),
                 self.turns[name].distance(turn),
             ]
-        largest = found[0]
-        for one in found[1:]:
-            largest = np.fmax(largest, one)
-        ratio: Array = largest / self.limit
-        return ratio
+        return _joined(found) / self.limit
 
 
 def _distance_from_others(data: Mapping[tuple[str, str], Array], left_out: int) -> float:
     """How far one of the demonstrations is from the region of the others."""
-    return max(
-        float(Region.of(np.delete(vectors, left_out, axis=0), kind).distance(vectors[left_out]))
-        for (kind, _), vectors in data.items()
-        if vectors.shape[1]
+    return float(
+        _joined(
+            Region.of(np.delete(vectors, left_out, axis=0), kind).distance(vectors[left_out])
+            for (kind, _), vectors in data.items()
+            if vectors.shape[1]
+        )
     )
+
+
+def _joined(distances: Iterable[Array]) -> Array:
+    """The 4-norm of distances that broadcast; NaN does not count."""
+    total = np.zeros(())
+    for distance in distances:
+        total = total + np.where(np.isnan(distance), 0.0, distance) ** POWER
+    joined: Array = total ** (1 / POWER)
+    return joined
 
 
 def _rotation_vectors(orientations: Array, mean: Array) -> Array:

@@ -45,24 +45,24 @@ def shown(n: int, seed: int) -> Novelty:
 @pytest.mark.parametrize("n", [5, 10, 20])
 def test_what_is_like_the_demonstrations_is_beyond_1_once_in_n_plus_1(n):
     beyond = []
-    for seed in range(10):
-        starts, frame = bottles(300, seed + 100)
+    for seed in range(60):
+        starts, frame = bottles(50, seed + 100)
         beyond.append((shown(n, seed).ratio(starts, {"cup": frame}) > 1).mean())
     assert np.mean(beyond) == pytest.approx(1 / (n + 1), abs=0.05)
 
 
-@pytest.mark.parametrize("n", [5, 10])
-def test_inside_and_outside_the_shown_box_are_told_apart(n):
+@pytest.mark.parametrize(("n", "width"), [(5, 3.0), (10, 3.0), (10, 2.0)])
+def test_inside_and_outside_the_shown_box_are_told_apart(n, width):
     areas = []
     for seed in range(5):
         novelty = shown(n, seed)
         starts, inside = bottles(400, seed + 100)
-        _, wide = bottles(400, seed + 200, width=3.0)
+        _, wide = bottles(400, seed + 200, width=width)
         outside = [i for i in range(400) if not SKILL.usual(wide[i])]
         low = novelty.ratio(starts, {"cup": inside})
         high = novelty.ratio(starts, {"cup": wide})[outside]
         areas.append((low[:, None] < high).mean())  # area under the ROC
-    assert np.mean(areas) > 0.95  # 0.985 and 0.991 measured
+    assert np.mean(areas) > 0.95  # 0.988, 0.993 and 0.966 measured
 
 
 def test_it_is_the_same_however_the_base_is_turned():
@@ -100,6 +100,17 @@ def test_demonstrations_that_are_all_alike_do_not_make_everything_new():
     assert novelty.limit == LEAST
     assert float(novelty.ratio([0.0, 0.0], {"cup": Frame([0.005, 0, 0])})) < 1
     assert float(novelty.ratio([0.0, 0.0], {"cup": Frame([0.1, 0, 0])})) > 3
+
+
+def test_two_things_that_are_a_little_unusual_are_newer_than_one():
+    novelty = learned(np.zeros((FEWEST - 1, 3)), np.zeros((FEWEST - 1, 2)))
+    place = Frame([0.1, 0, 0], quaternions.exp(torch.zeros(3, dtype=torch.float64)))
+    both = Frame(place.position, quaternions.exp(torch.tensor([0, 0, 0.7]).double()))
+    one, two = (float(novelty.ratio(None, {"cup": frame})) for frame in (place, both))
+    turned = float(novelty.ratio(None, {"cup": Frame([0.0, 0, 0], both.orientation)}))
+    assert 0.5 < one < 1 and 0.5 < turned < 1
+    assert max(one, turned) < two < one + turned
+    assert two**4 == pytest.approx(one**4 + turned**4)
 
 
 def test_what_is_not_known_does_not_count():
