@@ -6,7 +6,7 @@ A unit quaternion :math:`\epsilon` and its negative :math:`-\epsilon` are *the s
 Sensors and libraries return either, and may change their mind from one sample to the next. Who
 treats the four numbers as a plain vector averages :math:`\epsilon` with :math:`-\epsilon`, and
 gets nothing, or any rotation at all. Operators of orientation take care of this. Where
-demonstrations lie far apart that is not enough: :doc:`plot_16_orientations_far_apart`.
+demonstrations lie far apart that is not enough; another example is about these.
 """
 
 # sphinx_gallery_thumbnail_number = 1

@@ -25,8 +25,8 @@ from tpgmm_torch.plotting import BLUE, ORANGE, STYLE, VERMILION
 # %%
 # A skill that was shown eight times
 # ----------------------------------
-# A planar arm slides its tip into an object, as in :doc:`plot_01_planar_arm`. Objects stood in
-# a box of 20 by 30 cm, turned by up to 14 degrees either way.
+# A planar arm slides its tip into an object, as in the first example. Objects stood in a box of
+# 20 by 30 cm, turned by up to 14 degrees either way.
 
 LINKS, LENGTHS = ("base", "upper_arm", "forearm", "hand", "tip"), (0.0, 0.4, 0.3, 0.2)
 urdf = '<robot name="planar arm">' + "".join(f'<link name="{link}"/>' for link in LINKS)
