@@ -102,9 +102,9 @@ gallery_thumbnails = {
     "plot_09_covariance_along_the_path": (0, 0, 0.41, 1),
     "plot_10_own_operator": (0, 0, 0.35, 0.9),
     "plot_14_corrections": (0, 0, 0.525, 1),
-    "plot_16_orientations_far_apart": (0, 0, 0.48, 1),
-    "plot_17_new_to_me": (0, 0, 0.53, 1),
-    "plot_18_which_goes_first": (0, 0, 0.42, 1),
+    "plot_16_orientations_far_apart": (0.05, 0, 0.43, 0.86),
+    "plot_17_new_to_me": (0, 0, 0.51, 1),
+    "plot_18_which_goes_first": (0, 0.02, 0.412, 0.92),
 }
 
 # Site
