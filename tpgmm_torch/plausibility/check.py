@@ -186,7 +186,7 @@ def _findings(episodes: Sequence[EpisodeSummary], robot: Kinematics | None) -> l
         *check_clock(episodes),
         *check_joints(episodes, robot),
         *check_poses(episodes, robot),
-        *check_likeness(episodes),
+        *check_likeness(episodes, robot),
     ]
 
 

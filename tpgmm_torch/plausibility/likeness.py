@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import torch
 
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
@@ -24,12 +28,16 @@ LIKE = 0.5
 SMALLEST_RANGE = 0.2
 
 
-def check_likeness(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
+def check_likeness(
+    episodes: Sequence[EpisodeSummary], robot: Kinematics | None
+) -> Iterator[Finding]:
     """Copies, and episodes whose path is not like the others.
 
     Parameters
     ----------
     episodes : sequence of EpisodeSummary
+    robot : Kinematics, optional
+        Tells which of its joints are quaternions.
 
     Yields
     ------
@@ -51,7 +59,7 @@ def check_likeness(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
         )
     if len(episodes) < 5:
         return
-    paths = np.stack([e.path for e in episodes])
+    paths = _paths(episodes, robot)
     middle = np.median(paths, axis=0)
     scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
     distances = np.sqrt((((paths - middle) / scale) ** 2).mean(axis=(1, 2)))
@@ -73,6 +81,18 @@ def check_likeness(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
             tuple(odd),
             float(distances[odd[0]]),
         )
+
+
+def _paths(episodes: Sequence[EpisodeSummary], robot: Kinematics | None) -> Array:
+    """Paths (E, P, n_joints); of quaternions each on the side on which the first one is."""
+    paths = np.stack([episode.path for episode in episodes])
+    starts = robot.quaternion_starts if robot is not None else ()
+    groups = [list(range(start, start + 4)) for start in starts]
+    groups += [list(group) for group in quaternion_groups(episodes[0].joint_names)]
+    for columns in groups:
+        turns = quaternions.continuous(torch.from_numpy(paths[..., columns]))
+        paths[..., columns] = quaternions.match_hemisphere(turns, turns[:1]).numpy()
+    return paths
 
 
 def check_freedom(

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from tests.support.skills import HANDLING, HANDS, handlings, waves
 from tpgmm_torch import (
@@ -18,6 +19,7 @@ from tpgmm_torch import (
     RelativePosition,
     Stack,
     TaskParameterizedGMM,
+    quaternions,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.plausibility.check import summarize
@@ -32,8 +34,8 @@ HAND = Poses(["hand"], orientation=False)
 PUT = RelativePosition("cup", "tray")
 
 
-def found(items):
-    return [(f.check, f.episodes) for f in check_likeness(summarize(items, None))]
+def found(items, robot=None):
+    return [(f.check, f.episodes) for f in check_likeness(summarize(items, robot), robot)]
 
 
 def test_demonstrations_of_one_skill_are_alike():
@@ -52,6 +54,23 @@ def test_a_motion_played_backwards_is_unlike_the_others():
     shown[3] = replace(shown[3], joints=shown[3].joints.flip(0))
     [(check, episodes)] = found(shown)
     assert (check, episodes) == ("episodes", (3,))
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_the_sign_of_a_quaternion_makes_no_stranger(named):
+    tool, time = Poses(["tool"]), torch.linspace(0, 2, 40, dtype=torch.float64)
+    turn = quaternions.exp(time[:, None] * torch.tensor([0.6, 0.0, 0.8]).double())
+    shown = []
+    for n in range(8):
+        tilt = quaternions.exp(torch.tensor([0.02 * n, 0.0, 0.0]).double())
+        # as trackers do: w >= 0, and two of them w <= 0
+        q = quaternions.product(tilt, turn)
+        q = torch.where(q[:, :1] < 0, -q, q) * (-1 if n in (2, 5) else 1)
+        joints = torch.cat((torch.zeros(40, 3), q), dim=1)
+        shown.append(
+            Demonstration(time, joints, joint_names=tool.joint_names if named else None)
+        )
+    assert found(shown, None if named else tool) == []
 
 
 def test_joints_that_hardly_move_say_little():
