@@ -84,14 +84,16 @@ def check_likeness(
 
 
 def _paths(episodes: Sequence[EpisodeSummary], robot: Kinematics | None) -> Array:
-    """Paths (E, P, n_joints); of quaternions each on the side on which the first one is."""
+    """Paths (E, P, n_joints); of quaternions each on the side of their mean."""
     paths = np.stack([episode.path for episode in episodes])
     starts = robot.quaternion_starts if robot is not None else ()
     groups = [list(range(start, start + 4)) for start in starts]
     groups += [list(group) for group in quaternion_groups(episodes[0].joint_names)]
     for columns in groups:
         turns = quaternions.continuous(torch.from_numpy(paths[..., columns]))
-        paths[..., columns] = quaternions.match_hemisphere(turns, turns[:1]).numpy()
+        mean = quaternions.continuous(quaternions.mean(turns.movedim(0, 1)))
+        along = (turns * mean).sum((1, 2))[:, None, None]
+        paths[..., columns] = (turns * quaternions.hemisphere_sign(along)).numpy()
     return paths
 
 
