@@ -1,8 +1,8 @@
 """gym-aloha's two ViperX arms at the table of the suite, with palms in place of fingers.
 
-They are taken from gym-aloha's own MuJoCo model when they are asked for, so that nothing of that
-package is copied: bodies, joints, ranges, masses, shapes. Its table, fingers, servos and dry
-friction are left out: joints are under the same position control as those of the other robot.
+Bodies, joints, ranges, masses and shapes are taken from gym-aloha's own MuJoCo model when they
+are asked for, so that nothing of that package is copied. Its table, fingers, servos and dry
+friction are left out: joints are under the same position control as the upper body's.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
 __all__ = ["pair_posture", "pair_robot", "pair_spec"]
 
-#: Where the left arm stands [m]; the right one is its mirror image. This place, and how the hands
-#: are mounted, were searched for: the one of those tried from which six joints do what the experts
-#: of all tasks ask for, as far as can be from where they end, stretch out, or lose a direction.
+#: Where the left arm stands [m]; the right one is its mirror image. This, and how hands are
+#: mounted, comes from a search: how far six joints stay, in all that the experts ask for, from
+#: their ends and speeds, from stretched elbows and straight wrists.
 BASE = (0.03, 0.4, -0.19)
-#: How the left hand is mounted: so far ahead of ``gripper_link`` [m], which is turned by so much
-#: to the left, and down, where the hand is level and straight [rad].
+#: How the left hand is mounted: so far ahead of ``gripper_link`` [m], and that is turned to the
+#: left and down by so much where the hand is level and straight [rad].
 AHEAD, OUTWARDS, DOWN = 0.08, math.radians(6.0), math.radians(27.0)
 #: Half the sides of a palm [m], as those of the upper body, and the mass of a hand [kg].
 PALM, MASS = (0.025, 0.01, 0.04), 0.1
@@ -47,12 +47,12 @@ def pair_posture() -> Tensor:
 
 
 def pair_robot() -> Robot:
-    """The kinematics of both arms: six joints of the left one, named as by gym-aloha, then the right one's.
+    """The kinematics of both arms: the six joints of the left one, then the right one's.
 
     Returns
     -------
     Robot
-        With the links ``l_hand`` and ``r_hand``.
+        Joints are named as gym-aloha's actions are, links ``l_hand`` and ``r_hand``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def pair_robot() -> Robot:
         Without gym-aloha.
     """
     spec = _arms()
-    # a robot is saved with what it is used for: without the paths of this machine's meshes
+    # models are saved with their robot: no paths of this machine's meshes
     for shape in (*spec.geoms, *spec.meshes):
         spec.delete(shape)
     spec.compile()
@@ -73,7 +73,12 @@ def pair_robot() -> Robot:
 
 
 def pair_spec() -> mujoco.MjSpec:
-    """Both arms alone, as :func:`~lerobot_policy_tpgmm.environments.robot_scene.controlled`.
+    """Both arms alone, simulated under position control.
+
+    Returns
+    -------
+    mujoco.MjSpec
+        As :func:`~lerobot_policy_tpgmm.environments.robot_scene.controlled` gives it.
 
     Raises
     ------

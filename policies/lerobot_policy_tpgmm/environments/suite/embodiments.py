@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import mujoco
 from torch import Tensor
 
-from lerobot_policy_tpgmm.environments.bottle.conditions import skill
-from lerobot_policy_tpgmm.environments.robot_scene import robot_spec
-from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from lerobot_policy_tpgmm.environments.aloha.pair import (
     pair_posture,
     pair_robot,
     pair_spec,
 )
+from lerobot_policy_tpgmm.environments.bottle.conditions import skill
+from lerobot_policy_tpgmm.environments.robot_scene import robot_spec
+from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import UnknownNameError
 
