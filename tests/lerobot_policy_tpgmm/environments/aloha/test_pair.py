@@ -1,5 +1,6 @@
 """gym-aloha's arms at the suite's table: kinematics are those of the physics, and reach all."""
 
+import json
 import sys
 
 import mujoco
@@ -15,7 +16,9 @@ from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
 from lerobot_policy_tpgmm.environments.suite.names import SUITE
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
+from lerobot_policy_tpgmm.evaluation.benchmarks import benchmark
 from tests.support.suite_expert import replay
+from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import quaternions
 from tpgmm_torch.exceptions import DependencyError
@@ -140,6 +143,16 @@ def test_pushes_are_meant_for_strong_joints_of_both_arms():
     strong = {f"{side}_arm_{joint}" for side in SIDES for joint in ARM_JOINTS[:3]}
     assert pushed == strong
     assert all(any(part in name for part in PUSHED) for name in strong)
+
+
+def test_a_comparison_records_them_as_another_robot(tmp_path):
+    task = benchmark("lid-viperx", rate=FPS)
+    assert task.options == {"task": "lid", "robot": "viperx"} and task.robot is ROBOT
+    assert task.record(tmp_path, 1, 1, seed=0) == [True]
+    info = json.loads((tmp_path / "training" / "meta" / "info.json").read_text())
+    assert info["robot_type"] == "viperx" and info["features"]["action"]["shape"] == [12]
+    [shown] = load_lerobot(tmp_path / "training", robot=ROBOT)
+    assert shown.joint_names == ROBOT.joint_names
 
 
 def test_nothing_of_this_machine_is_in_the_description():
