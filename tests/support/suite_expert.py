@@ -1,9 +1,16 @@
 """The experts of the suite in their environments."""
 
+import sys
+
 import numpy as np
 import torch
 
 from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
+from lerobot_policy_tpgmm.environments.suite.names import ROBOTS
+
+#: Robots that can be tried: by the version, not by what is installed, as gym-aloha cannot be
+#: installed on Python 3.13; on Python 3.12 a missing package fails.
+TRIED = [name for name in ROBOTS if name != "viperx" or sys.version_info < (3, 13)]
 
 
 def start_of(motion):
@@ -22,7 +29,7 @@ def replay(env: SuiteEnv, motion, references=None, seed=0, seconds=None, **start
     ----------
     motion : Demonstration
         At the environment's rate.
-    references : ndarray of shape (T, 17), optional
+    references : ndarray of shape (T, n_joints), optional
         To send others.
     seconds : float, optional
         To stop before the end of the episode.

@@ -414,7 +414,7 @@ def follow_hands(
     Parameters
     ----------
     robot : Robot
-        The upper body, whose waist shall move less than its arms.
+        With both hands as links; a waist that arms share shall move less than these.
     starts : Tensor of shape (n, n_joints)
         Where the joints begin [rad].
     wanted : callable
@@ -429,7 +429,7 @@ def follow_hands(
     Tensor of shape (T, n, n_joints)
     """
     weights = torch.ones(robot.n_joints, dtype=torch.float64)
-    waist = [robot.joint_names.index(f"waist_{axis}") for axis in ("roll", "pitch", "yaw")]
+    waist = [i for i, name in enumerate(robot.joint_names) if name.startswith("waist_")]
     weights[waist] = 0.3
     dt = float(times[1] - times[0])
     limit = robot.velocity * dt

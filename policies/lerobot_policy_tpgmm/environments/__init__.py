@@ -15,7 +15,7 @@ from lerobot_policy_tpgmm.control_rate import rate_processors
 from lerobot_policy_tpgmm.environments.aloha.robot import JOINTS, OBJECTS
 from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
 from lerobot_policy_tpgmm.environments.metaworld.tasks import check_task
-from lerobot_policy_tpgmm.environments.suite.names import SUITE
+from lerobot_policy_tpgmm.environments.suite.names import ROBOTS, SUITE, UPPER_BODY
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
@@ -208,8 +208,10 @@ class BimanualConfig(_TaskEnvConfig):
     ----------
     task : str, default="handover"
         One of :data:`~lerobot_policy_tpgmm.environments.suite.names.SUITE`.
+    robot : str, default="upper_body"
+        One of :data:`~lerobot_policy_tpgmm.environments.suite.names.ROBOTS`.
     features, features_map, max_parallel_tasks, disable_env_checker
-        As in every configuration of LeRobot; the features follow from the task.
+        As in every configuration of LeRobot; the features follow from task and robot.
     fps, episode_length, pushes, noise, condition
         Options of :class:`~lerobot_policy_tpgmm.environments.suite.env.SuiteEnv`; its own
         defaults where None.
@@ -220,6 +222,7 @@ class BimanualConfig(_TaskEnvConfig):
     environment: ClassVar[str] = "Bimanual-v0"
 
     task: str | None = "handover"
+    robot: str = UPPER_BODY
     fps: int = 100
     episode_length: int | None = None
     pushes: bool = False
@@ -229,8 +232,10 @@ class BimanualConfig(_TaskEnvConfig):
     def __post_init__(self) -> None:
         if self.task is None or self.task not in SUITE:
             raise UnknownNameError("task", str(self.task), "bimanual", SUITE)
+        if self.robot not in ROBOTS:
+            raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
         if not self.features:
-            self.features = _features(17, len(SUITE[self.task]))
+            self.features = _features(ROBOTS[self.robot], len(SUITE[self.task]))
 
 
 @EnvConfig.register_subclass("aloha_state")

@@ -1,4 +1,4 @@
-"""The simulated upper body under joint position control, in MuJoCo."""
+"""A simulated robot with two hands under joint position control, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -12,7 +12,16 @@ from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CAMERA", "DAMPING", "PALM", "STIFFNESS", "TIMESTEP", "RobotScene", "robot_spec"]
+__all__ = [
+    "CAMERA",
+    "DAMPING",
+    "PALM",
+    "STIFFNESS",
+    "TIMESTEP",
+    "RobotScene",
+    "controlled",
+    "robot_spec",
+]
 
 #: Of the simulation and of the position control of the joints [s].
 TIMESTEP = 1e-3
@@ -29,15 +38,29 @@ PALM = 2
 
 
 def robot_spec() -> mujoco.MjSpec:
-    """The robot alone, with a light and a camera before it.
+    """The upper body alone, with a light and a camera before it.
 
     Returns
     -------
     mujoco.MjSpec
-        The joints in the URDF's order with a position actuator each; geoms ``l_palm`` and
-        ``r_palm``.
+        As :func:`controlled` gives it, the joints in the URDF's order.
     """
-    spec = mujoco.MjSpec.from_string(upper_body_urdf())
+    return controlled(mujoco.MjSpec.from_string(upper_body_urdf()))
+
+
+def controlled(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Give a robot position control, palms, a light and a camera before it.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        A robot alone, with bodies ``l_hand`` and ``r_hand``, whose first geoms are the palms.
+
+    Returns
+    -------
+    mujoco.MjSpec
+        The same, with a position actuator for each joint, and geoms ``l_palm`` and ``r_palm``.
+    """
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for joint in spec.joints:
@@ -78,7 +101,7 @@ class RobotScene:
     Parameters
     ----------
     spec : mujoco.MjSpec
-        That of :func:`robot_spec`, with more in it.
+        That of :func:`controlled`, with more in it.
 
     Attributes
     ----------
@@ -93,7 +116,7 @@ class RobotScene:
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """Joint positions, shape (17,) [rad]."""
+        """Joint positions, shape (n_joints,) [rad]."""
         return self.data.qpos[: self._n].copy()
 
     def follow(
@@ -103,9 +126,9 @@ class RobotScene:
 
         Parameters
         ----------
-        references : ndarray of shape (n + 1, 17)
+        references : ndarray of shape (n + 1, n_joints)
             Where the joints should be now and at the end of the next ``n`` time steps [rad].
-        torques : ndarray of shape (n, 17), optional
+        torques : ndarray of shape (n, n_joints), optional
             From outside, during each time step [N m].
         """
         model, data, n = self.model, self.data, self._n

@@ -18,7 +18,7 @@ DELAY = (1, 8)
 #: A push's beginning, in a skill of 13 s, and length [s], and its torque [N m], which stays
 #: below what the motors can give (50). It is meant for one of the strong joints of the arms.
 PUSH_START, PUSH_LENGTH, PUSH_TORQUE = (0.5, 13.0), (0.1, 0.3), (40.0, 50.0)
-PUSHED = ("shoulder_pitch", "shoulder_yaw", "elbow")
+PUSHED = ("shoulder_pitch", "shoulder_yaw", "arm_waist", "arm_shoulder", "elbow")
 
 
 @dataclass(frozen=True)

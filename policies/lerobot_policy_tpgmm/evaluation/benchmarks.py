@@ -18,7 +18,7 @@ from lerobot_policy_tpgmm.environments.aloha.robot import aloha_operators, aloha
 from lerobot_policy_tpgmm.environments.bottle.measures import LIMITS, PUT_LIMITS
 from lerobot_policy_tpgmm.environments.disturbances import CONDITIONS, NOMINAL
 from lerobot_policy_tpgmm.environments.suite.env import SUITE_CONDITIONS
-from lerobot_policy_tpgmm.environments.suite.names import SUITE
+from lerobot_policy_tpgmm.environments.suite.names import ROBOTS, SUITE, UPPER_BODY
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.carrying import TASK as CARRY
@@ -37,7 +37,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["BENCHMARKS", "Benchmark", "benchmark"]
+__all__ = ["BENCHMARKS", "OTHER_ROBOTS", "Benchmark", "benchmark"]
 
 
 #: How hard the robot moved, as the report shows it.
@@ -136,6 +136,8 @@ class _HandlingBenchmark(Benchmark):
     gym_id: ClassVar[str]
     task: str
     objects: tuple[str, ...]
+    #: What its data sets call the robot.
+    robot_type: str = UPPER_BODY
     #: Options of the environment in recording alone.
     recording: ClassVar[Mapping[str, Any]] = {}
     #: Demonstrations are drawn together; the first may train, the last ones validate.
@@ -171,7 +173,7 @@ class _HandlingBenchmark(Benchmark):
                 fps=self.rate,
                 task=self.task,
                 actions=[_references(motion) for motion in motions],
-                robot_type="upper_body",
+                robot_type=self.robot_type,
             )
             successes[name] = [success for _, success in followed]
         env.close()
@@ -292,8 +294,8 @@ class SuiteBenchmark(_HandlingBenchmark):
 
     Parameters
     ----------
-    name : str
-        Of the task.
+    name, robot : str
+        Of the task, and of who does it.
     rate, options
         As for :class:`Benchmark`.
     """
@@ -304,10 +306,14 @@ class SuiteBenchmark(_HandlingBenchmark):
     conditions: ClassVar = SUITE_CONDITIONS
 
     def __init__(
-        self, name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
+        self,
+        name: str,
+        robot: str,
+        rate: int | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
-        self.skill = suite_task(name)
-        super().__init__(rate, {"task": name, **(options or {})})
+        self.skill, self.robot_type = suite_task(name, robot), robot
+        super().__init__(rate, {"task": name, "robot": robot, **(options or {})})
         self.robot, self.objects = self.skill.robot, self.skill.objects
         self.task, self.criteria = self.skill.description, self.skill.limits
         self.figures = {**self.skill.headings, **PEAKS}
@@ -375,12 +381,23 @@ class AlohaInsertionBenchmark(AlohaBenchmark):
     fixed: ClassVar = {"task": "insertion"}
 
 
+#: The tasks of the suite on other robots than the upper body: their benchmarks' names.
+OTHER_ROBOTS = {
+    robot: {f"{task}-{robot}": task for task in SUITE}
+    for robot in ROBOTS
+    if robot != UPPER_BODY
+}
 BENCHMARKS: dict[str, Callable[[int | None, Mapping[str, Any] | None], Benchmark]] = {
     "bottle_shaking": BottleBenchmark,
     "carry_and_put": CarryBenchmark,
-    **{name: partial(SuiteBenchmark, name) for name in SUITE},
+    **{name: partial(SuiteBenchmark, name, UPPER_BODY) for name in SUITE},
     "aloha_state": AlohaBenchmark,
     "aloha_insertion": AlohaInsertionBenchmark,
+    **{
+        name: partial(SuiteBenchmark, task, robot)
+        for robot, tasks in OTHER_ROBOTS.items()
+        for name, task in tasks.items()
+    },
 }
 
 

@@ -43,7 +43,8 @@ def compare(
         typer.Option(
             metavar="NAME,...",
             help="Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), "
-            "aloha_insertion, ... (a wrong name lists them); suite: all but gym-aloha's; all.",
+            "aloha_insertion, ... (a wrong name lists them); suite: all of the upper body; "
+            "suite-viperx: its tasks on gym-aloha's arms (lid-viperx, ...); all.",
         ),
     ] = "bottle_shaking",
     policies: Annotated[
@@ -155,12 +156,12 @@ def compare(
 
 def _environments(text: str) -> list[str]:
     """The names that are meant, each once."""
-    from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS
+    from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
 
-    groups = {
-        "all": list(BENCHMARKS),
-        "suite": [name for name in BENCHMARKS if not name.startswith("aloha")],
-    }
+    groups = {f"suite-{robot}": list(tasks) for robot, tasks in OTHER_ROBOTS.items()}
+    others = {"aloha_state", "aloha_insertion"}.union(*groups.values())
+    groups["suite"] = [name for name in BENCHMARKS if name not in others]
+    groups["all"] = list(BENCHMARKS)
     return _named(text, groups)
 
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from lerobot_policy_tpgmm.environments.suite.names import SUITE
 from lerobot_policy_tpgmm.evaluation import compare as module
 from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS
 from lerobot_policy_tpgmm.evaluation.cells import Cell
@@ -61,7 +62,8 @@ def test_disturbed_policies_stand_beside_the_open_loop(
     [
         ("carry_and_put", ["carry_and_put"]),
         ("carry_and_put,aloha_state,carry_and_put", ["carry_and_put", "aloha_state"]),
-        ("suite", [name for name in BENCHMARKS if "aloha" not in name]),
+        ("suite", [n for n in BENCHMARKS if "aloha" not in n and "viperx" not in n]),
+        ("suite-viperx", [f"{task}-viperx" for task in SUITE]),
         ("aloha_state,all", ["aloha_state", *(n for n in BENCHMARKS if n != "aloha_state")]),
     ],
 )

@@ -25,6 +25,7 @@ from lerobot_policy_tpgmm.environments.disturbances import (
 )
 from lerobot_policy_tpgmm.environments.robot_scene import CAMERA
 from lerobot_policy_tpgmm.environments.start import Start, check_start
+from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from lerobot_policy_tpgmm.environments.suite.scene import SuiteScene, table_spec
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tpgmm_torch.exceptions import DataError
@@ -64,9 +65,9 @@ class SuiteStart(Start):
 
 
 class SuiteEnv(ControlledEnv):
-    """A 17-joint upper body at a table, and a task for both hands.
+    """A robot at a table, and a task for both hands.
 
-    Robot and actions are those of
+    Control and actions are those of
     :class:`~lerobot_policy_tpgmm.environments.bottle.shaking.BottleShakingEnv`.
     ``observation.environment_state`` has the present poses of the objects of the task, held or
     not. A hand takes hold of what it may hold when its palm is within 15 mm of it and comes no
@@ -78,6 +79,8 @@ class SuiteEnv(ControlledEnv):
     ----------
     task : str
         ``handover``, ``lid``, ``peg_in_hole``, ``pour`` or ``wipe``.
+    robot : str, default="upper_body"
+        The 17-joint ``upper_body``, or ``viperx``, gym-aloha's two arms of 6 joints.
     fps, episode_length, pushes, noise, condition, render_mode, render_width, render_height
         As for :class:`~lerobot_policy_tpgmm.environments.bottle.shaking.BottleShakingEnv`; an
         episode takes as long as the slowest demonstration and a second by default. Nobody puts
@@ -87,6 +90,8 @@ class SuiteEnv(ControlledEnv):
     ------
     DataError, UnknownNameError
         If an option is not one of the above.
+    DependencyError
+        Without gym-aloha, where its arms are asked for.
     """
 
     _scene: SuiteScene
@@ -95,6 +100,7 @@ class SuiteEnv(ControlledEnv):
     def __init__(
         self,
         task: str,
+        robot: str = UPPER_BODY,
         *,
         fps: int = 100,
         episode_length: int | None = None,
@@ -105,13 +111,13 @@ class SuiteEnv(ControlledEnv):
         render_width: int = 320,
         render_height: int = 240,
     ) -> None:
-        self._task = suite_task(task)
+        self._task = suite_task(task, robot)
         if any(map(_skips, parse_condition(condition))):
             raise DataError(
                 f"condition {condition!r} skips a part of the task, which {task} does not "
                 "offer: what its hands and its judge would have done meanwhile is not known"
             )
-        spec = table_spec()
+        spec = table_spec(self._task.embodiment.spec())
         self._task.furnish(spec)
         ends = self._task.ends()
         whole = list(ends.values())
@@ -132,7 +138,7 @@ class SuiteEnv(ControlledEnv):
             render_width=render_width,
             render_height=render_height,
         )
-        self.task, self.task_description = task, self._task.description
+        self.robot, self.task, self.task_description = robot, task, self._task.description
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far; the task says what each figure is."""

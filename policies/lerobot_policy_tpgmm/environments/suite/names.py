@@ -1,11 +1,16 @@
-"""The tasks of the suite and their objects, known without MuJoCo."""
+"""The tasks of the suite, their objects, and who does them, known without MuJoCo."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
-__all__ = ["SUITE"]
+__all__ = ["ROBOTS", "SUITE", "UPPER_BODY"]
+
+#: Who does the tasks unless another is named.
+UPPER_BODY = "upper_body"
+#: How many joints each robot has.
+ROBOTS: Mapping[str, int] = MappingProxyType({UPPER_BODY: 17, "viperx": 12})
 
 #: What is observed in each task, in that order.
 SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(

@@ -1,4 +1,4 @@
-"""The simulated upper body at a table with things that its hands can hold, in MuJoCo."""
+"""A simulated robot at a table with things that its hands can hold, in MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_policy_tpgmm.environments.robot_scene import RobotScene, robot_spec
+from lerobot_policy_tpgmm.environments.robot_scene import RobotScene
 
 __all__ = ["OBJECT", "TABLE", "Hold", "Snapshot", "SuiteScene", "add_thing", "table_spec"]
 
@@ -42,14 +42,14 @@ class Hold:
     grip: str
 
 
-def table_spec() -> mujoco.MjSpec:
-    """The robot at a table, a body ``table`` whose top is where that is.
+def table_spec(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Put a robot at a table, a body ``table`` whose top is where that is.
 
-    Returns
-    -------
-    mujoco.MjSpec
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        That of an embodiment.
     """
-    spec = robot_spec()
     table = spec.worldbody.add_body(name="table")
     table.add_geom(
         type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=TABLE, conaffinity=0, group=3
@@ -177,7 +177,7 @@ class SuiteScene(RobotScene):
         Parameters
         ----------
         poses : mapping of str to ndarray of shape (7,)
-        joints : ndarray of shape (17,)
+        joints : ndarray of shape (n_joints,)
             [rad]
         table : float
             Its height [m].

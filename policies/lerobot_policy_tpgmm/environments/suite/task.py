@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_policy_tpgmm.environments.bottle.conditions import skill
+from lerobot_policy_tpgmm.environments.suite.embodiments import Embodiment
 from lerobot_policy_tpgmm.environments.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
@@ -132,10 +132,10 @@ class Judge(ABC):
 class SuiteTask(ABC):
     """A task of the suite: its objects, its expert, its judge.
 
-    Attributes
+    Parameters
     ----------
-    robot : Robot
-        The 17-joint upper body.
+    embodiment : Embodiment
+        The robot that does it.
     """
 
     #: The name, ``--env.task`` of LeRobot, and what data sets call it.
@@ -157,10 +157,13 @@ class SuiteTask(ABC):
     #: How a report calls figures, and their digits.
     headings: ClassVar[Mapping[str, tuple[str, int]]]
 
+    def __init__(self, embodiment: Embodiment) -> None:
+        self.embodiment = embodiment
+
     @property
     def robot(self) -> Robot:
-        """The robot of all tasks."""
-        return skill().robot
+        """The embodiment's kinematics."""
+        return self.embodiment.robot
 
     @abstractmethod
     def furnish(self, spec: mujoco.MjSpec) -> None:
@@ -216,9 +219,9 @@ class SuiteTask(ABC):
         return dict(zip(self.phases, done.tolist(), strict=True))
 
     def start_posture(self, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Around the neutral one, shape (17,) [rad]."""
+        """Around the neutral one, shape (n_joints,) [rad]."""
         spread = rng.uniform(-START, START, self.robot.n_joints)
-        posture = skill().neutral_posture().numpy() + spread
+        posture = self.embodiment.posture.numpy() + spread
         return np.clip(posture, self.robot.lower.numpy(), self.robot.upper.numpy())
 
     def demonstrations(
@@ -269,7 +272,7 @@ class SuiteTask(ABC):
         Parameters
         ----------
         poses : mapping of str to ndarray of shape (7,)
-        joints : ndarray of shape (17,)
+        joints : ndarray of shape (n_joints,)
             [rad]
         rate : float, default=100
         """
@@ -301,7 +304,7 @@ class SuiteTask(ABC):
         def wanted(time: Tensor) -> list[Frame]:
             return hands_along(hands, legs, phases.progress(time, ends), style.bow)
 
-        posture = skill().neutral_posture() + style.posture
+        posture = self.embodiment.posture + style.posture
         joints = follow_hands(robot, starts, wanted, times, posture)
         return [
             Demonstration(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 
+from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.handover import Handover
 from lerobot_policy_tpgmm.environments.suite.lid import Lid
+from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from lerobot_policy_tpgmm.environments.suite.peg_in_hole import PegInHole
 from lerobot_policy_tpgmm.environments.suite.pour import Pour
 from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
@@ -20,14 +22,16 @@ TASKS: dict[str, type[SuiteTask]] = {
 
 
 @functools.cache
-def suite_task(name: str) -> SuiteTask:
-    """A task by its name.
+def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
+    """A task by its name, and that of the robot that does it.
 
     Raises
     ------
     UnknownNameError
         If there is none.
+    DependencyError
+        If the robot's description is in a package that is not installed.
     """
     if name not in TASKS:
         raise UnknownNameError("task", name, "the suite", TASKS)
-    return TASKS[name]()
+    return TASKS[name](embodiment(robot))

@@ -19,11 +19,12 @@ from lerobot_policy_tpgmm.environments.disturbances import (
     Stopped,
     displaced,
 )
+from lerobot_policy_tpgmm.environments.suite.embodiments import EMBODIMENTS, embodiment
 from lerobot_policy_tpgmm.environments.suite.env import SUITE_CONDITIONS, SuiteEnv
 from lerobot_policy_tpgmm.environments.suite.handover import GRIP, LEFT, RIGHT
-from lerobot_policy_tpgmm.environments.suite.names import SUITE
+from lerobot_policy_tpgmm.environments.suite.names import ROBOTS, SUITE
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
-from tests.support.suite_expert import replay, start_of, tick
+from tests.support.suite_expert import TRIED, replay, start_of, tick
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 FPS = 25
@@ -40,9 +41,10 @@ def motion():
     return TASK.demonstrations(2, seed=1, rate=FPS)[0]
 
 
+@pytest.mark.parametrize("robot", TRIED)
 @pytest.mark.parametrize("name", SUITE)
-def test_the_checkers_of_gymnasium_and_stable_baselines_pass(name):
-    env = made(name, fps=50, pushes=True, noise=1.0, episode_length=5)
+def test_the_checkers_of_gymnasium_and_stable_baselines_pass(name, robot):
+    env = made(name, robot=robot, fps=50, pushes=True, noise=1.0, episode_length=5)
     with warnings.catch_warnings():
         # actions are angles, not numbers between -1 and 1
         warnings.filterwarnings("ignore", message=".*symmetric and normalized")
@@ -50,18 +52,21 @@ def test_the_checkers_of_gymnasium_and_stable_baselines_pass(name):
     check_by_stable_baselines(gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1)))
 
 
+@pytest.mark.parametrize("robot", TRIED)
 @pytest.mark.parametrize("name", SUITE)
-def test_lerobot_makes_each_task(name):
-    config = make_env_config("bimanual", task=name, fps=25, episode_length=2)
+def test_lerobot_makes_each_task(name, robot):
+    config = make_env_config("bimanual", task=name, robot=robot, fps=25, episode_length=2)
+    joints = suite_task(name, robot).robot.joint_names
     shapes = {key: value.shape for key, value in env_to_policy_features(config).items()}
     assert shapes == {
-        "observation.state": (17,),
+        "observation.state": (len(joints),),
         "observation.environment_state": (7 * len(SUITE[name]),),
-        "action": (17,),
+        "action": (len(joints),),
     }
     envs = make_env(config, n_envs=2)["bimanual"][0]
     observation, _ = envs.reset(seed=[0, 1])
-    assert set(envs.call("task")) == {name}
+    assert set(envs.call("task")) == {name} and set(envs.call("robot")) == {robot}
+    assert set(envs.call("joint_names")) == {joints}
     assert set(envs.call("task_description")) == {suite_task(name).description}
     for _ in range(2):
         *_, truncated, info = envs.step(observation["agent_pos"].astype(np.float32))
@@ -83,10 +88,26 @@ def test_tasks_that_do_not_exist_are_refused():
             make("juggle")
 
 
+def test_robots_that_do_not_exist_are_refused():
+    for make in (
+        SuiteEnv,
+        lambda task, robot: make_env_config("bimanual", task=task, robot=robot),
+    ):
+        with pytest.raises(UnknownNameError, match=r"octopus.*upper_body.*viperx"):
+            make("lid", "octopus")
+
+
+def test_every_robot_has_as_many_joints_as_is_known_without_mujoco():
+    for name in TRIED:
+        assert embodiment(name).robot.n_joints == ROBOTS[name]
+    assert set(EMBODIMENTS) == set(ROBOTS)
+
+
+@pytest.mark.parametrize("robot", TRIED)
 @pytest.mark.parametrize("name", SUITE)
-def test_an_episode_is_that_of_its_seed(name):
+def test_an_episode_is_that_of_its_seed(name, robot):
     def episode(seed):
-        env = SuiteEnv(name, fps=FPS, pushes=True, noise=1.0)
+        env = SuiteEnv(name, robot, fps=FPS, pushes=True, noise=1.0)
         seen = [env.reset(seed=seed)[0]]
         seen += [env.step(seen[0]["agent_pos"])[0] for _ in range(20)]
         return np.array([np.concatenate(list(observation.values())) for observation in seen])
@@ -94,7 +115,7 @@ def test_an_episode_is_that_of_its_seed(name):
     np.testing.assert_array_equal(episode(7), episode(7))
     assert not np.array_equal(episode(7)[0], episode(8)[0])
     # and however often somebody looks
-    slow, fast = (SuiteEnv(name, fps=fps).reset(seed=7)[0] for fps in (25, 100))
+    slow, fast = (SuiteEnv(name, robot, fps=fps).reset(seed=7)[0] for fps in (25, 100))
     for key, value in slow.items():
         np.testing.assert_array_equal(value, fast[key])
 

@@ -6,7 +6,7 @@ import torch
 
 from lerobot_policy_tpgmm.environments.bottle.measures import successful
 from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
-from lerobot_policy_tpgmm.environments.suite.lid import HIGHEST, LOWEST, Lid
+from lerobot_policy_tpgmm.environments.suite.lid import HIGHEST, LOWEST
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tests.support.suite_expert import replay
 from tpgmm_torch import Demonstration
@@ -88,5 +88,5 @@ def test_boxes_stand_where_the_task_is_meant_for_them_and_the_seed_says_where():
     assert all(map(TASK.usual, drawn)) and not TASK.usual(drawn[0] + np.eye(7)[1])
     positions = np.array(drawn)[:, :3]
     assert (np.ptp(positions, axis=0) > 0.8 * np.subtract(HIGHEST, LOWEST)).all()
-    again = Lid().draw(np.random.default_rng(0))["box"]
+    again = TASK.draw(np.random.default_rng(0))["box"]
     np.testing.assert_array_equal(again, drawn[0])

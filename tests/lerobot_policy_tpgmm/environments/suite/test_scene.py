@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_policy_tpgmm.environments.bottle.conditions import skill
+from lerobot_policy_tpgmm.environments.robot_scene import robot_spec
 from lerobot_policy_tpgmm.environments.suite.scene import (
     OBJECT,
     TABLE,
@@ -28,7 +29,7 @@ def at(*position):
 
 def made():
     """A thin rod, and a cube on a shelf that cannot be moved, far from the table."""
-    spec = table_spec()
+    spec = table_spec(robot_spec())
     add_thing(spec, "rod").add_geom(
         name="rod",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,

@@ -20,10 +20,19 @@ from lerobot_policy_tpgmm.environments.suite.task import (
 )
 from lerobot_policy_tpgmm.environments.suite.tasks import TASKS, suite_task
 from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS
+from tests.support.suite_expert import TRIED
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.exceptions import UnknownNameError
 
+#: The sum of all angles of a demonstration by the upper body, without regard to sign [rad].
+TOTALS = {
+    "handover": 1002.7587637709989,
+    "lid": 1016.4567192942939,
+    "peg_in_hole": 492.2491393930438,
+    "pour": 1040.144200298613,
+    "wipe": 1182.953066188302,
+}
 BOX = (0.2, -0.1, 0.1), (0.3, 0.1, 0.2), 20.0
 
 
@@ -45,9 +54,10 @@ def test_names_are_those_that_are_known_without_mujoco():
         suite_task("juggle")
 
 
+@pytest.mark.parametrize("robot", TRIED)
 @pytest.mark.parametrize("name", SUITE)
-def test_a_task_hangs_together(name):
-    task, env = suite_task(name), SuiteEnv(name)
+def test_a_task_hangs_together(name, robot):
+    task, env = suite_task(name, robot), SuiteEnv(name, robot)
     env.reset(seed=0)
     assert task.name == name and task.objects == SUITE[name]
     assert set(task.draw(np.random.default_rng(0))) == set(task.objects)
@@ -67,6 +77,12 @@ def test_a_task_hangs_together(name):
     # the same draws, however an episode begins
     given = env.reset(seed=4, options={task.objects[0]: first})[0]["agent_pos"]
     np.testing.assert_array_equal(env.reset(seed=4)[0]["agent_pos"], given)
+
+
+@pytest.mark.parametrize(("name", "total"), sorted(TOTALS.items()))
+def test_what_the_upper_body_demonstrates_is_what_was_published(name, total):
+    [shown] = suite_task(name).demonstrations(2, seed=1, rate=10, only=[0])
+    assert float(shown.joints.abs().sum()) == pytest.approx(total, rel=1e-9)
 
 
 def test_a_seed_says_all():
