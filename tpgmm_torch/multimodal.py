@@ -231,12 +231,8 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DataError
             If they do not fit together.
         """
-        models, weights, limits = (
-            list(models),
-            np.array(weights, float),
-            np.array(limits, float),
-        )
-        labels = np.array(labels, dtype=np.intp)
+        models, labels = list(models), np.array(labels, dtype=np.intp)
+        weights, limits = (np.array(values, dtype=np.float64) for values in (weights, limits))
         if not models or not len(models) == len(weights) == len(limits):
             raise DataError(
                 f"{len(models)} models with {len(weights)} weights and {len(limits)} limits: "
@@ -244,7 +240,7 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             )
         if not (bool((weights > 0).all()) and np.isfinite([*weights, *limits]).all()):
             raise DataError(
-                f"weights {weights} and limits {limits} are finite, weights positive"
+                f"weights and limits are finite, weights positive: got {weights} and {limits}"
             )
         if labels.ndim != 1 or not set(labels.tolist()) <= set(range(len(models))):
             raise DataError(f"labels {labels.tolist()} are no numbers of {len(models)} ways")
@@ -678,7 +674,9 @@ class MultimodalController:
             for k, at in enumerate(times)
         ]
         novelty = np.array([_novelty(one, begun, self._midway) for one in model.models_])
-        self.choice = ModeChoice.of(model.weights_, novelty, self._misfit + np.array(there))
+        # the posture is a moment of the motion that was tried out
+        misfit = np.maximum(self._misfit, there)
+        self.choice = ModeChoice.of(model.weights_, novelty, misfit)
 
     def _switch(self, mode: int, time: float, frames: Mapping[str, Frame]) -> None:
         """From the next step on the robot goes another way."""

@@ -498,13 +498,14 @@ class TPGMMConfig(StatePolicyConfig):
         fitted = [_noted(one) for one in models_of(model)]
         self.modes, self.ways = len(fitted), []
         if isinstance(model, MultimodalTaskParameterizedGMM) and self.modes > 1:
-            members = [
-                (model.labels_ == mode).nonzero()[0].tolist() for mode in range(self.modes)
-            ]
-            numbers = zip(fitted, model.weights_.tolist(), model.limits_.tolist(), members)
             self.ways = [
-                Way(**own, weight=weight, limit=limit, episodes=episodes)
-                for own, weight, limit, episodes in numbers
+                Way(
+                    **own,
+                    weight=float(model.weights_[mode]),
+                    limit=float(model.limits_[mode]),
+                    episodes=(model.labels_ == mode).nonzero()[0].tolist(),
+                )
+                for mode, own in enumerate(fitted)
             ]
             fitted = [_unfitted()]
         for name, value in fitted[0].items():
