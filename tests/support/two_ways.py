@@ -161,6 +161,24 @@ class Handles(TwoWays):
         return place.transform(torch.tensor([[0, 0.08, 0], [0, -0.08, 0]]).double())
 
 
+def reach_of_one_handle(n, seed=0, angles=(0, 0.6)) -> list[Situation]:
+    """Objects so far away that the arm reaches one of the two handles only."""
+    rng, found = np.random.default_rng(seed), []
+    while len(found) < n:
+        radius, angle = rng.uniform(0.75, 0.95), rng.uniform(*angles)
+        place = (radius * np.cos(angle), radius * np.sin(angle), 0)
+        frame = Frame(place, turned(rng.uniform(-0.5, 0.5)))
+        far = Handles().handles(frame).norm(dim=-1)
+        if far.max() > 0.93 and far.min() < 0.87:
+            found.append(Situation(Handles().start(rng), {"object": frame}))
+    return found
+
+
+def another_handle_each() -> list[Situation]:
+    """Two situations, in each of which the arm reaches another handle alone."""
+    return [*reach_of_one_handle(1, angles=(-0.6, 0)), *reach_of_one_handle(1)]
+
+
 @functools.cache
 def shown(task: type[TwoWays], seed: int = 0, n: int = 10) -> tuple:
     """Demonstrations of a task, and their sides."""

@@ -9,12 +9,19 @@ import torch
 from sklearn.base import clone
 
 from tests.support.skills import canonical, handlings, hands_model, new_handling, waves
-from tests.support.two_ways import Handles, Obstacle, fitted, shown, tip, turned
+from tests.support.two_ways import (
+    Handles,
+    Obstacle,
+    another_handle_each,
+    fitted,
+    reach_of_one_handle,
+    shown,
+    tip,
+)
 from tpgmm_torch import (
     Frame,
     ModeSelection,
     MultimodalTaskParameterizedGMM,
-    Situation,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.exceptions import (
@@ -26,19 +33,6 @@ from tpgmm_torch.exceptions import (
 )
 
 FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
-
-
-def reach_of_one_handle(n, seed=0, angles=(0, 0.6)):
-    """Objects so far away that the arm reaches one of the two handles only."""
-    rng, found = np.random.default_rng(seed), []
-    while len(found) < n:
-        radius, angle = rng.uniform(0.75, 0.95), rng.uniform(*angles)
-        place = (radius * np.cos(angle), radius * np.sin(angle), 0)
-        frame = Frame(place, turned(rng.uniform(-0.5, 0.5)))
-        far = Handles().handles(frame).norm(dim=-1)
-        if far.max() > 0.93 and far.min() < 0.87:
-            found.append(Situation(Handles().start(rng), {"object": frame}))
-    return found
 
 
 @pytest.mark.parametrize("task", [Obstacle, Handles])
@@ -236,6 +230,17 @@ def test_who_is_left_alone_stays_on_the_way_that_was_chosen():
         assert torch.equal(controller.reference, plain.reference)
 
 
+def test_an_unlikely_moment_of_the_way_is_no_reason_to_leave_it():
+    """In the worst moment of a situation of novelty 1.4, misfit must not count twice."""
+    model, situation = fitted(Obstacle, 100), Obstacle().situations(50, 100)[15]
+    controller = model.controller(situation.joints, situation.frames)
+    first, modes = controller.mode, set()
+    while not controller.finished:
+        controller.step(3 / 59, controller.reference, situation.frames)
+        modes.add(controller.mode)
+    assert modes == {first}
+
+
 def test_a_robot_that_is_moved_over_goes_on_the_other_way():
     model, [situation] = fitted(Handles), Handles().situations(1, 6)
     controller = model.controller(situation.joints, situation.frames)
@@ -249,15 +254,9 @@ def test_a_robot_that_is_moved_over_goes_on_the_other_way():
     assert controller.mode == 1 - first
 
 
-def parted():
-    """Two situations, in each of which the arm reaches another handle alone."""
-    right, left = reach_of_one_handle(1), reach_of_one_handle(1, angles=(-0.6, 0))
-    return fitted(Handles), [*left, *right]
-
-
 @pytest.mark.filterwarnings(FAR)
 def test_each_robot_of_a_batch_goes_its_own_way():
-    model, situations = parted()
+    model, situations = fitted(Handles), another_handle_each()
     starts = torch.stack([one.joints for one in situations])
     frames = {"object": Frame.stack([one.frames["object"] for one in situations])}
     together = model.controller(starts, frames)
@@ -283,7 +282,7 @@ def test_each_robot_of_a_batch_goes_its_own_way():
 
 @pytest.mark.filterwarnings(FAR)
 def test_who_looks_ahead_stays_on_the_way_and_goes_on_from_there():
-    model, situations = parted()
+    model, situations = fitted(Handles), another_handle_each()
     starts = torch.stack([one.joints for one in situations])
     frames = {"object": Frame.stack([one.frames["object"] for one in situations])}
     one, other = model.controller(starts, frames), model.controller(starts, frames)
