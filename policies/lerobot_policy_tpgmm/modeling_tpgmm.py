@@ -512,8 +512,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return super().train(mode)
 
     def get_optim_params(self) -> Any:
-        """What gradient training changes: the mixture."""
-        return self.parameters()
+        """What gradient training changes: the mixture of one way.
+
+        Others are found when there is an optimizer already, and a run that is resumed has to
+        find in it as many parameters as before.
+        """
+        return self.mixture.parameters()
 
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None

@@ -12,8 +12,13 @@ from tests.support.command_line import output, refusal
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tests.support.two_ways import ARM, Handles, two_ways_set
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import Demonstration, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    MultimodalTaskParameterizedGMM,
+    TaskParameterizedGMM,
+)
 
 NAMES = fitted().kinematics.joint_names
 POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
@@ -87,6 +92,27 @@ def test_a_skill_in_parts_is_the_models_controller(tmp_path):
         observed[STATE] = action
     moved = command.reference - start.joints
     assert float(command.time) > model.parts_[-1].begin and float(moved.abs().max()) > 0.2
+
+
+def test_several_ways_are_one_policy(tmp_path):
+    two_ways_set(tmp_path)
+    arguments = (
+        "fit", tmp_path / "set", "--robot", tmp_path / "arm.urdf", "--link", "tip",
+        "--operator", "position:tip@object", "--operator", "canonical",
+        "--alignment", "none", "--n-components", 8, "--modes", "auto", "--out",
+    )  # fmt: skip
+    output(*arguments, tmp_path / "model")
+    text = output(*arguments, tmp_path / "policy", "--format", "lerobot")
+    assert "2 ways:" in text and text.endswith(f"saved            {tmp_path / 'policy'}\n")
+    policy = TPGMMPolicy.from_pretrained(tmp_path / "policy")
+    assert policy.config.modes == 2 and policy.config.fps == 20
+    assert tuple(policy.config.state_names) == ARM.joint_names
+    model = MultimodalTaskParameterizedGMM.load(tmp_path / "model")
+    given = Handles().situations(3, 0)
+    for one, other in zip(
+        policy.to_estimator().predict(given), model.predict(given), strict=True
+    ):
+        torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-9)
 
 
 def test_an_unknown_format_is_refused(tmp_path):

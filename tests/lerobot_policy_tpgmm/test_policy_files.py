@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from draccus.utils import DecodingError
+from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_pre_post_processors
@@ -393,6 +393,6 @@ def test_a_way_of_another_save_is_refused(two_ways, tmp_path):
     ],
 )
 def test_settings_that_are_of_each_way_are_not_for_all(two_ways, override, message, caplog):
-    with pytest.raises(DecodingError):
+    with pytest.raises(ParsingError):
         loaded(two_ways, override)
     assert message in caplog.text

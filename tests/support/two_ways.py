@@ -2,12 +2,15 @@
 
 import functools
 from abc import ABC, abstractmethod
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from tpgmm_datasets import save_lerobot
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -177,6 +180,16 @@ def reach_of_one_handle(n, seed=0, angles=(0, 0.6)) -> list[Situation]:
 def another_handle_each() -> list[Situation]:
     """Two situations, in each of which the arm reaches another handle alone."""
     return [*reach_of_one_handle(1, angles=(-0.6, 0)), *reach_of_one_handle(1)]
+
+
+def two_ways_set(path: Path) -> Path:
+    """A data set of two handles, 20 steps per second, and the arm's URDF beside it."""
+    demonstrations, _ = shown(Handles)
+    time = torch.arange(len(TIME)) / 20
+    given = [replace(one, time=time.double()) for one in demonstrations]
+    save_lerobot(given, path / "set", fps=20, task="take a handle")
+    (path / "arm.urdf").write_text(ARM.config()["urdf"])
+    return path
 
 
 @functools.cache
