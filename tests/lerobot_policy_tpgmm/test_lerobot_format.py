@@ -23,6 +23,11 @@ from tpgmm_torch import (
 NAMES = fitted().kinematics.joint_names
 POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
 
+BOTTLE = (
+    "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand", "--n-components", 30,
+    "--format", "lerobot",
+)  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
@@ -30,10 +35,7 @@ def directory(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fitted")
     shaking = replace(generator(), steady_rhythm=True)
     save_lerobot(shaking.demonstrations(10, seed=0), folder / "set", fps=20, task="shake")
-    printed = output(
-        "fit", folder / "set", "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand",
-        "--n-components", 30, "--out", folder / "policy", "--format", "lerobot",
-    )  # fmt: skip
+    printed = output("fit", folder / "set", *BOTTLE, "--out", folder / "policy")
     assert printed.endswith(f"{folder / 'policy'}\n")
     return folder / "policy"
 
@@ -121,9 +123,17 @@ def test_an_unknown_format_is_refused(tmp_path):
     assert "pip install lerobot_policy_tpgmm" in line
 
 
-def test_lerobot_eval_runs_it(directory, tmp_path):
+@pytest.mark.parametrize("modes", [1, 2])
+def test_lerobot_eval_runs_it(directory, tmp_path, modes):
+    path = directory
+    if modes > 1:
+        path = tmp_path / "policy"
+        text = output(
+            "fit", directory.parent / "set", *BOTTLE, "--modes", modes, "--out", path,
+        )  # fmt: skip
+        assert "2 ways:" in text
     done = lerobot(
-        "eval", f"--policy.path={directory}", "--env.type=bottle_shaking", "--env.fps=20",
+        "eval", f"--policy.path={path}", "--env.type=bottle_shaking", "--env.fps=20",
         "--env.mode=kinematic", "--eval.n_episodes=2", "--eval.batch_size=2",
         "--eval.use_async_envs=false", f"--output_dir={tmp_path / 'out'}", home=tmp_path,
     )  # fmt: skip
