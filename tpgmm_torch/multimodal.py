@@ -552,6 +552,7 @@ class MultimodalController:
     ) -> None:
         self._model, self._clock, self._settings = model, clock, dict(settings)
         self._start, self._since = joints, 0.0
+        frames = {name: frame.to(joints) for name, frame in frames.items()}
         if choice is None:
             [choice] = model.choose(Situation(joints, frames))
         self.choice, self._misfit, self._midway = choice, choice.misfit, False
@@ -799,7 +800,6 @@ class _Parts:
 
     def __init__(self, batch: Sequence[int]) -> None:
         self.batch, self._robots = tuple(batch), list(np.ndindex(*batch))
-        self._frames: dict[str, tuple[Any, list[Any]]] = {}
 
     def joined(self, values: Sequence[Tensor]) -> Tensor:
         """Values (...) of each robot as those of the batch."""
@@ -834,19 +834,19 @@ class _Parts:
         ]
 
     def _of_frame(self, name: str, frame: Any) -> list[Any]:
-        told, parts = self._frames.get(name, (None, []))
-        if frame is None or told is not frame:
-            if isinstance(frame, Frame):
-                parts = [frame.expand(self.batch)[robot] for robot in self._robots]
-            elif frame is None:
-                parts = [None] * len(self._robots)
-            else:
+        try:
+            if frame is None:
+                return [None] * len(self._robots)
+            if not isinstance(frame, Frame):
                 poses = torch.as_tensor(frame)
-                poses = poses.expand(*self.batch, poses.shape[-1])
-                parts = [poses[robot] for robot in self._robots]
-            # a frame that is told again has to be the same, not an equal one
-            self._frames = {**self._frames, name: (frame, parts)}
-        return parts
+                return list(poses.expand(*self.batch, poses.shape[-1]).flatten(0, -2))
+            whole = frame.expand(self.batch)
+            return [whole[robot] for robot in self._robots]
+        except RuntimeError as error:
+            raise ShapeError(
+                f"the skill began with robots of shape {self.batch}, frame {name!r} now has "
+                f"another: {error}"
+            ) from error
 
 
 def _silent(model: TaskParameterizedGMM) -> TaskParameterizedGMM:

@@ -392,12 +392,12 @@ class TPGMMConfig(StatePolicyConfig):
                     f"the policy has {len(self.ways)} ways, each with its own "
                     f"{', '.join(wrong)}: fit again to change them"
                 )
-        if self.fitted and self.modes != len(self.each_way()):
+        ways = self.each_way()  # each of them is checked
+        if self.fitted and self.modes != len(ways):
             raise DataError(
-                f"the policy is fitted, modes={len(self.each_way())}, got {self.modes!r}: "
-                "train a new one for another number of ways"
+                f"the policy is fitted, modes={len(ways)}, got {self.modes!r}: train a new one "
+                "for another number of ways"
             )
-        self.each_way()  # each of them is checked
 
     @property
     def fitted(self) -> bool:

@@ -278,6 +278,9 @@ def test_each_robot_of_a_batch_goes_its_own_way():
     assert together.modes.tolist() == [one.mode for one in alone]
     with pytest.raises(ShapeError, match="began with robots of shape"):
         together.step(0.05, starts[:1], frames)
+    poses = torch.cat((frames["object"].position, frames["object"].orientation), dim=-1)
+    with pytest.raises(ShapeError, match="frame 'object' now has another"):
+        together.step(0.05, starts, {"object": poses.expand(3, 2, 7)})
 
 
 @pytest.mark.filterwarnings(FAR)
