@@ -641,7 +641,12 @@ class MultimodalController:
         if _moved(self._seen, places):
             self._seen = places
             self._try_out(here, places, times)
-        self._weigh(here, places, times)
+        # where the mode itself sends the robot is nothing against it
+        asked, allowed = self.controller.command, np.zeros(model.n_modes_)
+        if asked is not None and bool(asked.estimate.joints.isfinite().all()):
+            joints, at = asked.estimate.joints[None], here.new_tensor([times[self.mode]])
+            allowed[self.mode] = model._excess(self.mode, at, joints, places)
+        self._weigh(here, places, times, allowed)
         chances = self.choice.probabilities
         if chances[self.choice.mode] > CLEARLY * chances[self.mode]:
             self._switch(self.choice.mode, times[self.choice.mode], places)
@@ -667,8 +672,17 @@ class MultimodalController:
         misfits = [self._model._misfits(k, [now], at) for k, at in enumerate(times)]
         self._misfit = np.concatenate(misfits)
 
-    def _weigh(self, here: Tensor, frames: Mapping[str, Frame], times: Sequence[float]) -> None:
-        """Compare modes, in each of which the robot is ``here`` at a time."""
+    def _weigh(
+        self,
+        here: Tensor,
+        frames: Mapping[str, Frame],
+        times: Sequence[float],
+        allowed: Array | float = 0.0,
+    ) -> None:
+        """Compare modes, in each of which the robot is ``here`` at a time.
+
+        So much less likely than any demonstration as ``allowed`` it may be.
+        """
         model, begun = self._model, Situation(self._start, frames)
         there = [
             model._excess(k, here.new_tensor([at]), here[None], frames)
@@ -676,7 +690,7 @@ class MultimodalController:
         ]
         novelty = np.array([_novelty(one, begun, self._midway) for one in model.models_])
         # the posture is a moment of the motion that was tried out
-        misfit = np.maximum(self._misfit, there)
+        misfit = np.maximum(self._misfit, np.array(there) - allowed)
         self.choice = ModeChoice.of(model.weights_, novelty, misfit)
 
     def _switch(self, mode: int, time: float, frames: Mapping[str, Frame]) -> None:
