@@ -30,6 +30,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 from tpgmm_torch.novelty import ALIKE
 from tpgmm_torch.persistence import MODES
+from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.storage import Folder
 from tpgmm_torch.structure.mode_selection import ModeSelection
 from tpgmm_torch.structure.operator_selection import OperatorSelection
@@ -158,6 +159,19 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """How many ways there are."""
         return len(self.models_)
 
+    @property
+    def joint_names_(self) -> tuple[str, ...]:
+        """Of the robot, in the order of the joint vectors."""
+        self._check_fitted()
+        return self.models_[0].joint_names_
+
+    @property
+    def frame_names_(self) -> tuple[str, ...]:
+        """Objects that a situation has to tell the poses of, for any of the ways."""
+        self._check_fitted()
+        names = (name for model in self.models_ for name in model.frame_names_)
+        return tuple(dict.fromkeys(names))
+
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Divide demonstrations by mode, and learn from those of each.
 
@@ -194,6 +208,49 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.weights_ = np.bincount(selection.labels_) / len(known)
         self.mode_selection_ = selection
         return self
+
+    @classmethod
+    def from_models(
+        cls,
+        models: Sequence[TaskParameterizedGMM],
+        weights: Any,
+        limits: Any,
+        labels: Any,
+    ) -> Self:
+        """A fitted model of known ways, which are kept as they are.
+
+        Parameters
+        ----------
+        models : sequence of TaskParameterizedGMM
+            Fitted, of one robot.
+        weights, limits, labels : array-like
+            As in the attributes of that name.
+
+        Raises
+        ------
+        DataError
+            If they do not fit together.
+        """
+        models, labels = list(models), np.array(labels, dtype=np.intp)
+        weights, limits = (np.array(values, dtype=np.float64) for values in (weights, limits))
+        if not models or not len(models) == len(weights) == len(limits):
+            raise DataError(
+                f"{len(models)} models with {len(weights)} weights and {len(limits)} limits: "
+                "there is one of each for every way"
+            )
+        if not (bool((weights > 0).all()) and np.isfinite([*weights, *limits]).all()):
+            raise DataError(
+                f"weights and limits are finite, weights positive: got {weights} and {limits}"
+            )
+        if labels.ndim != 1 or not set(labels.tolist()) <= set(range(len(models))):
+            raise DataError(f"labels {labels.tolist()} are no numbers of {len(models)} ways")
+        [first, *others] = models
+        if any(other.joint_names_ != first.joint_names_ for other in others):
+            raise DataError("the ways are of different robots")
+        multimodal = cls(clone(first), len(models))
+        multimodal.models_, multimodal.mode_selection_ = models, None
+        multimodal.weights_, multimodal.limits_, multimodal.labels_ = weights, limits, labels
+        return multimodal
 
     def choose(self, X: Situation | Sequence[Situation]) -> list[ModeChoice]:
         """The mode for each situation, and why.
@@ -269,15 +326,15 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         *,
         clock: Clock | str = "localizing",
         **settings: Any,
-    ) -> MultimodalController:
+    ) -> MultimodalController | MultimodalControllers:
         """The skill, to be run tick by tick, in the mode that suits now.
 
         Parameters
         ----------
-        joints : array-like of shape (n_joints,)
-            The start posture of one robot; others have a controller of their own.
+        joints : array-like of shape (..., n_joints)
+            The start posture. Of a batch, each robot goes its own way.
         frames : mapping of str to Frame, optional
-            Object poses; a step may be given others.
+            Object poses, of shapes that broadcast with the batch; a step may be given others.
         clock : Clock or str, default="localizing"
         **settings
             Further ones of :meth:`TaskParameterizedGMM.controller`.
@@ -285,11 +342,13 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Raises
         ------
         ShapeError, DataError, NotFittedError, UnknownNameError
-            As there, and if there are several robots.
+            As there.
         """
         self._check_fitted()
         clock = parse_clock(clock)
-        return MultimodalController(self, joints, frames or {}, clock, settings)
+        starts = self.models_[0].kinematics_.joint_tensor(joints)
+        kind = MultimodalControllers if starts.ndim > 1 else MultimodalController
+        return kind(self, starts, frames or {}, clock, settings)
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:
         """Mean log-likelihood per time step of demonstrations; higher is better."""
@@ -373,17 +432,11 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         models = [
             TaskParameterizedGMM.load(path / f"mode_{k}", custom, device) for k in range(count)
         ]
-        [first, *others] = models
-        if any(
-            other.kinematics_.joint_names != first.kinematics_.joint_names for other in others
-        ):
-            raise ModelFileError(f"the modes in {path} are of different robots")
-        multimodal = cls(clone(first), count)
-        multimodal.models_, multimodal.mode_selection_ = models, None
-        multimodal.weights_, multimodal.limits_, multimodal.labels_ = (
-            numbers[name].numpy() for name in ("weights", "limits", "labels")
-        )
-        return multimodal
+        known = (numbers[name].numpy() for name in ("weights", "limits", "labels"))
+        try:
+            return cls.from_models(models, *known)
+        except DataError as error:
+            raise ModelFileError(f"{path} does not fit together: {error}") from error
 
     def _check_choices(self, choices: Sequence[ModeChoice], n_situations: int) -> None:
         if len(choices) != n_situations:
@@ -466,13 +519,15 @@ class MultimodalController:
     ----------
     model : MultimodalTaskParameterizedGMM
         Whose :meth:`~MultimodalTaskParameterizedGMM.controller` makes it.
-    joints : array-like of shape (n_joints,)
+    joints : Tensor of shape (n_joints,)
         The start posture.
     frames : mapping of str to Frame
         Poses of the objects until others are told.
     clock : Clock
     settings : mapping
         Further ones of :meth:`TaskParameterizedGMM.controller`.
+    choice : ModeChoice, optional
+        For this situation; by default it is found.
 
     Attributes
     ----------
@@ -482,29 +537,32 @@ class MultimodalController:
         Why: the last comparison, the present posture included.
     controller : Controller
         Of the mode that runs, with everything that it tells.
+    command : Command or None
+        What the last step returned.
     """
 
     def __init__(
         self,
         model: MultimodalTaskParameterizedGMM,
-        joints: Any,
+        joints: Tensor,
         frames: Mapping[str, Frame],
         clock: Clock,
         settings: Mapping[str, Any],
+        choice: ModeChoice | None = None,
     ) -> None:
-        start = model.models_[0].kinematics_.joint_tensor(joints)
-        if start.ndim != 1:
-            raise ShapeError(
-                f"each robot goes its own way: a controller is for one start posture "
-                f"(n_joints,), got {tuple(start.shape)}; make one for each"
-            )
         self._model, self._clock, self._settings = model, clock, dict(settings)
-        self._start, self._since = start, 0.0
-        [self.choice] = model.choose(Situation(start, frames))
-        self._misfit, self.mode = self.choice.misfit, self.choice.mode
+        self._start, self._since = joints, 0.0
+        frames = {name: frame.to(joints) for name, frame in frames.items()}
+        if choice is None:
+            [choice] = model.choose(Situation(joints, frames))
+        self.choice, self._misfit, self._midway = choice, choice.misfit, False
+        if model.n_modes_ > 1:
+            self._look_where_it_begins(joints, frames)
+        self.mode = self.choice.mode
         self.controller = model.models_[self.mode].controller(
-            start, frames, clock=clock, **settings
+            joints, frames, clock=clock, **settings
         )
+        self.command: Command | None = None
         self._seen = dict(self.controller.holding.frames)
 
     @property
@@ -524,10 +582,12 @@ class MultimodalController:
 
     def step(
         self,
-        dt: float,
+        dt: float | Tensor,
         joints: Any = None,
         frames: Mapping[str, Any] | None = None,
-        **more: Any,
+        *,
+        told: Mapping[str, str | None] | None = None,
+        ages: Mapping[str, float] | None = None,
     ) -> Command:
         """Find the next reference, in another mode if that suits better now.
 
@@ -539,42 +599,99 @@ class MultimodalController:
             Where the robot stands.
         frames : mapping of str to Frame, optional
             Poses of the objects from now on.
-        **more
+        told, ages
             As for :meth:`Controller.step`.
         """
-        command = self.controller.step(dt, joints, frames, **more)
-        self._since += dt
+        self.command = self.controller.step(dt, joints, frames, told=told, ages=ages)
+        passed = float(dt)
+        self._since += passed if 0 < passed < math.inf else 0.0
         if self._model.n_modes_ > 1 and self._since >= LOOK and not self.finished:
             self._since = 0.0
-            self._compare(joints)
-        return command
+            self._compare()
+        return self.command
 
-    def _compare(self, joints: Any) -> None:
+    def copy(self) -> Self:
+        """As :meth:`Controller.copy`."""
+        other = copy.copy(self)
+        other.controller = self.controller.copy()
+        return other
+
+    def ahead(self) -> Self:
+        """As :meth:`Controller.ahead`; where nothing is moved, the mode stays."""
+        other = copy.copy(self)
+        other.controller, other._since = self.controller.ahead(), -math.inf
+        return other
+
+    def resumed(
+        self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
+    ) -> Self:
+        """As :meth:`Controller.resumed`."""
+        other, controller = copy.copy(moment), self.controller
+        other.controller = controller.resumed(moment.controller, passed, joints, frames)
+        other._since = self._since + passed
+        return other
+
+    def _compare(self) -> None:
         """Go over to another mode from the next step on, if it is far likelier."""
         model, places = self._model, dict(self.controller.holding.frames)
-        here = (
-            self.reference
-            if joints is None
-            else model.models_[0].kinematics_.joint_tensor(joints)
-        )
-        here = torch.where(here.isnan(), self.reference, here)
+        here, measured = self.reference, self.controller.measured
+        if measured is not None:
+            here = torch.where(measured.isnan(), here, measured)
         times = [self._progress(k) for k in range(model.n_modes_)]
-        now = Situation(here, places)
         if _moved(self._seen, places):
             self._seen = places
-            self._misfit = np.array(
-                [model._misfits(k, [now], at)[0] for k, at in enumerate(times)]
-            )
-        there = [
-            model._excess(k, here.new_tensor([at]), here[None], places)
-            for k, at in enumerate(times)
-        ]
-        begun = Situation(self._start, places)
-        novelty = np.array([_novelty(one, begun) for one in model.models_])
-        self.choice = ModeChoice.of(model.weights_, novelty, self._misfit + np.array(there))
+            self._try_out(here, places, times)
+        # where the mode itself sends the robot is nothing against it
+        asked, allowed = self.controller.command, np.zeros(model.n_modes_)
+        if asked is not None and bool(asked.estimate.joints.isfinite().all()):
+            joints, at = asked.estimate.joints[None], here.new_tensor([times[self.mode]])
+            allowed[self.mode] = model._excess(self.mode, at, joints, places)
+        self._weigh(here, places, times, allowed)
         chances = self.choice.probabilities
         if chances[self.choice.mode] > CLEARLY * chances[self.mode]:
             self._switch(self.choice.mode, times[self.choice.mode], places)
+
+    def _look_where_it_begins(self, joints: Tensor, frames: Mapping[str, Frame]) -> None:
+        """Choose by where the robot stands too, if the clock finds it in the middle."""
+        times = []
+        for model in self._model.models_:
+            first, last = float(model.time_[0]), float(model.time_[-1])
+            places = model._completed(joints, frames)
+            begun = self._clock.start(model.regression(), first, last, joints, places)
+            times.append(float(begun.time))
+            self._midway |= times[-1] > first + START * (last - first)
+        if self._midway:
+            self._try_out(joints, frames, times)
+            self._weigh(joints, frames, times)
+
+    def _try_out(
+        self, here: Tensor, frames: Mapping[str, Frame], times: Sequence[float]
+    ) -> None:
+        """Whether each mode can be done from its time on."""
+        now = Situation(here, frames)
+        misfits = [self._model._misfits(k, [now], at) for k, at in enumerate(times)]
+        self._misfit = np.concatenate(misfits)
+
+    def _weigh(
+        self,
+        here: Tensor,
+        frames: Mapping[str, Frame],
+        times: Sequence[float],
+        allowed: Array | float = 0.0,
+    ) -> None:
+        """Compare modes, in each of which the robot is ``here`` at a time.
+
+        So much less likely than any demonstration as ``allowed`` it may be.
+        """
+        model, begun = self._model, Situation(self._start, frames)
+        there = [
+            model._excess(k, here.new_tensor([at]), here[None], frames)
+            for k, at in enumerate(times)
+        ]
+        novelty = np.array([_novelty(one, begun, self._midway) for one in model.models_])
+        # the posture is a moment of the motion that was tried out
+        misfit = np.maximum(self._misfit, np.array(there) - allowed)
+        self.choice = ModeChoice.of(model.weights_, novelty, misfit)
 
     def _switch(self, mode: int, time: float, frames: Mapping[str, Frame]) -> None:
         """From the next step on the robot goes another way."""
@@ -591,6 +708,161 @@ class MultimodalController:
         return float(grid[0]) + share * float(grid[-1] - grid[0])
 
 
+class MultimodalControllers:
+    """A batch of robots that run a skill of several ways, each of them in its own.
+
+    Parameters
+    ----------
+    model, frames, clock, settings
+        As for :class:`MultimodalController`.
+    joints : Tensor of shape (..., n_joints)
+        The start postures.
+
+    Attributes
+    ----------
+    controllers : list of MultimodalController
+        One for each robot.
+    command : Command or None
+        What the last step returned.
+    """
+
+    def __init__(
+        self,
+        model: MultimodalTaskParameterizedGMM,
+        joints: Tensor,
+        frames: Mapping[str, Frame],
+        clock: Clock,
+        settings: Mapping[str, Any],
+    ) -> None:
+        self._parts = _Parts(joints.shape[:-1])
+        self.command: Command | None = None
+        starts = joints.reshape(-1, joints.shape[-1])
+        pairs = list(zip(starts, self._parts.of_frames(frames), strict=True))
+        choices = model.choose([Situation(*pair) for pair in pairs])
+        self.controllers = [
+            MultimodalController(model, *pair, clock, settings, choice)
+            for pair, choice in zip(pairs, choices, strict=True)
+        ]
+
+    @property
+    def modes(self) -> NDArray[np.intp]:
+        """In which each robot goes (...)."""
+        modes = np.array([one.mode for one in self.controllers], dtype=np.intp)
+        return modes.reshape(self._parts.batch)
+
+    @property
+    def reference(self) -> Tensor:
+        """The last references (..., n_joints); the start postures before the first step."""
+        return self._parts.joined([one.reference for one in self.controllers])
+
+    @property
+    def time(self) -> Tensor:
+        """Progress of each robot in its mode (...) [s]."""
+        return self._parts.joined([one.time for one in self.controllers])
+
+    @property
+    def finished(self) -> bool:
+        """Whether all robots are at the end."""
+        return all(one.finished for one in self.controllers)
+
+    def step(
+        self,
+        dt: float | Tensor,
+        joints: Any = None,
+        frames: Mapping[str, Any] | None = None,
+        *,
+        told: Mapping[str, str | None] | None = None,
+        ages: Mapping[str, float] | None = None,
+    ) -> Command:
+        """As :meth:`Controller.step`."""
+        parts = self._parts
+        stand, places = parts.of_joints(joints), parts.of_frames(frames)
+        seconds = torch.as_tensor(dt, dtype=torch.float64).expand(parts.batch).flatten()
+        commands = [
+            one.step(passed, at, place, told=told, ages=ages)
+            for one, passed, at, place in zip(
+                self.controllers, seconds.tolist(), stand, places, strict=True
+            )
+        ]
+        self.command = Command.stack(commands, parts.batch)
+        return self.command
+
+    def copy(self) -> Self:
+        """As :meth:`Controller.copy`."""
+        return self._like([one.copy() for one in self.controllers])
+
+    def ahead(self) -> Self:
+        """As :meth:`Controller.ahead`."""
+        return self._like([one.ahead() for one in self.controllers])
+
+    def resumed(
+        self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
+    ) -> Self:
+        """As :meth:`Controller.resumed`."""
+        told = self._parts.of_joints(joints), self._parts.of_frames(frames)
+        pairs = zip(self.controllers, moment.controllers, *told, strict=True)
+        return moment._like([one.resumed(then, passed, *here) for one, then, *here in pairs])
+
+    def _like(self, controllers: list[MultimodalController]) -> Self:
+        other = copy.copy(self)
+        other.controllers = controllers
+        return other
+
+
+class _Parts:
+    """What is told of a batch of robots, divided among them."""
+
+    def __init__(self, batch: Sequence[int]) -> None:
+        self.batch, self._robots = tuple(batch), list(np.ndindex(*batch))
+
+    def joined(self, values: Sequence[Tensor]) -> Tensor:
+        """Values (...) of each robot as those of the batch."""
+        return torch.stack([*values]).reshape(*self.batch, *values[0].shape)
+
+    def of_joints(self, joints: Any) -> list[Tensor | None]:
+        """Of each robot (n_joints,); None if nothing was measured.
+
+        Raises
+        ------
+        ShapeError
+            If there are more or fewer robots.
+        """
+        if joints is None:
+            return [None] * len(self._robots)
+        tensor = torch.as_tensor(joints)
+        if tensor.shape[:-1] != self.batch:
+            raise ShapeError(
+                f"the skill began with robots of shape {self.batch}, now there are joints of "
+                f"shape {tuple(tensor.shape)}: begin it anew for other robots"
+            )
+        return [tensor[robot] for robot in self._robots]
+
+    def of_frames(self, frames: Mapping[str, Any] | None) -> list[Any]:
+        """Of each robot: a mapping of str to its pose, or None."""
+        if frames is None:
+            return [None] * len(self._robots)
+        poses = {name: self._of_frame(name, frame) for name, frame in frames.items()}
+        return [
+            {name: each[number] for name, each in poses.items()}
+            for number in range(len(self._robots))
+        ]
+
+    def _of_frame(self, name: str, frame: Any) -> list[Any]:
+        try:
+            if frame is None:
+                return [None] * len(self._robots)
+            if not isinstance(frame, Frame):
+                poses = torch.as_tensor(frame)
+                return list(poses.expand(*self.batch, poses.shape[-1]).flatten(0, -2))
+            whole = frame.expand(self.batch)
+            return [whole[robot] for robot in self._robots]
+        except RuntimeError as error:
+            raise ShapeError(
+                f"the skill began with robots of shape {self.batch}, frame {name!r} now has "
+                f"another: {error}"
+            ) from error
+
+
 def _silent(model: TaskParameterizedGMM) -> TaskParameterizedGMM:
     """The model without warnings: who asks for the mode that is chosen will have them."""
     model = copy.copy(model)
@@ -598,14 +870,18 @@ def _silent(model: TaskParameterizedGMM) -> TaskParameterizedGMM:
     return model
 
 
-def _novelty(model: TaskParameterizedGMM, situation: Situation) -> float:
-    """Of a situation to one mode, where it begins; 0 if it does not know what it was shown."""
+def _novelty(model: TaskParameterizedGMM, situation: Situation, midway: bool = False) -> float:
+    """Of a situation to one mode, where it begins; 0 if it does not know what it was shown.
+
+    Who begins in the middle of the skill stands where nobody starts, which says nothing.
+    """
     if model.shown_ is None or model.shown_.novelty is None:
         return 0.0
     situation = situation.reordered(model.kinematics_.joint_names)
     complete = model._completed(situation.joints, situation.frames)
     first = {n: f[0] if f.batch_shape else f for n, f in complete.items()}
-    return float(model.shown_.novelty.ratio(situation.joints, first))
+    joints = torch.full_like(situation.joints, torch.nan) if midway else situation.joints
+    return float(model.shown_.novelty.ratio(joints, first))
 
 
 def _recorded(situation: Situation, time: Tensor) -> Tensor | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
@@ -18,6 +18,7 @@ from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import (
     Hold,
     Kinematics,
+    MultimodalTaskParameterizedGMM,
     OneEuro,
     Operator,
     Robot,
@@ -27,6 +28,7 @@ from tpgmm_torch import (
     parse_clock,
 )
 from tpgmm_torch.alignment.text import METHODS
+from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators.text import format_operator, parse_operator
@@ -34,7 +36,18 @@ from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.plausibility import Shown
 from tpgmm_torch.structure.parts import parse_parts
 
-__all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
+__all__ = [
+    "FITTED",
+    "Skill",
+    "StatePolicyConfig",
+    "TPGMMConfig",
+    "Way",
+    "models_of",
+    "state_features",
+]
+
+#: What is learned: one way of a skill, or several.
+Skill = TaskParameterizedGMM | MultimodalTaskParameterizedGMM
 
 #: Parameters of the estimator that go into the configuration under their own names.
 HYPERPARAMETERS = (
@@ -56,6 +69,40 @@ CHOICES = {
     "learn_from": ("measured", "commanded"),
     "loss": ("likelihood", "imitation"),
 }
+
+
+@dataclass
+class Way:
+    """One of the ways in which a policy does a skill: what :class:`TPGMMConfig` has for one.
+
+    Parameters
+    ----------
+    n_components, operators, n_steps, parts, holds, via_points, via_fade, shown, peaks
+        As there.
+    weight, limit : float
+        As in :class:`tpgmm_torch.MultimodalTaskParameterizedGMM`, a number of each.
+    episodes : list of int
+        The demonstrations that show this way.
+    """
+
+    n_components: int
+    operators: list[dict[str, Any] | str]
+    n_steps: int
+    parts: str | None
+    holds: list[str] | None
+    via_points: list[str] | None
+    via_fade: float
+    shown: dict[str, Any] | None
+    peaks: list[list[float]] | None
+    weight: float
+    limit: float
+    episodes: list[int]
+
+
+#: Fields that a fit fills in; where there are several ways, those of each.
+FITTED = tuple(
+    each.name for each in fields(Way) if each.name not in ("weight", "limit", "episodes")
+)
 
 
 @dataclass
@@ -143,6 +190,11 @@ class TPGMMConfig(StatePolicyConfig):
     peaks : list of two lists of float, optional
         Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
         the bounds of what neither the robot nor the user bounds.
+    modes : "auto" or int, default=1
+        In how many ways the skill is done, each a model of its own; "auto" finds it. A fitted
+        policy chooses one by the situation, and changes it while several are open.
+    ways : list of Way, optional
+        Of a policy that is fitted and has several: what each has in place of the fields above.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -257,6 +309,8 @@ class TPGMMConfig(StatePolicyConfig):
     n_steps: int = 0
     shown: dict[str, Any] | None = None
     peaks: list[list[float]] | None = None
+    modes: int | str = 1
+    ways: list[Way] = field(default_factory=list)
 
     state_names: list[str] | None = None
     action_names: list[str] | None = None
@@ -326,6 +380,42 @@ class TPGMMConfig(StatePolicyConfig):
             parse_event(text)
         self.control()
         self.estimator(None, ()).check_parameters()
+        check_parameters(MultimodalTaskParameterizedGMM(modes=self.modes))
+        self._check_ways()
+
+    def _check_ways(self) -> None:
+        """Whether nothing is said of all ways that is of each one."""
+        if self.ways:
+            wrong = [name for name, none in _unfitted().items() if getattr(self, name) != none]
+            if wrong:
+                raise DataError(
+                    f"the policy has {len(self.ways)} ways, each with its own "
+                    f"{', '.join(wrong)}: fit again to change them"
+                )
+        ways = self.each_way()  # each of them is checked
+        if self.fitted and self.modes != len(ways):
+            raise DataError(
+                f"the policy is fitted, modes={len(ways)}, got {self.modes!r}: train a new one "
+                "for another number of ways"
+            )
+
+    @property
+    def fitted(self) -> bool:
+        """Whether what a fit fills in is there."""
+        return bool(self.n_steps or self.ways)
+
+    def each_way(self) -> list[TPGMMConfig]:
+        """A configuration for each way, with what is its own in its place.
+
+        Raises
+        ------
+        DataError, InvalidParameterError
+            If a value is none that exists.
+        """
+        return [
+            replace(self, modes=1, ways=[], **{name: getattr(way, name) for name in FITTED})
+            for way in self.ways
+        ] or [self]
 
     @property
     def rate(self) -> float:
@@ -403,22 +493,23 @@ class TPGMMConfig(StatePolicyConfig):
         self.kinematics()  # what cannot be read back is refused now
         self.decoded_operators()
 
-    def note(self, model: TaskParameterizedGMM) -> None:
-        """Write down what a fitted model is beside its mixture."""
-        self.n_steps = len(model.time_)
-        # with the paths that it found
-        self.operators = [_description(operator) for operator in model.operators_]
-        self.parts = ",".join(f"{part.begin:.6g}" for part in model.parts_[1:]) or None
-        self.holds = list(map(str, model.holds_))
-        self.via_points = list(map(str, model.via_points_)) or None
-        self.via_fade = model.via_fade_
-        for text, point in zip(self.via_points or (), model.via_points_, strict=True):
-            if ViaPoint.parse(text) != point:
-                raise DataError(f"the via-point {text} is of an operator that has no text")
-        self.shown = None if model.shown_ is None else model.shown_.config()
-        self.peaks = None
-        if model.acceleration_ is not None and model.jerk_ is not None:
-            self.peaks = [model.acceleration_.tolist(), model.jerk_.tolist()]
+    def note(self, model: Skill) -> None:
+        """Write down what a fitted model is beside its mixtures."""
+        fitted = [_noted(one) for one in models_of(model)]
+        self.modes, self.ways = len(fitted), []
+        if isinstance(model, MultimodalTaskParameterizedGMM) and self.modes > 1:
+            self.ways = [
+                Way(
+                    **own,
+                    weight=float(model.weights_[mode]),
+                    limit=float(model.limits_[mode]),
+                    episodes=(model.labels_ == mode).nonzero()[0].tolist(),
+                )
+                for mode, own in enumerate(fitted)
+            ]
+            fitted = [_unfitted()]
+        for name, value in fitted[0].items():
+            setattr(self, name, value)
 
     def recall(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
         """The inverse of :meth:`note`, for a model made of a mixture; it is changed."""
@@ -431,12 +522,36 @@ class TPGMMConfig(StatePolicyConfig):
             return model.with_via_points(self.via_points, self.via_fade)
         return model
 
+    def joined(self, models: Sequence[TaskParameterizedGMM]) -> Skill:
+        """The skill, of the models of its ways.
+
+        Raises
+        ------
+        DataError
+            If they do not fit together.
+        """
+        if not self.ways:
+            [model] = models
+            return model
+        labels = {
+            episode: mode for mode, way in enumerate(self.ways) for episode in way.episodes
+        }
+        count = sum(len(way.episodes) for way in self.ways)
+        if labels.keys() != set(range(count)):
+            raise DataError("ways: each episode shows one of them, and none is left out")
+        return MultimodalTaskParameterizedGMM.from_models(
+            models,
+            [way.weight for way in self.ways],
+            [way.limit for way in self.ways],
+            [labels[episode] for episode in range(count)],
+        )
+
     def via_operators(self) -> list[Operator]:
         """Whose coordinates the via-points are."""
         return [ViaPoint.parse(text).operator for text in self.via_points or ()]
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
-        """An unfitted estimator of these hyper-parameters."""
+        """An unfitted estimator of these hyper-parameters, for one way."""
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
         settings["parts"] = parse_parts(self.parts)
         settings["holds"] = "auto" if self.holds is None else list(map(Hold.parse, self.holds))
@@ -455,6 +570,38 @@ class TPGMMConfig(StatePolicyConfig):
     def get_optimizer_preset(self) -> AdamConfig:
         """Adam, without weight decay."""
         return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0)
+
+
+def models_of(skill: Skill) -> list[TaskParameterizedGMM]:
+    """The models of the ways of a fitted skill."""
+    return [skill] if isinstance(skill, TaskParameterizedGMM) else skill.models_
+
+
+def _noted(model: TaskParameterizedGMM) -> dict[str, Any]:
+    """The fields ``FITTED`` of a model of one way."""
+    via_points = list(map(str, model.via_points_))
+    for text, point in zip(via_points, model.via_points_, strict=True):
+        if ViaPoint.parse(text) != point:
+            raise DataError(f"the via-point {text} is of an operator that has no text")
+    peaks = None
+    if model.acceleration_ is not None and model.jerk_ is not None:
+        peaks = [model.acceleration_.tolist(), model.jerk_.tolist()]
+    return {
+        "n_components": model.n_components_,
+        "operators": list(map(_description, model.operators_)),  # with the paths that it found
+        "n_steps": len(model.time_),
+        "parts": ",".join(f"{part.begin:.6g}" for part in model.parts_[1:]) or None,
+        "holds": list(map(str, model.holds_)),
+        "via_points": via_points or None,
+        "via_fade": model.via_fade_,
+        "shown": None if model.shown_ is None else model.shown_.config(),
+        "peaks": peaks,
+    }
+
+
+def _unfitted() -> dict[str, Any]:
+    """The fields ``FITTED`` where no fit has filled them in."""
+    return {each.name: each.default for each in fields(TPGMMConfig) if each.name in FITTED}
 
 
 def _description(operator: Operator) -> dict[str, Any] | str:

@@ -6,6 +6,7 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,8 +19,11 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import (
+    FITTED,
     HYPERPARAMETERS,
+    Skill,
     TPGMMConfig,
+    models_of,
     state_features,
 )
 from lerobot_policy_tpgmm.control_rate import check_rate
@@ -33,8 +37,9 @@ from lerobot_policy_tpgmm.observations import (
 )
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
 from lerobot_policy_tpgmm.training.learner import Learner
-from tpgmm_torch import Controller, TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
+from tpgmm_torch.control.controller import SkillController
 from tpgmm_torch.exceptions import (
     DataError,
     ModelFileError,
@@ -65,9 +70,9 @@ class Chunk:
 
     Parameters
     ----------
-    first : Controller
+    first : SkillController
         After its first action: what it was told last.
-    moments : list of Controller
+    moments : list of SkillController
         After each of its actions.
     joints : Tensor of shape (B, chunk_size, n_joints)
         The references.
@@ -78,8 +83,8 @@ class Chunk:
         Actions per second.
     """
 
-    first: Controller
-    moments: list[Controller]
+    first: SkillController
+    moments: list[SkillController]
     joints: Tensor
     actions: Tensor
     timestamp: float | None
@@ -129,6 +134,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     config_class = TPGMMConfig
     name = "tpgmm"
 
+    mixture: MixtureParameters
+
     def __init__(
         self,
         config: TPGMMConfig,
@@ -139,9 +146,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         super().__init__(config)
         self.config = config
         if dataset_meta is not None:
-            (check_dataset if config.n_steps else adopt)(config, dataset_meta)
-        kinematics, operators = config.kinematics(), config.decoded_operators()
-        if kinematics is None or operators is None:
+            (check_dataset if config.fitted else adopt)(config, dataset_meta)
+        kinematics, ways = config.kinematics(), config.each_way()
+        operators = [one for way in ways for one in way.decoded_operators() or ()]
+        if kinematics is None or not operators:
             raise DataError(
                 "a policy that is not fitted needs a data set to be trained on: lerobot-train "
                 "--policy.type=tpgmm --dataset.root=..., or TPGMMPolicy.from_estimator(model), "
@@ -149,21 +157,21 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         config.validate_features()
         self.kinematics = kinematics.to(getattr(torch, config.dtype))
-        self.operators = tuple(operators)
-        required = frame_names([*operators, *config.via_operators()], self.kinematics)
+        needed = [
+            frame_names([*(way.decoded_operators() or ()), *way.via_operators()], kinematics)
+            for way in ways
+        ]
+        required = list(dict.fromkeys(chain(*needed)))
         # an object that only stands where links do is told from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
         known |= {*(config.frames or ()), *poses_named(config.environment_names)}
         known |= {*poses_named(config.state_names)}
         for operator in operators:
             operator.check(self.kinematics, known - set(self.kinematics.links))
-        dimensions = [operator.dimension(self.kinematics) for operator in operators]
-        self.mixture = MixtureParameters(
-            config.n_components, dimensions, config.n_steps, getattr(torch, config.dtype)
-        )
+        self._make_mixtures()
         names = self.kinematics.joint_names
         state_names = config.state_names or names
-        if config.n_steps:  # the robot at hand may state more than the data set did
+        if config.fitted:  # the robot at hand may state more than the data set did
             size = (len(state_names),)
             config.input_features[OBS_STATE] = PolicyFeature(FeatureType.STATE, size)
         self._check_size("state_names", state_names, config.robot_state_feature)
@@ -173,7 +181,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         environment = config.env_state_feature
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names
-        told = observed_frames(config, required)
+        told = list(dict.fromkeys(chain(*map(observed_frames, ways, needed))))
         default = config.default_environment_state
         self.frames = FrameFeatures(told, config.frames, *named, default, width)
         self._learner: Learner | None = None
@@ -184,11 +192,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             self._learner = Learner(
                 config,
                 self.kinematics,
-                self.operators,
+                operators,
                 self.mixture,
                 self.joints,
                 shown,
                 dataset_meta,
+                self._become,
             )
         self.reset()
 
@@ -201,10 +210,38 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"another robot? Else name the entries in order, --policy.{field}='[...]'"
             )
 
+    def _make_mixtures(self) -> None:
+        """A mixture for each way that has none yet.
+
+        That of the first is ``mixture``, as if it were the only one, and others are
+        ``mixture_1``, ``mixture_2``, ...
+        """
+        for number, way in enumerate(self.config.each_way()):
+            name = f"mixture_{number}" if number else "mixture"
+            if not hasattr(self, name):
+                operators = way.decoded_operators() or ()
+                dimensions = [one.dimension(self.kinematics) for one in operators]
+                dtype = getattr(torch, self.config.dtype)
+                made = MixtureParameters(way.n_components, dimensions, way.n_steps, dtype)
+                self.add_module(name, made)
+
+    @property
+    def mixtures(self) -> list[MixtureParameters]:
+        """Of each way."""
+        return [module for module in self.children() if isinstance(module, MixtureParameters)]
+
+    def _become(self, model: Skill) -> None:
+        """Take over what a fitted model is."""
+        self.config.note(model)
+        self._make_mixtures()
+        for mixture, one in zip(self.mixtures, models_of(model), strict=True):
+            mixture.copy_from(one)
+        self.to(self.mixture.time.device)
+
     @classmethod
     def from_estimator(
         cls,
-        model: TaskParameterizedGMM,
+        model: Skill,
         *,
         fps: float | None = None,
         state_names: Sequence[str] | None = None,
@@ -217,7 +254,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
         Parameters
         ----------
-        model : TaskParameterizedGMM
+        model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
             Fitted.
         fps : float, optional
             Steps per second; by default those of the model's time grid.
@@ -241,23 +278,25 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         if not hasattr(model, "weights_"):
             raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
-        kinematics, time = model.kinematics_, model.time_
+        models = models_of(model)
+        kinematics, time = models[0].kinematics_, models[0].time_
         if fps is None and len(time) > 1:
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        settings = {name: getattr(model, name) for name in HYPERPARAMETERS}
-        settings["n_components"] = model.n_components_
-        if not isinstance(settings["random_state"], int):
-            settings["random_state"] = None
+        settings, *others = map(_settings, models)
+        if differ := [n for n in settings if any(one[n] != settings[n] for one in others)]:
+            raise DataError(f"all ways of a policy have the same settings; {differ} differ")
         config = TPGMMConfig(
             **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
         )
+        config.describe(kinematics, models[0].operators_)
         config.note(model)
         config.state_names = list(state_names or kinematics.joint_names)
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
-        config.describe(kinematics, model.operators_)
-        told = observed_frames(config, model.frame_names_)
+        pairs = zip(config.each_way(), models, strict=True)
+        told = [name for way, one in pairs for name in observed_frames(way, one.frame_names_)]
+        told = list(dict.fromkeys(told))
         poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
         given = frames or {}
         order = [name for name in poses.in_environment if name not in given]
@@ -273,20 +312,22 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
         policy = cls(config)
-        policy.mixture.copy_from(model)
+        policy._become(model)
         return policy.eval().to(config.device)
 
-    def to_estimator(self) -> TaskParameterizedGMM:
-        """The fitted model that the policy is."""
-        device = self.mixture.time.device
+    def to_estimator(self) -> Skill:
+        """The fitted model that the policy is; of several ways, one of them all."""
+        device, models = self.mixture.time.device, []
         kinematics = self.kinematics.to(device=device)
-        model = self.config.estimator(kinematics, self.config.decoded_operators())
-        model.device = str(device)
-        return self.config.recall(self.mixture.to_estimator(model))
+        for way, mixture in zip(self.config.each_way(), self.mixtures, strict=True):
+            model = way.estimator(kinematics, way.decoded_operators())
+            model.device = str(device)
+            models.append(way.recall(mixture.to_estimator(model)))
+        return self.config.joined(models)
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
-        self._controller: Controller | None = None
+        self._controller: SkillController | None = None
         self._chunk: Chunk | None = None
         self._timestamp: Tensor | None = None
 
@@ -370,7 +411,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
         return True
 
-    def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
+    def _begin(self, batch: Mapping[str, Tensor]) -> SkillController:
         check_rate(batch, self.config.rate)
         model = self.to_estimator()
         self._timestamp = None
@@ -380,7 +421,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return model.controller(joints, frames, **self.config.control())
 
     def _told(
-        self, batch: Mapping[str, Tensor], controller: Controller
+        self, batch: Mapping[str, Tensor], controller: SkillController
     ) -> tuple[Tensor | None, dict[str, Any] | None]:
         """Joints and poses that a controller is told."""
         shape, config, measured = controller.reference.shape, self.config, self._observed(batch)
@@ -398,7 +439,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return measured if config.closed_loop else None, poses or None
 
     def _step(
-        self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
+        self, controller: SkillController, batch: Mapping[str, Tensor], passed: Any = None
     ) -> Tensor:
         """The references (B, n_joints) of the next action."""
         start, first = controller.reference, controller.command is None
@@ -471,8 +512,12 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return super().train(mode)
 
     def get_optim_params(self) -> Any:
-        """What gradient training changes: the mixture."""
-        return self.parameters()
+        """What gradient training changes: the mixture of one way.
+
+        Others are found when there is an optimizer already, and a run that is resumed has to
+        find in it as many parameters as before.
+        """
+        return self.mixture.parameters()
 
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
@@ -558,3 +603,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             model.config.rate,
         )
         return model
+
+
+def _settings(model: TaskParameterizedGMM) -> dict[str, Any]:
+    """What goes into a configuration under its own name, but what a fit fills in."""
+    settings = {name: getattr(model, name) for name in HYPERPARAMETERS if name not in FITTED}
+    if not isinstance(settings["random_state"], int):
+        settings["random_state"] = None
+    return settings

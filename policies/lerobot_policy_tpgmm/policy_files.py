@@ -137,7 +137,7 @@ def read_tensors(file: str, expected: Mapping[str, Tensor]) -> dict[str, Tensor]
             f"{file} does not belong to the configuration beside it: {'; '.join(wrong)}. Was "
             "n_components, the robot or an operator changed? Fit again"
         )
-    if not bool(tensors["mixture.fitted"]):
+    if not all(bool(value) for name, value in tensors.items() if name.endswith(".fitted")):
         raise ModelFileError(
             f"{file} holds a policy that was saved before it was fitted: train it to the end "
             "of the first epoch"

@@ -43,7 +43,7 @@ def test_a_data_set_completes_a_configuration():
     assert made.environment_names == POSE and not made.units
     assert set(made.input_features) == {STATE, ENVIRONMENT}
     assert made.kinematics() == fitted().kinematics
-    assert made.decoded_operators() == list(fitted().operators)
+    assert made.decoded_operators() == fitted().config.decoded_operators()
     assert "<robot" in made.robot["config"]["urdf"]
     policy = TPGMMPolicy(made)
     assert policy.frames.in_environment == {"bottle": [*range(7)]}

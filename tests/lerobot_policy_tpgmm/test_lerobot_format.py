@@ -12,11 +12,21 @@ from tests.support.command_line import output, refusal
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tests.support.two_ways import ARM, Handles, two_ways_set
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import Demonstration, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    MultimodalTaskParameterizedGMM,
+    TaskParameterizedGMM,
+)
 
 NAMES = fitted().kinematics.joint_names
 POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+
+BOTTLE = (
+    "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand", "--n-components", 30,
+    "--format", "lerobot",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -25,10 +35,7 @@ def directory(tmp_path_factory):
     folder = tmp_path_factory.mktemp("fitted")
     shaking = replace(generator(), steady_rhythm=True)
     save_lerobot(shaking.demonstrations(10, seed=0), folder / "set", fps=20, task="shake")
-    printed = output(
-        "fit", folder / "set", "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand",
-        "--n-components", 30, "--out", folder / "policy", "--format", "lerobot",
-    )  # fmt: skip
+    printed = output("fit", folder / "set", *BOTTLE, "--out", folder / "policy")
     assert printed.endswith(f"{folder / 'policy'}\n")
     return folder / "policy"
 
@@ -89,15 +96,44 @@ def test_a_skill_in_parts_is_the_models_controller(tmp_path):
     assert float(command.time) > model.parts_[-1].begin and float(moved.abs().max()) > 0.2
 
 
+def test_several_ways_are_one_policy(tmp_path):
+    two_ways_set(tmp_path)
+    arguments = (
+        "fit", tmp_path / "set", "--robot", tmp_path / "arm.urdf", "--link", "tip",
+        "--operator", "position:tip@object", "--operator", "canonical",
+        "--alignment", "none", "--n-components", 8, "--modes", "auto", "--out",
+    )  # fmt: skip
+    output(*arguments, tmp_path / "model")
+    text = output(*arguments, tmp_path / "policy", "--format", "lerobot")
+    assert "2 ways:" in text and text.endswith(f"saved            {tmp_path / 'policy'}\n")
+    policy = TPGMMPolicy.from_pretrained(tmp_path / "policy")
+    assert policy.config.modes == 2 and policy.config.fps == 20
+    assert tuple(policy.config.state_names) == ARM.joint_names
+    model = MultimodalTaskParameterizedGMM.load(tmp_path / "model")
+    given = Handles().situations(3, 0)
+    for one, other in zip(
+        policy.to_estimator().predict(given), model.predict(given), strict=True
+    ):
+        torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-9)
+
+
 def test_an_unknown_format_is_refused(tmp_path):
     line = refusal("fit", tmp_path, "--out", tmp_path / "out", "--format", "onnx")
     assert "format 'onnx' is not known here; there are ['lerobot', 'tpgmm']" in line
     assert "pip install lerobot_policy_tpgmm" in line
 
 
-def test_lerobot_eval_runs_it(directory, tmp_path):
+@pytest.mark.parametrize("modes", [1, 2])
+def test_lerobot_eval_runs_it(directory, tmp_path, modes):
+    path = directory
+    if modes > 1:
+        path = tmp_path / "policy"
+        text = output(
+            "fit", directory.parent / "set", *BOTTLE, "--modes", modes, "--out", path,
+        )  # fmt: skip
+        assert "2 ways:" in text
     done = lerobot(
-        "eval", f"--policy.path={directory}", "--env.type=bottle_shaking", "--env.fps=20",
+        "eval", f"--policy.path={path}", "--env.type=bottle_shaking", "--env.fps=20",
         "--env.mode=kinematic", "--eval.n_episodes=2", "--eval.batch_size=2",
         "--eval.use_async_envs=false", f"--output_dir={tmp_path / 'out'}", home=tmp_path,
     )  # fmt: skip

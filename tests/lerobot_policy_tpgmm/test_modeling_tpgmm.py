@@ -23,6 +23,7 @@ from tests.support.policies import (
     played,
     policy,
     pose,
+    seen,
     situations,
 )
 from tests.support.skills import (
@@ -30,12 +31,23 @@ from tests.support.skills import (
     bottle_model,
     canonical,
     cups,
+    handlings,
     hands,
+    hands_model,
     new_handling,
     small_bottle,
     waves,
 )
-from tpgmm_torch import Canonical, Frame, RelativePosition, Situation, TaskParameterizedGMM
+from tests.support.two_ways import Handles, another_handle_each, tip
+from tests.support.two_ways import fitted as ways
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    MultimodalTaskParameterizedGMM,
+    RelativePosition,
+    Situation,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import (
     DataError,
@@ -48,6 +60,9 @@ from tpgmm_torch.exceptions import (
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
 RATE = 20.0
 STEPS = len(small_bottle().time_)
+
+
+FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
 
 
 def predicted(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
@@ -436,3 +451,84 @@ def test_what_is_held_is_part_of_the_policy(tmp_path):
     assert_close(loaded._controller.holding.frames["bottle"].position, there, 1e-4)
     with pytest.raises(DataError, match=r"hold 'bottle' is not of the form"):
         TPGMMConfig(holds=["bottle"])
+
+
+# Several ways
+
+
+@pytest.mark.filterwarnings(FAR)
+def test_of_several_ways_each_robot_goes_the_one_that_suits(tmp_path):
+    model, given = ways(Handles), another_handle_each()
+    TPGMMPolicy.from_estimator(model).save_pretrained(tmp_path)
+    acting, observed = TPGMMPolicy.from_pretrained(tmp_path), seen(given)
+    period = 1 / acting.config.rate
+    for _ in range(2):  # what was done before a reset leaves nothing behind
+        acting.reset()
+        now, at = dict(observed), observed[ENVIRONMENT].double()
+        controllers = [
+            model.controller(
+                now[STATE][robot].double(),
+                {"object": Frame(at[robot, :3], at[robot, 3:])},
+                **acting.config.control(),
+            )
+            for robot in range(2)
+        ]
+        for tick in range(75):
+            with torch.inference_mode():
+                action = acting.select_action(now)
+            for robot, one in enumerate(controllers):
+                place = {"object": at[robot]} if tick else None
+                command = one.step(period, now[STATE][robot].double(), place)
+                wanted = command.reference.float()
+                torch.testing.assert_close(action[robot], wanted, rtol=0, atol=1e-9)
+            now[STATE] = action
+        assert [one.mode for one in controllers] == [1, 0]
+        for joints, situation in zip(now[STATE].double(), given, strict=True):
+            handles = Handles().handles(situation.frames["object"])
+            assert float((tip(joints) - handles).norm(dim=-1).min()) < 0.015
+
+
+def act_following(acting: TPGMMPolicy, observed: dict, steps: int) -> torch.Tensor:
+    """Actions (B, steps, n) for robots that are where they were sent."""
+    acting.reset()
+    actions = [observed[STATE]]
+    for _ in range(steps):
+        actions.append(acting.select_action({**observed, STATE: actions[-1]}))
+    return torch.stack(actions[1:], dim=1)
+
+
+@pytest.mark.filterwarnings(FAR)
+def test_a_chunk_goes_one_way_and_the_next_may_go_another():
+    given = another_handle_each()
+    acting = TPGMMPolicy.from_estimator(ways(Handles), chunk_size=10)
+    observed, swapped = seen(given), seen(given[::-1])
+    whole = act_following(acting, observed, 10)
+    with torch.inference_mode():
+        acting.reset()
+        chunk = acting.predict_action_chunk(observed)
+        assert_close(chunk, whole.double())
+        # its object is where the other robot's was, whom it reaches at another handle only
+        moved = {STATE: chunk[:, -1], ENVIRONMENT: swapped[ENVIRONMENT]}
+        gaps = []
+        for _ in range(8):
+            moved[STATE] = acting.predict_action_chunk(moved)[:, -1]
+    for joints, situation in zip(moved[STATE].double(), given[::-1], strict=True):
+        handles = Handles().handles(situation.frames["object"])
+        gaps.append(float((tip(joints) - handles).norm(dim=-1).min()))
+    assert min(gaps) < 0.015
+
+
+def test_one_way_that_is_found_is_a_policy_as_any_other():
+    found = MultimodalTaskParameterizedGMM(hands_model()).fit(handlings(4))
+    [model] = found.models_
+    assert TPGMMPolicy.from_estimator(found).config == TPGMMPolicy.from_estimator(model).config
+    with pytest.raises(NotFittedError):
+        TPGMMPolicy.from_estimator(MultimodalTaskParameterizedGMM(hands_model()))
+
+
+def test_ways_that_were_learned_differently_are_refused():
+    model = copy.copy(ways(Handles))
+    model.models_ = [copy.copy(one) for one in model.models_]
+    model.models_[1].fusion = "covariance"
+    with pytest.raises(DataError, match=r"same settings; \['fusion'\] differ"):
+        TPGMMPolicy.from_estimator(model)

@@ -1,6 +1,7 @@
 """Policies for tests: a small one of the paper's skill, and what it observes."""
 
 import copy
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -55,6 +56,14 @@ def situations(observed: dict[str, Tensor], time: Tensor | None = None) -> list[
         Situation(state.double(), {"bottle": Frame(at[:3].double(), at[3:].double())}, time)
         for state, at in zip(observed[STATE], observed[ENVIRONMENT], strict=True)
     ]
+
+
+def seen(given: Sequence[Situation]) -> dict[str, Tensor]:
+    """What LeRobot observes in situations of one object."""
+    return {
+        STATE: torch.stack([one.joints for one in given]).float(),
+        ENVIRONMENT: torch.stack([pose(*one.frames.values()) for one in given]).float(),
+    }
 
 
 def act(acting: TPGMMPolicy, observed: dict[str, Tensor], steps: int) -> Tensor:

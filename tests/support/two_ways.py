@@ -2,12 +2,15 @@
 
 import functools
 from abc import ABC, abstractmethod
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from tpgmm_datasets import save_lerobot
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -159,6 +162,34 @@ class Handles(TwoWays):
     def handles(self, place: Frame) -> Tensor:
         """Where they are (2, 3)."""
         return place.transform(torch.tensor([[0, 0.08, 0], [0, -0.08, 0]]).double())
+
+
+def reach_of_one_handle(n, seed=0, angles=(0, 0.6)) -> list[Situation]:
+    """Objects so far away that the arm reaches one of the two handles only."""
+    rng, found = np.random.default_rng(seed), []
+    while len(found) < n:
+        radius, angle = rng.uniform(0.75, 0.95), rng.uniform(*angles)
+        place = (radius * np.cos(angle), radius * np.sin(angle), 0)
+        frame = Frame(place, turned(rng.uniform(-0.5, 0.5)))
+        far = Handles().handles(frame).norm(dim=-1)
+        if far.max() > 0.93 and far.min() < 0.87:
+            found.append(Situation(Handles().start(rng), {"object": frame}))
+    return found
+
+
+def another_handle_each() -> list[Situation]:
+    """Two situations, in each of which the arm reaches another handle alone."""
+    return [*reach_of_one_handle(1, angles=(-0.6, 0)), *reach_of_one_handle(1)]
+
+
+def two_ways_set(path: Path) -> Path:
+    """A data set of two handles, 20 steps per second, and the arm's URDF beside it."""
+    demonstrations, _ = shown(Handles)
+    time = torch.arange(len(TIME)) / 20
+    given = [replace(one, time=time.double()) for one in demonstrations]
+    save_lerobot(given, path / "set", fps=20, task="take a handle")
+    (path / "arm.urdf").write_text(ARM.config()["urdf"])
+    return path
 
 
 @functools.cache

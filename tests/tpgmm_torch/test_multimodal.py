@@ -8,13 +8,20 @@ import pytest
 import torch
 from sklearn.base import clone
 
-from tests.support.skills import handlings, hands_model, new_handling
-from tests.support.two_ways import Handles, Obstacle, fitted, shown, tip, turned
+from tests.support.skills import canonical, handlings, hands_model, new_handling, waves
+from tests.support.two_ways import (
+    Handles,
+    Obstacle,
+    another_handle_each,
+    fitted,
+    reach_of_one_handle,
+    shown,
+    tip,
+)
 from tpgmm_torch import (
     Frame,
     ModeSelection,
     MultimodalTaskParameterizedGMM,
-    Situation,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.exceptions import (
@@ -26,19 +33,6 @@ from tpgmm_torch.exceptions import (
 )
 
 FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
-
-
-def reach_of_one_handle(n, seed=0):
-    """Objects so far away that the arm reaches one of the two handles only."""
-    rng, found = np.random.default_rng(seed), []
-    while len(found) < n:
-        radius, angle = rng.uniform(0.75, 0.95), rng.uniform(0, 0.6)
-        place = (radius * np.cos(angle), radius * np.sin(angle), 0)
-        frame = Frame(place, turned(rng.uniform(-0.5, 0.5)))
-        far = Handles().handles(frame).norm(dim=-1)
-        if far.max() > 0.93 and far.min() < 0.87:
-            found.append(Situation(Handles().start(rng), {"object": frame}))
-    return found
 
 
 @pytest.mark.parametrize("task", [Obstacle, Handles])
@@ -236,6 +230,19 @@ def test_who_is_left_alone_stays_on_the_way_that_was_chosen():
         assert torch.equal(controller.reference, plain.reference)
 
 
+@pytest.mark.parametrize(("seed", "number"), [(100, 15), (214, 23)])
+def test_an_unlikely_moment_of_the_way_is_no_reason_to_leave_it(seed, number):
+    """Novelty is 1.4 and 1.1: the way itself is less likely there than what was shown."""
+    model = fitted(Obstacle, seed)
+    situation = Obstacle().situations(50, seed)[number]
+    controller = model.controller(situation.joints, situation.frames)
+    first, modes = controller.mode, set()
+    while not controller.finished:
+        controller.step(3 / 59, controller.reference, situation.frames)
+        modes.add(controller.mode)
+    assert modes == {first}
+
+
 def test_a_robot_that_is_moved_over_goes_on_the_other_way():
     model, [situation] = fitted(Handles), Handles().situations(1, 6)
     controller = model.controller(situation.joints, situation.frames)
@@ -249,9 +256,114 @@ def test_a_robot_that_is_moved_over_goes_on_the_other_way():
     assert controller.mode == 1 - first
 
 
-def test_one_controller_is_for_one_robot():
+@pytest.mark.filterwarnings(FAR)
+def test_each_robot_of_a_batch_goes_its_own_way():
+    model, situations = fitted(Handles), another_handle_each()
+    starts = torch.stack([one.joints for one in situations])
+    frames = {"object": Frame.stack([one.frames["object"] for one in situations])}
+    together = model.controller(starts, frames)
+    alone = [model.controller(one.joints, one.frames) for one in situations]
+    assert torch.equal(together.reference, starts) and together.command is None
+    assert together.modes.tolist() == [1, 0]
+    for tick in range(70):
+        # each one's time passes by itself
+        passed = torch.tensor([0.05, 0.04 if tick % 2 else 0.06]).double()
+        told = together.reference.clone()
+        told[1, 0] = torch.nan if 20 < tick < 24 else told[1, 0]
+        command = together.step(passed, told, frames)
+        for robot, one in enumerate(alone):
+            wanted = one.step(float(passed[robot]), told[robot], situations[robot].frames)
+            for name in ("reference", "velocity", "time", "codes", "covariance", "novelty"):
+                assert torch.equal(getattr(command, name)[robot], getattr(wanted, name)), name
+            assert command.reason(robot) == wanted.reason()
+    assert together.finished == all(one.finished for one in alone)
+    assert together.modes.tolist() == [one.mode for one in alone]
+    with pytest.raises(ShapeError, match="began with robots of shape"):
+        together.step(0.05, starts[:1], frames)
+    poses = torch.cat((frames["object"].position, frames["object"].orientation), dim=-1)
+    with pytest.raises(ShapeError, match="frame 'object' now has another"):
+        together.step(0.05, starts, {"object": poses.expand(3, 2, 7)})
+
+
+@pytest.mark.filterwarnings(FAR)
+def test_who_looks_ahead_stays_on_the_way_and_goes_on_from_there():
+    model, situations = fitted(Handles), another_handle_each()
+    starts = torch.stack([one.joints for one in situations])
+    frames = {"object": Frame.stack([one.frames["object"] for one in situations])}
+    one, other = model.controller(starts, frames), model.controller(starts, frames)
+    one.step(0.05, starts), other.step(0.05, starts)
+    before, ahead, moments = one.reference, one.ahead(), []
+    for _ in range(10):
+        ahead.step(0.05)
+        other.step(0.05, other.reference)
+        moments.append(ahead.copy())
+        torch.testing.assert_close(ahead.reference, other.reference, rtol=0, atol=1e-9)
+    assert torch.equal(one.reference, before)
+    one = one.resumed(moments[-1], 0.5, ahead.reference, frames)
+    for _ in range(10):
+        one.step(0.05, one.reference), other.step(0.05, other.reference)
+        torch.testing.assert_close(one.reference, other.reference, rtol=0, atol=1e-9)
+    # what is seen counts again: its object is where the other robot's was
+    swapped = {"object": frames["object"][[1, 0]]}
+    for _ in range(8):
+        one.step(0.05, one.reference, swapped), ahead.step(0.05)
+    assert one.modes[0] == 0
+    assert ahead.modes.tolist() == [1, 0]
+
+
+def test_joints_that_cannot_be_believed_change_no_way():
+    model, [situation] = fitted(Handles), Handles().situations(1, 6)
+    [over] = model.models_[1 - model.choose(situation)[0].mode].predict(situation)
+    for wrong in (torch.full((3,), torch.nan).double(), over.joints[40]):
+        controller = model.controller(situation.joints, situation.frames)
+        first = controller.mode
+        for tick in range(40):
+            # told of every second tick, at which the modes are compared
+            told = wrong if tick > 30 and tick % 2 else controller.reference
+            controller.step(0.05, told, situation.frames)
+        assert controller.mode == first
+
+
+@pytest.mark.filterwarnings(FAR)
+@pytest.mark.parametrize("share", [0.5, 0.7])
+def test_who_begins_in_the_middle_goes_on_in_the_way_that_he_is_in(share):
+    model = fitted(Obstacle)
+    for situation in Obstacle().situations(2, 7):
+        for mode, one in enumerate(model.models_):
+            [motion] = one.predict(situation, candidates=False)
+            there = motion.joints[int(share * len(motion.time))]
+            controller = model.controller(
+                there, situation.frames, clock="localizing:initial=anywhere"
+            )
+            assert controller.mode == mode
+            first, last = controller.reference, float(one.time_[-1])
+            assert float(controller.time) > 0.4 * last
+            run(controller, situation)
+            assert controller.mode == mode
+            gap = tip(controller.reference) - situation.frames["goal"].position
+            assert float(gap.norm()) < 0.01 and torch.equal(first, there)
+
+
+def test_a_model_is_put_together_from_its_ways():
+    model = fitted(Handles)
+    parts = [model.models_, model.weights_, model.limits_, model.labels_]
+    again = MultimodalTaskParameterizedGMM.from_models(*parts)
+    [situation] = Handles().situations(1, 3)
+    assert torch.equal(again.predict(situation)[0].joints, model.predict(situation)[0].joints)
+    assert again.frame_names_ == ("object",) and again.joint_names_ == model.joint_names_
+    for place, wrong, message in (
+        (0, model.models_[:1], "1 models with 2 weights and 2 limits"),
+        (0, [model.models_[0], canonical().fit(waves())], "of different robots"),
+        (1, [0.0, 1.0], r"weights positive: got \[0. 1.\]"),
+        (2, [1.0, np.nan], r"weights and limits are finite.* \[ 1. nan\]"),
+        (3, [0, 2], r"labels \[0, 2\] are no numbers of 2 ways"),
+    ):
+        given = [*parts[:place], wrong, *parts[place + 1 :]]
+        with pytest.raises(DataError, match=message):
+            MultimodalTaskParameterizedGMM.from_models(*given)
+
+
+def test_a_situation_has_to_tell_every_frame():
     model, situation = fitted(Handles), Handles().situations(1, 0)[0]
-    with pytest.raises(ShapeError, match="make one for each"):
-        model.controller(situation.joints.expand(2, 3), situation.frames)
     with pytest.raises(UnknownNameError, match="object"):
         model.controller(situation.joints)

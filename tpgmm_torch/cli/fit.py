@@ -15,7 +15,6 @@ from tpgmm_torch.cli.plugins import OWN, model_format
 if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.exceptions import DataError
 
 __all__ = ["app"]
 
@@ -166,7 +165,8 @@ def fit(
         Any,
         learning(
             "In how many ways the skill is done, each a model of its own; 'auto' finds it. "
-            "'tpgmm reproduce' takes several as a whole, all else one of them, DIR/mode_0.",
+            "'tpgmm reproduce' takes several as a whole, all else one of them, DIR/mode_0; a "
+            "policy holds them all.",
             parser=options.count_or_auto,
             metavar="auto | INTEGER",
         ),
@@ -283,12 +283,15 @@ def fit(
         else:
             ways = MultimodalTaskParameterizedGMM(model, modes).fit(data.aligned)
             assert ways.mode_selection_ is not None
-            if ways.n_modes_ > 1 and write is not None:
-                raise _refusal(ways.labels_.tolist(), output_format)
             typer.echo(f"{ways.mode_selection_.report()}\n")
             if ways.n_modes_ > 1:
-                ways.save(out)
-                typer.echo(f"saved            {out}, with mode_0 to mode_{ways.n_modes_ - 1}")
+                folders = ""
+                if write is None:
+                    ways.save(out)
+                    folders = f", with mode_0 to mode_{ways.n_modes_ - 1}"
+                else:
+                    write(ways, out, recordings.signals())
+                typer.echo(f"saved            {out}{folders}")
                 return
             [model] = ways.models_
         durations, steps = data.summary(processes)
@@ -311,21 +314,6 @@ def fit(
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
-
-
-def _refusal(labels: Sequence[int], output_format: str) -> DataError:
-    """What to say where a format holds one model, and there are several."""
-    from tpgmm_torch.exceptions import DataError
-
-    members = [
-        ",".join(str(episode) for episode, one in enumerate(labels) if one == mode)
-        for mode in range(max(labels) + 1)
-    ]
-    return DataError(
-        f"the format {output_format!r} holds one model, these are {len(members)} ways: of the "
-        f"episodes read, {' and '.join(members)}. Fit one of them, --modes 1 --episodes "
-        f"{members[0]}"
-    )
 
 
 def _report(

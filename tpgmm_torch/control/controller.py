@@ -7,7 +7,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 
-__all__ = ["Controller"]
+__all__ = ["Controller", "SkillController"]
 
 #: For so long a robot that was moved is remembered to have been [s].
 PUSH_MEMORY = 0.5
@@ -50,6 +50,46 @@ GRID = 2.0**32
 INSTANT = 1e-6
 
 _Joints = TypeVar("_Joints", Tensor, Tensor | None)
+
+
+class SkillController(Protocol):
+    """What runs a skill, of one way or of several, on one robot or a batch of them."""
+
+    command: Command | None
+
+    @property
+    def reference(self) -> Tensor:
+        """See :class:`Controller`."""
+
+    @property
+    def time(self) -> Tensor:
+        """See :class:`Controller`."""
+
+    @property
+    def finished(self) -> bool:
+        """See :attr:`Controller.finished`."""
+
+    def step(
+        self,
+        dt: float | Tensor,
+        joints: Any = None,
+        frames: Mapping[str, Any] | None = None,
+        *,
+        told: Mapping[str, str | None] | None = None,
+        ages: Mapping[str, float] | None = None,
+    ) -> Command:
+        """See :meth:`Controller.step`."""
+
+    def copy(self) -> Self:
+        """See :meth:`Controller.copy`."""
+
+    def ahead(self) -> Self:
+        """See :meth:`Controller.ahead`."""
+
+    def resumed(
+        self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
+    ) -> Self:
+        """See :meth:`Controller.resumed`."""
 
 
 class Controller:
@@ -105,6 +145,9 @@ class Controller:
         Progress at the last step [s]; the beginning before the first one.
     command : Command or None
         What the last step returned.
+    measured : Tensor of shape (..., n_joints) or None
+        Where the robots stood at the last step, NaN where that was not believed; None if
+        nothing was measured.
 
     Raises
     ------
@@ -137,6 +180,7 @@ class Controller:
         kinematics = regression.kinematics
         self.reference = kinematics.joint_tensor(joints)
         self.command: Command | None = None
+        self.measured: Tensor | None = None
         self._regression, self._end, self._blend = regression, end, blend
         self._measured_feedback, self._impedance = feedback == "measured", impedance
         self._gripping = kinematics.gripping()
@@ -230,6 +274,7 @@ class Controller:
         if last is not None and nothing:
             return self._refuse(last, f"time did not increase: dt = {seconds} s")
         measured, halted = self._hear(seconds, joints, frames, ages)
+        self.measured = measured
         before = self._progress
         if last is not None and self._trust is not None:
             seconds = np.minimum(seconds, self._trust.longest_step)

@@ -44,7 +44,7 @@ def model_card(
 
     Parameters
     ----------
-    model : TaskParameterizedGMM
+    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
         Fitted.
     repo_id : str
         ``"owner/name"``, its title and in the lines that load it.
@@ -73,20 +73,26 @@ def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
 
     Parameters
     ----------
-    model : TaskParameterizedGMM
-        Fitted.
+    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+        Fitted; of several ways, each is described.
     measured : mapping of str to object, optional
         As for :func:`model_card`.
     """
-    sections = {
-        "The skill": _skill(model),
-        "What matters, and when": _influence(model),
-        "Measured": _table(("what", "how much"), measured.items())
-        if measured
-        else "Nothing was stated.",
-        "Where it fails": _limits(model),
-        "How it was learned": _learning(model),
-    }
+    figures = "Nothing was stated."
+    if measured:
+        figures = _table(("what", "how much"), measured.items())
+    ways = getattr(model, "models_", [model])
+    # what was measured is of all ways, and comes before them
+    sections = {"Measured": figures} if len(ways) > 1 else {}
+    for number, way in enumerate(ways):
+        name = f" (way {number})" if len(ways) > 1 else ""
+        sections |= {
+            f"The skill{name}": _skill(way),
+            f"What matters, and when{name}": _influence(way),
+            "Measured": figures,
+            f"Where it fails{name}": _limits(way),
+            f"How it was learned{name}": _learning(way),
+        }
     return "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
 
 

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, distributed
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.configuration_tpgmm import Skill, TPGMMConfig, models_of
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.training.clocks import Clock
@@ -41,7 +41,14 @@ from lerobot_policy_tpgmm.training.losses import (
 from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
-from tpgmm_torch import Demonstration, Hold, Kinematics, Operator
+from tpgmm_torch import (
+    Demonstration,
+    Hold,
+    Kinematics,
+    MultimodalTaskParameterizedGMM,
+    Operator,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.events import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
@@ -69,16 +76,18 @@ class Learner:
     Parameters
     ----------
     config : TPGMMConfig
-        Of the policy that is trained; a fit writes ``n_steps``.
+        Of the policy that is trained.
     kinematics : Kinematics
     operators : sequence of Operator
     mixture : MixtureParameters
-        What is learned.
+        What is learned, of the first way.
     joints : JointFeatures
     frames : FrameFeatures
         Where observations hold the joints and the frames.
     dataset_meta : LeRobotDatasetMetadata
         Of the data set that the batches come from.
+    become : callable
+        Makes the policy what a fitted model is, ``config`` and ``mixture`` included.
 
     Attributes
     ----------
@@ -98,8 +107,9 @@ class Learner:
         joints: JointFeatures,
         frames: FrameFeatures,
         dataset_meta: Any,
+        become: Callable[[Skill], None],
     ) -> None:
-        self._config, self._mixture = config, mixture
+        self._config, self._mixture, self._become = config, mixture, become
         self._kinematics, self._operators = kinematics, tuple(operators)
         self._joints, self._frames = joints, frames
         self._dataset, flags = dataset_meta, dataset_meta.features
@@ -188,6 +198,8 @@ class Learner:
             return f"frames are at events, {', '.join(config.link_frames.values())}"
         if config.parts:  # and would narrow what does not matter in a part
             return f"parts are learned one by one, they end at {config.parts} s"
+        if config.ways:  # nor which of them an episode shows
+            return f"the skill is done in {len(config.ways)} ways"
         return ""
 
     def check_saveable(self) -> None:
@@ -227,25 +239,37 @@ class Learner:
             log.info("aligning them: --policy.alignment=%s", config.alignment)
         aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
         if not mixture.fitted:
-            log.info("EM: fitting %d components", config.n_components)
-            model = config.estimator(kinematics, list(self._operators)).fit(aligned)
-            mixture.copy_from(model)
-            config.note(model)
-            self._operators = model.operators_
-            log.info(
-                "%d components fitted by %d steps of EM: the policy is trained",
-                config.n_components,
-                model.n_iter_,
-            )
+            self._fit(config.estimator(kinematics, list(self._operators)), aligned)
         self.clock = self._aligned_clock(aligner, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
         self._learned, self._recorder = set(numbers), None
         self._go_on_from(dict(zip(numbers, aligned, strict=True)), kinematics)
 
+    def _fit(self, model: TaskParameterizedGMM, aligned: Sequence[Demonstration]) -> None:
+        """Learn aligned demonstrations, of as many ways as there are."""
+        config, skill = self._config, cast(Skill, model)
+        if config.modes != 1:
+            log.info("looking for several ways: --policy.modes=%s", config.modes)
+            skill = MultimodalTaskParameterizedGMM(model, config.modes)
+        log.info("EM: fitting %d components", config.n_components)
+        skill.fit(aligned)
+        if isinstance(skill, MultimodalTaskParameterizedGMM) and skill.mode_selection_:
+            log.info("%s", skill.mode_selection_.report())
+        self._become(skill)
+        self._operators = models_of(skill)[0].operators_
+        for one in models_of(skill):
+            log.info(
+                "%d components fitted by %d steps of EM: the policy is trained",
+                one.n_components_,
+                one.n_iter_,
+            )
+
     def _go_on_from(self, aligned: Mapping[int, Demonstration], kinematics: Kinematics) -> None:
         """Find what the loss of later steps needs to know of the demonstrations."""
         config, mixture, operators = self._config, self._mixture, self._operators
+        if config.ways:
+            return
         holds = list(map(Hold.parse, config.holds or ()))
         shown = list(aligned.values())
         if config.robust:  # as in fit, which says so

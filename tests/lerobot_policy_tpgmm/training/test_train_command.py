@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -9,15 +10,18 @@ import torch
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_commands import lerobot
 from tests.support.skills import same
+from tests.support.two_ways import ARM, Handles, two_ways_set
 from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import MultimodalTaskParameterizedGMM, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
+from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.operators.text import parse_operator
 
 RATE, BATCH, K = 10, 128, 8
+LAST = Path("out", "checkpoints", "last", "pretrained_model")
 
 
 @pytest.fixture(scope="module")
@@ -128,3 +132,55 @@ def test_a_run_is_resumed(folder, log, n_steps):
     assert held_out[-1] < held_out[0]
     assert "components fitted" not in resumed
     saved(folder, end)
+
+
+def test_several_ways_are_found_learned_and_taken_by_lerobots_commands(tmp_path):
+    two_ways_set(tmp_path)
+    operators = ["position:tip@object", "canonical"]
+    log = train(
+        tmp_path, "--policy.type=tpgmm", f"--policy.robot={tmp_path / 'arm.urdf'}",
+        "--policy.links=['tip']", "--policy.device=cpu", "--policy.n_components=8",
+        f"--policy.operators={json.dumps(operators)}", "--policy.modes=auto",
+        "--policy.alignment=none", "--num_workers=0", "--dataset.repo_id=local/handles",
+        f"--dataset.root={tmp_path / 'set'}", "--batch_size=600", "--steps=2", "--save_freq=1",
+        f"--output_dir={tmp_path / 'out'}",
+    )  # fmt: skip
+    for said in ("looking for several ways", "2 ways:", "the skill is done in 2 ways"):
+        assert said in log
+    read = load_lerobot(tmp_path / "set", robot=ARM)
+    model = TaskParameterizedGMM(8, list(map(parse_operator, operators)), ARM)
+    model = MultimodalTaskParameterizedGMM(model).fit(read)
+    found = [saved(tmp_path, step).to_estimator() for step in (1, 2)]
+    for one in found:
+        assert one.labels_.tolist() == model.labels_.tolist()
+        torch.testing.assert_close(one.limits_, model.limits_)
+        for way, wanted in zip(one.models_, model.models_, strict=True):
+            same(way, wanted, 1e-9)
+    train(
+        tmp_path, f"--config_path={tmp_path / LAST / 'train_config.json'}", "--resume=true",
+        "--steps=3",
+    )  # fmt: skip
+    [situation] = Handles().situations(1, 0)
+    place, names = situation.frames["object"], [f"{name}.pos" for name in ARM.joint_names]
+    at = torch.cat((situation.joints, place.position, place.orientation)).tolist()
+    at = dict(zip([*names, *(f"object.{part}.pos" for part in POSE_PARTS)], at, strict=True))
+    start, moved = tmp_path / "start.json", tmp_path / "log.json"
+    start.write_text(json.dumps(at))
+    done = lerobot(
+        "rollout", "--strategy.type=base", f"--policy.path={tmp_path / LAST}",
+        "--robot.type=bimanual", f"--robot.start={start}", f"--robot.log={moved}",
+        f"--policy.state_names={json.dumps([*at])}", "--fps=20", "--duration=2",
+        f"--policy.action_names={json.dumps(names)}",
+        "--return_to_initial_position=false", "--task=take",
+        home=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    sent = torch.tensor([[*one.values()] for one in json.loads(moved.read_text())])
+    joints, frames = situation.joints.float(), {"object": place}
+    control = saved(tmp_path, 3).config.control()
+    controller = model.controller(joints.double(), frames, **control)
+    assert len(sent) >= 12
+    for tick, action in enumerate(sent):
+        command = controller.step(0.05, joints.double(), frames if tick else None)
+        torch.testing.assert_close(action.double(), command.reference, rtol=0, atol=1e-5)
+        joints = action

@@ -205,7 +205,3 @@ def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses_once(tmp_path, monk
         *given, "--modes", 2, "--checkpoint", tmp_path / "c", "--out", tmp_path / "m"
     )
     assert "--modes compares all episodes" in line
-    line = refusal(*given, "--modes", 2, "--format", "lerobot", "--out", tmp_path / "policy")
-    assert (
-        "holds one model, these are 2 ways: of the episodes read, 0,2,4,6 and 1,3,5,7" in line
-    )

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.support.skills import small_bottle, waves
+from tests.support.two_ways import Handles, fitted
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.hub import describe, model_card
 
@@ -82,3 +83,12 @@ def test_text_that_was_given_stays_in_its_cell():
     card = describe(model, measured={"error | of\na <b>hand": 3})
     [*_, row] = rows(card, "Measured")
     assert row == ["error \\| of a &lt;b>hand", "3"]
+
+
+def test_of_several_ways_each_is_described():
+    model = fitted(Handles)
+    card = describe(model, {"success": "50 of 50"})
+    for mode in range(2):
+        learned = dict(rows(card, f"How it was learned (way {mode})"))
+        assert learned["demonstrations"] == str((model.labels_ == mode).sum())
+    assert card.count("## Measured") == card.count("50 of 50") == 1

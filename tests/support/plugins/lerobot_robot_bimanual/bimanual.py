@@ -4,6 +4,9 @@ from lerobot.robots import Robot
 
 from .config_bimanual import BimanualConfig
 
+#: What begins so is observed, and not moved.
+OBJECTS = ("bottle", "object")
+
 
 class Bimanual(Robot):
     """Joints are at once where they are sent; what else it observes stands still.
@@ -25,7 +28,7 @@ class Bimanual(Robot):
 
     @property
     def action_features(self):
-        return {name: float for name in self._observed if not name.startswith("bottle")}
+        return {name: float for name in self._observed if not name.startswith(OBJECTS)}
 
     @property
     def is_connected(self):
