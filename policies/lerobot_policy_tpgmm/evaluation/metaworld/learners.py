@@ -124,9 +124,6 @@ class TaskParameterized:
         The speed of the reproduction, as a share of the demonstrations'. The experts move the
         target as fast as Meta-World lets them: at their own pace, what differs from them falls
         behind, and cuts the corners and the depth of a push.
-    nearest : bool
-        Whether each demonstration is learned alone, and an episode is led by the one that
-        began most alike; else one model is learned from all of them.
     longest, at_least : float, int
         What ``of_one_kind`` keeps is learned from.
     steps_per_component : int
@@ -146,7 +143,6 @@ class TaskParameterized:
     """
 
     pace: float = 0.8
-    nearest: bool = False
     longest: float = 1.4
     at_least: int = 3
     steps_per_component: int = 3
@@ -163,28 +159,19 @@ class TaskParameterized:
     clock: str | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def name(self) -> str:
-        """On the command line."""
-        return "tpgmm-nearest" if self.nearest else "tpgmm"
+    name = "tpgmm"
 
-    def fit(self, episodes: Sequence[Recorded], seed: int) -> TaskParameterizedActor | Nearest:
+    def fit(self, episodes: Sequence[Recorded], seed: int) -> TaskParameterizedActor:
         """Learn from episodes; ``seed`` is that of EM."""
-        alike = of_one_kind(episodes, self.longest, self.at_least)
-        if not self.nearest:
-            return self._learned(alike, seed)
-        starts = np.array([one.observed[0] for one in alike])
-        return Nearest(starts, [self._learned([one], seed) for one in alike])
-
-    def _learned(self, alike: Sequence[Recorded], seed: int) -> TaskParameterizedActor:
         robot = metaworld_robot()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            alike = of_one_kind(episodes, self.longest, self.at_least)
             demonstrations = self._aligned(paced(alike, self.pace), robot)
             n_steps = len(demonstrations[0])
             model = TaskParameterizedGMM(
                 max(self.fewest, n_steps // self.steps_per_component),
-                metaworld_operators(present(alike)),
+                metaworld_operators(present(episodes)),
                 robot,
                 **{
                     "blend": 0.0,
@@ -261,34 +248,6 @@ class TaskParameterizedActor:
         return np.asarray(self.policy.select_action(_batch(observed[None]))[0])
 
 
-class Nearest:
-    """An actor for each demonstration; the one that began most alike leads an episode.
-
-    Parameters
-    ----------
-    starts : ndarray of shape (N, 25)
-        First observations of the demonstrations.
-    actors : sequence of TaskParameterizedActor
-    """
-
-    control, outcome = TaskParameterizedActor.control, TaskParameterizedActor.outcome
-
-    def __init__(self, starts: Rows, actors: Sequence[TaskParameterizedActor]) -> None:
-        self.starts, self.actors = starts, actors
-        self._chosen: list[int] = []
-
-    def begin(self, first: Rows) -> None:
-        """Hear the first observations, and choose."""
-        distances = np.linalg.norm(first[:, None] - self.starts, axis=2)  # (B, N)
-        self._chosen = distances.argmin(1).tolist()
-        for actor in self.actors:
-            actor.begin(first)
-
-    def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The next reference."""
-        return self.actors[self._chosen[episode]].act(episode, step, observed)
-
-
 def _batch(observed: Rows) -> dict[str, torch.Tensor]:
     values = torch.from_numpy(observed.astype(np.float32))
     return {OBS_STATE: values[:, : len(JOINTS)], OBS_ENV_STATE: values[:, len(JOINTS) :]}
@@ -297,11 +256,5 @@ def _batch(observed: Rows) -> dict[str, torch.Tensor]:
 Learner = TaskParameterized | Perceptron | Network
 #: By their names in files and on the command line.
 LEARNERS: dict[str, Learner] = {
-    learner.name: learner
-    for learner in (
-        TaskParameterized(),
-        TaskParameterized(nearest=True),
-        Perceptron(),
-        *NETWORKS,
-    )
+    learner.name: learner for learner in (TaskParameterized(), Perceptron(), *NETWORKS)
 }

@@ -221,21 +221,6 @@ def test_one_demonstration_is_enough_to_reach_another_goal():
     assert np.linalg.norm(blind.act(0, 10**6, new.observed[-1])[:3] - goal) > 0.02
 
 
-def test_the_demonstration_that_began_most_alike_leads():
-    shown = [reaching(i) for i in (1, 2, 3)]
-    alone = [TaskParameterized().fit([one], 0) for one in shown]
-    nearest = TaskParameterized(nearest=True).fit(shown, 0)
-    first = np.array([shown[i].observed[0] for i in (2, 0, 2)])
-    first[:, 4:7] += 1e-3
-    for actor in (nearest, *alone):
-        actor.begin(first)
-    for episode, i in enumerate((2, 0, 2)):
-        given = [nearest.act(episode, step, first[episode]) for step in range(60)]
-        wanted = [alone[i].act(episode, step, first[episode]) for step in range(60)]
-        assert np.allclose(given, wanted)
-    assert not np.allclose(given, [alone[0].act(2, step, first[2]) for step in range(60)])
-
-
 def test_reading_the_hand_at_every_step_gives_the_same_references_if_it_follows():
     shown, new = [reaching(i) for i in (1, 2, 3)], reaching(4)
     plan = TaskParameterized().fit(shown, 0)
