@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,13 +19,15 @@ import typer
 from lerobot_policy_tpgmm.environments.metaworld.state import MetaworldStateEnv
 from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, check_task
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
-from lerobot_policy_tpgmm.evaluation.metaworld.learners import LEARNERS
+from lerobot_policy_tpgmm.evaluation.metaworld.learners import LEARNERS, Actor, Learner
+from lerobot_policy_tpgmm.evaluation.metaworld.networks import Network
 from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
     evaluation_seeds,
     recorded,
     successes,
+    validation,
 )
-from lerobot_policy_tpgmm.evaluation.metaworld.summary import summary, task_table
+from lerobot_policy_tpgmm.evaluation.metaworld.summary import cost_table, summary, task_table
 from lerobot_policy_tpgmm.evaluation.metaworld.trials import trials
 from lerobot_policy_tpgmm.evaluation.report.tables import episode_table, write_table
 from tpgmm_torch.atomic import replacing
@@ -36,7 +38,7 @@ __all__ = ["app"]
 app = typer.Typer(add_completion=False)
 
 #: Whose versions are written down with each cell.
-PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot")
+PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot", "diffusers")
 
 
 @app.command()
@@ -53,6 +55,9 @@ def run(
     record: Annotated[
         int, typer.Option(min=1, help="Episodes of the expert; its rate is of these.")
     ] = 12,
+    budget: Annotated[
+        float, typer.Option(min=0, help="Minutes of the processor for each network at most.")
+    ] = 0.5,
     tuning: Annotated[
         bool, typer.Option(help="Try in other situations than those that are reported.")
     ] = False,
@@ -65,6 +70,7 @@ def run(
     for name in chosen:
         if name not in LEARNERS:
             raise UnknownNameError("policy", name, "the benchmark", LEARNERS)
+    learners = {name: _limited(LEARNERS[name], 60 * budget) for name in chosen}
     results = Results(out / ("tuning" if tuning else "cells"))
     situations = evaluation_seeds(episodes, tuning=tuning)
     for task in names:
@@ -74,13 +80,17 @@ def run(
             for n in _integers("demonstrations", demonstrations)
             for policy in chosen
         ]
-        kept = {cell: _kept(results, cell, situations) for cell in cells}
+        kept = {
+            cell: _kept(results, cell, settings_of(learners[cell.policy]), situations)
+            for cell in cells
+        }
         missing = [cell for cell in cells if len(kept[cell]) < episodes]
         if not missing:
             continue
         env = MetaworldStateEnv(task)
         for cell in missing:
-            result = _measure(env, cell, out / "demonstrations", record, situations, kept[cell])
+            learner, folder = learners[cell.policy], out / "demonstrations"
+            result = _measure(env, cell, learner, folder, record, situations, kept[cell])
             results.write(cell, result)
             solved = sum(episode["success"] for episode in result["episodes"])
             typer.echo(f"{cell.key}: {solved} of {episodes}")
@@ -95,14 +105,21 @@ def _integers(option: str, text: str) -> list[int]:
         raise DataError(f"--{option} is integers joined by commas, got {text!r}") from None
 
 
-def _settings(policy: str) -> dict[str, Any]:
-    return asdict(LEARNERS[policy])
+def _limited(learner: Learner, budget: float) -> Learner:
+    return replace(learner, budget=budget) if isinstance(learner, Network) else learner
 
 
-def _kept(results: Results, cell: Cell, situations: Sequence[int]) -> list[dict[str, Any]]:
+def settings_of(learner: Learner) -> dict[str, Any]:
+    """All settings of a learner, as JSON holds them."""
+    return {key: _plain(value) for key, value in asdict(learner).items()}
+
+
+def _kept(
+    results: Results, cell: Cell, settings: dict[str, Any], situations: Sequence[int]
+) -> list[dict[str, Any]]:
     """Episodes of a cell in the first of these situations, if settings are as they were."""
     found = results.read(cell)
-    if found is None or found["settings"] != _plain(_settings(cell.policy)):
+    if found is None or found["settings"] != settings:
         return []
     episodes = found["episodes"]
     seeds = [episode["seed"] for episode in episodes]
@@ -115,12 +132,15 @@ def _plain(value: Any) -> Any:
     """What JSON makes of a value."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, type):
+        return value.__name__
     return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value
 
 
 def _measure(
     env: MetaworldStateEnv,
     cell: Cell,
+    learner: Learner,
     folder: Path,
     record: int,
     situations: Sequence[int],
@@ -128,17 +148,24 @@ def _measure(
 ) -> dict[str, Any]:
     shown = recorded(folder, cell.env, cell.seed, record)
     chosen = successes(shown, cell.demonstrations, cell.env)
-    began = time.perf_counter()
-    actor = LEARNERS[cell.policy].fit(chosen, cell.seed)
-    trained = time.perf_counter()
+    held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
+    began = time.process_time()
+    actor: Actor = (
+        learner.fit(chosen, cell.seed, held_out)
+        if isinstance(learner, Network)
+        else learner.fit(chosen, cell.seed)
+    )
+    trained = time.process_time()
     episodes = [*kept, *trials(env, actor, situations[len(kept) :])]
     return {
         "episodes": episodes,
-        "settings": _plain(_settings(cell.policy)),
+        "settings": settings_of(learner),
         "expert": {"episodes": len(shown), "successes": sum(one.success for one in shown)},
         "demonstration_seeds": [one.seed for one in chosen],
-        "training_seconds": trained - began,
-        "evaluation_seconds": time.perf_counter() - trained,
+        "validation_seeds": [one.seed for one in held_out],
+        "training_seconds": trained - began,  # of the processor
+        "training_outcome": actor.outcome,
+        "evaluation_seconds": time.process_time() - trained,
         "versions": {name: version(name) for name in PACKAGES},
     }
 
@@ -159,6 +186,7 @@ def report(results: Results, out: Path) -> None:
             "",
             summary(found),
             task_table(found),
+            cost_table(found),
         ]
     )
     with replacing(out / "results.md") as file:

@@ -12,10 +12,6 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from numpy.typing import NDArray
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.neural_network import MLPRegressor
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
 from lerobot_policy_tpgmm.environments.metaworld.hand import (
@@ -26,11 +22,13 @@ from lerobot_policy_tpgmm.environments.metaworld.hand import (
     metaworld_robot,
 )
 from lerobot_policy_tpgmm.evaluation.metaworld.nearness import Nearness
+from lerobot_policy_tpgmm.evaluation.metaworld.networks import NETWORKS, Network
+from lerobot_policy_tpgmm.evaluation.metaworld.perceptron import Perceptron
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
 
-__all__ = ["LEARNERS", "Actor", "Perceptron", "TaskParameterized", "switches"]
+__all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "switches"]
 
 Rows = NDArray[np.float64]
 #: A change of the wanted opening by more than this, in a step, is a gripper that switches.
@@ -43,9 +41,13 @@ ABSENT = 1e-6
 
 
 class Actor(Protocol):
-    """What acts in :class:`MetaworldStateEnv`, with actions of one ``control``."""
+    """What acts in :class:`MetaworldStateEnv`, with actions of one ``control``.
+
+    ``outcome`` says why its training ended.
+    """
 
     control: str
+    outcome: str
 
     def begin(self, first: Rows) -> None:
         """Hear the first observations (B, 25) of the episodes to come, in their order."""
@@ -224,6 +226,7 @@ class TaskParameterizedActor:
     """
 
     control = "reference"
+    outcome = "learned by expectation-maximisation"
 
     def __init__(self, policy: TPGMMPolicy, chunked: bool) -> None:
         self.policy, self.chunked = policy, chunked
@@ -250,72 +253,8 @@ def _batch(observed: Rows) -> dict[str, torch.Tensor]:
     return {OBS_STATE: values[:, : len(JOINTS)], OBS_ENV_STATE: values[:, len(JOINTS) :]}
 
 
-@dataclass(frozen=True)
-class Perceptron:
-    """A multilayer perceptron from the present state to Meta-World's action.
-
-    Parameters
-    ----------
-    hidden : tuple of int
-        Units of the hidden layers.
-    alpha : float
-        Weight of the penalty on squared weights.
-    updates : int
-        Steps of gradient descent, whatever the number of demonstrations.
-    relative : bool
-        Whether it is told, too, where the hand is as seen from each object.
-    """
-
-    hidden: tuple[int, ...] = (256, 256)
-    alpha: float = 1e-3
-    updates: int = 3000
-    relative: bool = True
-
-    name = "perceptron"
-
-    def fit(self, episodes: Sequence[Recorded], seed: int) -> PerceptronActor:
-        """Learn from episodes; ``seed`` is that of the weights."""
-        x = self.features(np.concatenate([episode.observed for episode in episodes]))
-        y = np.concatenate([episode.actions for episode in episodes])
-        batch = min(200, len(x))
-        epochs = max(1, round(self.updates * batch / len(x)))
-        network = MLPRegressor(
-            hidden_layer_sizes=self.hidden, alpha=self.alpha, batch_size=batch, tol=0.0,
-            max_iter=epochs, n_iter_no_change=epochs, random_state=seed,
-        )  # fmt: skip
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # the budget is what ends it
-            pipeline = make_pipeline(StandardScaler(), network).fit(x, y)
-        return PerceptronActor(self, pipeline)
-
-    def features(self, observed: Rows) -> Rows:
-        """Its inputs (T, n) from observations (T, 25)."""
-        hand, poses = observed[:, : len(JOINTS)], observed[:, len(JOINTS) :]
-        places = poses.reshape(len(observed), -1, 7)[..., :3]
-        inputs = [hand, places.reshape(len(observed), -1)]
-        if self.relative:
-            inputs.append((places - hand[:, None, :3]).reshape(len(observed), -1))
-        return np.concatenate(inputs, axis=1)
-
-
-class PerceptronActor:
-    """What a :class:`Perceptron` learned."""
-
-    control = "displacement"
-
-    def __init__(self, settings: Perceptron, pipeline: Any) -> None:
-        self.settings, self.pipeline = settings, pipeline
-
-    def begin(self, first: Rows) -> None:
-        """Nothing: it looks at the present alone."""
-
-    def act(self, episode: int, step: int, observed: Rows) -> Rows:
-        """The next displacement and effort."""
-        action = self.pipeline.predict(self.settings.features(observed[None]))[0]
-        return np.clip(action, -1.0, 1.0)
-
-
+Learner = TaskParameterized | Perceptron | Network
 #: By their names in files and on the command line.
-LEARNERS: dict[str, TaskParameterized | Perceptron] = {
-    learner.name: learner for learner in (TaskParameterized(), Perceptron())
+LEARNERS: dict[str, Learner] = {
+    learner.name: learner for learner in (TaskParameterized(), Perceptron(), *NETWORKS)
 }

@@ -15,12 +15,24 @@ from lerobot_policy_tpgmm.environments.metaworld.state import MetaworldStateEnv
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["demonstration_seeds", "evaluation_seeds", "read", "recorded", "successes", "write"]
+__all__ = [
+    "demonstration_seeds",
+    "evaluation_seeds",
+    "read",
+    "recorded",
+    "successes",
+    "validation",
+    "validation_seeds",
+    "write",
+]
 
 #: Demonstrations of training seed s are of the situations ``STRIDE * s`` and on.
 STRIDE = 1000
-#: Evaluations begin here, those for tuning there: no situation of one is one of another.
-EVALUATION, TUNING = 1_000_000, 2_000_000
+#: Evaluations begin here, then those for tuning, then demonstrations that nothing is learned
+#: from: no situation of one is one of another.
+EVALUATION, TUNING, VALIDATION = 1_000_000, 2_000_000, 3_000_000
+#: Episodes that tell when training shall end, the same for all training seeds.
+VALIDATED = 6
 
 
 def demonstration_seeds(seed: int, n: int) -> range:
@@ -39,6 +51,11 @@ def evaluation_seeds(n: int, *, tuning: bool = False) -> range:
     return range(first, first + n)
 
 
+def validation_seeds() -> range:
+    """The situations of demonstrations that nothing is learned from."""
+    return range(VALIDATION, VALIDATION + VALIDATED)
+
+
 def recorded(folder: Path, task: str, seed: int, n: int) -> list[Recorded]:
     """The expert's episodes ``demonstration_seeds(seed, n)``, from a file if they are there.
 
@@ -50,14 +67,23 @@ def recorded(folder: Path, task: str, seed: int, n: int) -> list[Recorded]:
     seed, n : int
         As of :func:`demonstration_seeds`.
     """
-    path, seeds = folder / f"{task}-s{seed}.npz", demonstration_seeds(seed, n)
+    return _kept(folder / f"{task}-s{seed}.npz", task, demonstration_seeds(seed, n))
+
+
+def validation(folder: Path, task: str) -> list[Recorded]:
+    """The expert's episodes ``validation_seeds()`` that solve the task."""
+    episodes = _kept(folder / f"{task}-validation.npz", task, validation_seeds())
+    return [episode for episode in episodes if episode.success]
+
+
+def _kept(path: Path, task: str, seeds: range) -> list[Recorded]:
     episodes = read(path) if path.exists() else []
-    if [episode.seed for episode in episodes[:n]] != [*seeds]:
+    if [episode.seed for episode in episodes[: len(seeds)]] != [*seeds]:
         env = MetaworldStateEnv(task, control="displacement", stop_at_success=False)
         episodes = record_metaworld(env, seeds)
         env.close()
         write(path, episodes)
-    return episodes[:n]
+    return episodes[: len(seeds)]
 
 
 def successes(episodes: Sequence[Recorded], n: int, task: str) -> list[Recorded]:

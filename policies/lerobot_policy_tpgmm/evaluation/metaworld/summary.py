@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,7 +16,7 @@ from lerobot_policy_tpgmm.environments.metaworld.tasks import (
 )
 from lerobot_policy_tpgmm.evaluation.report.tables import wilson
 
-__all__ = ["GROUPS", "summary", "task_table"]
+__all__ = ["GROUPS", "cost_table", "summary", "task_table"]
 
 #: Rows of the summary, and the tasks that they are about.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -66,6 +67,38 @@ def task_table(results: Iterable[Result]) -> str:
         half = "tuned" if task in TUNED else "held"
         lines.append(_line([task, f"{difficulty(task)}, {half}", *entries]))
     return "\n".join(lines) + "\n"
+
+
+def cost_table(results: Iterable[Result]) -> str:
+    """What training and acting take, and why trainings ended, as Markdown.
+
+    Medians over the finished cells, ``results``, in seconds of the processor for a training and
+    in milliseconds for an action.
+    """
+    results = list(results)
+    lines = [_line(["", "trainings", "training [s]", "action [ms]", "why trainings ended"])]
+    lines.append(_line(["---"] * 5))
+    for policy, n in _columns(results):
+        here = [r for r in results if _place(r) == (policy, n)]
+        ends = Counter(result["training_outcome"] for result in here)
+        lines.append(
+            _line(
+                [
+                    f"{policy}, {n}",
+                    str(len(here)),
+                    f"{np.median([result['training_seconds'] for result in here]):.3g}",
+                    f"{1e3 * np.median([_action_seconds(result) for result in here]):.3g}",
+                    "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common()),
+                ]
+            )
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _action_seconds(result: Result) -> float:
+    episodes = result["episodes"]
+    acting = sum(episode["acting_seconds"] for episode in episodes)
+    return float(acting / sum(episode["steps"] for episode in episodes))
 
 
 def _place(result: Result) -> tuple[str, int]:

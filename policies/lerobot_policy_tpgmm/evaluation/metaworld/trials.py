@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,22 +33,37 @@ def trials(env: MetaworldStateEnv, actor: Actor, seeds: Sequence[int]) -> list[d
     Returns
     -------
     list of dict
-        ``seed``, ``success`` and ``steps``.
+        ``seed``, ``success``, ``steps``, and ``acting_seconds`` of the processor, with the
+        share of what ``begin`` took for all.
     """
     env.control = actor.control
-    actor.begin(np.array([_row(env.reset(seed=seed)[0]) for seed in seeds]))
+    first = np.array([_row(env.reset(seed=seed)[0]) for seed in seeds])
+    began = time.process_time()
+    actor.begin(first)
+    beginning = (time.process_time() - began) / len(seeds)
     episodes = []
     for episode, seed in enumerate(seeds):
         observed = _row(env.reset(seed=seed)[0])
         before, steps, done, info = observed, 0, False, {"is_success": False}
+        acting = beginning
         while not done:
-            observation, _, ended, cut, info = env.step(actor.act(episode, steps, observed))
+            began = time.process_time()
+            action = actor.act(episode, steps, observed)
+            acting += time.process_time() - began
+            observation, _, ended, cut, info = env.step(action)
             observed, steps = _row(observation), steps + 1
             done = ended or cut
             if steps % STILL_STEPS == 0:
                 done |= bool(np.abs(observed - before).max() < STILL)
                 before = observed
-        episodes.append({"seed": seed, "success": bool(info["is_success"]), "steps": steps})
+        episodes.append(
+            {
+                "seed": seed,
+                "success": bool(info["is_success"]),
+                "steps": steps,
+                "acting_seconds": acting,
+            }
+        )
     return episodes
 
 

@@ -7,13 +7,11 @@ import pandas as pd
 import pytest
 import torch
 
-from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
 from lerobot_policy_tpgmm.environments.metaworld.hand import metaworld_robot
 from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
-    Perceptron,
     TaskParameterized,
     of_one_kind,
     paced,
@@ -25,31 +23,28 @@ from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
     evaluation_seeds,
     read,
     successes,
+    validation_seeds,
     write,
 )
-from lerobot_policy_tpgmm.evaluation.metaworld.summary import GROUPS, summary, task_table
+from lerobot_policy_tpgmm.evaluation.metaworld.summary import (
+    GROUPS,
+    cost_table,
+    summary,
+    task_table,
+)
+from tests.support.reaching import reaching
 from tpgmm_torch.exceptions import DataError
 
 
-def cell(task, n, solved, of=4, seed=0, policy="tpgmm"):
+def cell(task, n, solved, of=4, seed=0, policy="tpgmm", seconds=2.0, outcome="done"):
     names = {"env": task, "policy": policy, "demonstrations": n, "seed": seed}
-    episodes = [{"seed": i, "success": i < solved} for i in range(of)]
-    return {"cell": {**names, "condition": "nominal"}, "episodes": episodes}
-
-
-def reaching(seed, n_steps=60):
-    """An episode that goes straight to the goal and closes the hand half way."""
-    generator = np.random.default_rng(seed)
-    start = np.array([0.0, 0.6, 0.2])
-    goal = generator.uniform((-0.1, 0.8, 0.1), (0.1, 0.9, 0.3))
-    share = np.linspace(0, 1, n_steps)[:, None]
-    path = start + (3 * share**2 - 2 * share**3) * (goal - start)
-    grip = (share < 0.5).astype(float)
-    poses = np.zeros((3, 7))
-    poses[:, 3], poses[0, :3], poses[2, :3] = 1, generator.uniform(0.3, 0.5, 3), goal
-    observed = np.hstack((path, grip, np.tile(poses.ravel(), (n_steps, 1))))
-    actions = np.hstack((np.gradient(path, axis=0) / 0.01, 1 - 2 * grip))
-    return Recorded(seed, observed, np.hstack((path, grip)), actions, True)
+    took = {"steps": 50, "acting_seconds": seconds / 100}
+    return {
+        "cell": {**names, "condition": "nominal"},
+        "episodes": [{"seed": i, "success": i < solved, **took} for i in range(of)],
+        "training_seconds": seconds,
+        "training_outcome": outcome,
+    }
 
 
 def test_groups_are_all_tasks_and_two_halves_that_share_none():
@@ -75,6 +70,16 @@ def test_tables_put_tpgmm_first_and_leave_room_where_nothing_was_measured():
     assert ("tuned" in push) == ("push-v3" in TUNED)
 
 
+def test_costs_are_medians_over_trainings_and_ends_are_counted():
+    ends = {2.0: "it stopped", 3.0: "the budget", 9.0: "it stopped"}
+    results = [
+        cell(task, 3, 1, seconds=seconds, outcome=outcome)
+        for task, (seconds, outcome) in zip(TASKS, ends.items(), strict=False)
+    ]
+    # 30 ms of each episode's 50 steps
+    assert "| tpgmm, 3 | 3 | 3 | 0.6 | it stopped: 2; the budget: 1 |" in cost_table(results)
+
+
 def test_a_report_is_written_of_all_cells_that_are_there(tmp_path):
     results = Results(tmp_path / "cells")
     for solved, seed in ((4, 0), (2, 7)):
@@ -94,7 +99,9 @@ def test_situations_of_demonstrations_tuning_and_evaluation_are_different():
     shown = {seed for s in (0, 1, 2, 999) for seed in demonstration_seeds(s, 1000)}
     tried, tuned = set(evaluation_seeds(500)), set(evaluation_seeds(500, tuning=True))
     assert len(shown) == 4000
+    checked = set(validation_seeds())
     assert shown.isdisjoint(tried | tuned) and tried.isdisjoint(tuned)
+    assert checked.isdisjoint(shown | tried | tuned)
     with pytest.raises(DataError, match="training seeds"):
         demonstration_seeds(1000, 1)
 
@@ -223,10 +230,3 @@ def test_reading_the_hand_at_every_step_gives_the_same_references_if_it_follows(
     for step in range(20):
         wanted = plan.act(0, step, new.observed[step])
         assert np.allclose(closed.act(0, step, new.observed[step]), wanted, atol=1e-4)
-
-
-def test_the_perceptron_learns_what_it_is_shown():
-    shown = [reaching(i) for i in range(5)]
-    actor = Perceptron(hidden=(64,), updates=600).fit(shown, 0)
-    given = np.array([actor.act(0, t, shown[0].observed[t]) for t in range(5, 55)])
-    assert np.abs(given - shown[0].actions[5:55]).mean() < 0.15
