@@ -110,9 +110,9 @@ class Command:
             ),
             stacked([one.codes for one in commands]),
             {
-                robot: one.reason()
+                robot: reason
                 for robot, one in zip(robots, commands, strict=True)
-                if one.reason()
+                if (reason := one.reason())
             },
             commands[0].impedance,
             (lambda: stacked([of_one() for of_one in novelty]))
