@@ -53,7 +53,7 @@ def run(
         str, typer.Option(metavar="NAME,...", help=f"Among {', '.join(LEARNERS)}.")
     ] = ",".join(LEARNERS),
     record: Annotated[
-        int, typer.Option(min=1, help="Episodes of the expert; its rate is of these.")
+        int, typer.Option(min=1, help="Episodes of the expert at least; more where it fails.")
     ] = 12,
     budget: Annotated[
         float, typer.Option(min=0, help="Minutes of the processor for each network at most.")
@@ -146,7 +146,7 @@ def _measure(
     situations: Sequence[int],
     kept: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    shown = recorded(folder, cell.env, cell.seed, record)
+    shown = recorded(folder, cell.env, cell.seed, cell.demonstrations, record)
     chosen = successes(shown, cell.demonstrations, cell.env)
     held_out = validation(folder, cell.env) if isinstance(learner, Network) else []
     began = time.process_time()

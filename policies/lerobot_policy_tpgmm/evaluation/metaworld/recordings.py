@@ -33,6 +33,8 @@ STRIDE = 1000
 EVALUATION, TUNING, VALIDATION = 1_000_000, 2_000_000, 3_000_000
 #: Episodes that tell when training shall end, the same for all training seeds.
 VALIDATED = 6
+#: The expert is given up after so many times the episodes that it is to solve.
+PATIENCE = 5
 
 
 def demonstration_seeds(seed: int, n: int) -> range:
@@ -56,18 +58,31 @@ def validation_seeds() -> range:
     return range(VALIDATION, VALIDATION + VALIDATED)
 
 
-def recorded(folder: Path, task: str, seed: int, n: int) -> list[Recorded]:
-    """The expert's episodes ``demonstration_seeds(seed, n)``, from a file if they are there.
+def recorded(folder: Path, task: str, seed: int, n: int, least: int) -> list[Recorded]:
+    """The expert's episodes for a training seed, from a file if they are there.
+
+    Where it fails, it is asked for further ones, five times ``n`` in all at most.
 
     Parameters
     ----------
     folder : Path
         Where the files are.
     task : str
-    seed, n : int
+    seed : int
         As of :func:`demonstration_seeds`.
+    n : int
+        Episodes that solve the task.
+    least : int
+        Episodes in any case.
     """
-    return _kept(folder / f"{task}-s{seed}.npz", task, demonstration_seeds(seed, n))
+    asked = max(n, least)
+    while True:
+        seeds = demonstration_seeds(seed, asked)
+        episodes = _kept(folder / f"{task}-s{seed}.npz", task, seeds)
+        missing = n - sum(episode.success for episode in episodes)
+        if missing <= 0 or asked >= PATIENCE * n:
+            return episodes
+        asked += missing
 
 
 def validation(folder: Path, task: str) -> list[Recorded]:
@@ -78,9 +93,12 @@ def validation(folder: Path, task: str) -> list[Recorded]:
 
 def _kept(path: Path, task: str, seeds: range) -> list[Recorded]:
     episodes = read(path) if path.exists() else []
-    if [episode.seed for episode in episodes[: len(seeds)]] != [*seeds]:
+    there = [episode.seed for episode in episodes]
+    if there[: len(seeds)] != [*seeds][: len(there)]:
+        episodes = []
+    if len(episodes) < len(seeds):
         env = MetaworldStateEnv(task, control="displacement", stop_at_success=False)
-        episodes = record_metaworld(env, seeds)
+        episodes = episodes + record_metaworld(env, seeds[len(episodes) :])
         env.close()
         write(path, episodes)
     return episodes[: len(seeds)]
@@ -97,8 +115,8 @@ def successes(episodes: Sequence[Recorded], n: int, task: str) -> list[Recorded]
     solved = [episode for episode in episodes if episode.success]
     if len(solved) < n:
         raise DataError(
-            f"the expert of {task} solved {len(solved)} of {len(episodes)} situations; {n} "
-            "demonstrations need more of them, see --record"
+            f"the expert of {task} solved {len(solved)} of {len(episodes)} situations, where "
+            f"{n} demonstrations were asked for: ask for fewer"
         )
     return solved[:n]
 

@@ -1,6 +1,7 @@
 """Meta-World's tables, files of episodes, and the prior: without Meta-World."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ import torch
 from lerobot_policy_tpgmm.environments.metaworld.hand import metaworld_robot
 from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
+from lerobot_policy_tpgmm.evaluation.metaworld import recordings
 from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     TaskParameterized,
@@ -126,6 +128,36 @@ def test_too_few_successes_are_refused():
     assert successes(episodes, 1, "push-v3") == episodes[:1]
     with pytest.raises(DataError, match="solved 1 of 2"):
         successes(episodes, 2, "push-v3")
+
+
+@pytest.mark.parametrize(
+    ("solves", "n", "least", "asked"),
+    [
+        (lambda seed: True, 2, 4, 4),
+        (lambda seed: True, 3, 2, 3),
+        (lambda seed: seed % 3 == 0, 4, 5, 10),
+        (lambda seed: False, 2, 1, 10),
+    ],
+    ids=["at least", "no fewer than needed", "more where it fails", "given up"],
+)
+def test_the_expert_is_asked_for_more_where_it_fails(
+    tmp_path, monkeypatch, solves, n, least, asked
+):
+    said = []
+
+    def record(env, seeds):
+        said.extend(seeds)
+        return [replace(reaching(seed, 5), success=solves(seed)) for seed in seeds]
+
+    monkeypatch.setattr(recordings, "record_metaworld", record)
+    monkeypatch.setattr(recordings, "MetaworldStateEnv", Mock())
+    episodes = recordings.recorded(tmp_path, "push-v3", 0, n, least)
+    assert [episode.seed for episode in episodes] == said == [*range(asked)]
+    # a second run asks for nothing, and one that needs fewer has the first of them
+    again = recordings.recorded(tmp_path, "push-v3", 0, n, least)
+    assert [episode.seed for episode in again] == [*range(asked)] == said
+    if any(episode.success for episode in episodes):
+        assert len(recordings.recorded(tmp_path, "push-v3", 0, 1, 2)) == 2
 
 
 def test_switches_are_where_the_gripper_jumps():
