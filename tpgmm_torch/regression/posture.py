@@ -52,8 +52,10 @@ __all__ = ["PostureSearch", "Residual"]
 TRIALS = 2
 #: Components of a smaller weight do not count.
 NEGLIGIBLE = 1e-5
-#: Damping, as a share of the precision: at first after a step that failed, and at most.
-FIRST, MOST = 1e-3, 1e8
+#: Damping, as a share of the precision: at least, at first after a step that failed, and at
+#: most. Joints that only their own operator keeps are a million times softer than hands, and
+#: whoever gives up all damping at once creeps along the valleys between them.
+LEAST, FIRST, MOST = 1e-6, 1e-3, 1e8
 #: A step that promises less than this share of the cost is not tried.
 PROMISE = 1e-9
 #: The regression is trusted where its step leaves less than this share of the way to the
@@ -61,7 +63,9 @@ PROMISE = 1e-9
 TRUST = 0.2
 #: Ticks for which a lower cost is looked for from one of so many other postures. It is gone to
 #: if it is lower by this factor, and by so much.
-LOOK, STARTS, BETTER, SLACK = 20, 64, 0.95, 50.0
+LOOK, STARTS, BETTER, SLACK = 25, 64, 0.95, 50.0
+#: After so many ticks a look that is still this many times as high is given up for the next.
+EARLY, HOPELESS = 5, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +83,7 @@ class PostureSearch:
         Where the components' searches are; behind them that for the lowest mean cost, and one
         that looks elsewhere for a lower one.
     age : Tensor of int, of shape (...), optional
-        Ticks since each robot's search began.
+        Ticks since each robot's search began, and those that looks were given up early.
     """
 
     active: Tensor | None = None
@@ -235,7 +239,10 @@ class PostureSearch:
         rows_of = (places[:, None], *where) if batch else (places, None)
         minima[rows_of] = torch.cat((own, nearest[-1:], found[-1:]))
         damping[rows_of] = damped
-        return wanted, trust, minima, damping, age + 1
+        hopeless = (here % LOOK == EARLY - 1) & (height[-1] > HOPELESS * height[-2])
+        age = age + 1
+        age[where] = torch.where(hopeless, (here // LOOK + 1) * LOOK, age[where])
+        return wanted, trust, minima, damping, age
 
 
 def _with_means(
@@ -301,7 +308,7 @@ def _descended(
         new, new_vector, new_precision = cost(there)
         gain = torch.where(tried, (here - new) / promise, 0.0)
         taken = tried & (new < here)
-        easier = torch.where(damping > FIRST, damping / 5, 0.0)
+        easier = torch.where(damping > LEAST, damping / 5, 0.0)
         harder = torch.clamp(10 * damping, FIRST, MOST)
         damping = torch.where(tried & (gain > 0.75), easier, damping)
         damping = torch.where(tried & (gain < 0.25), harder, damping)

@@ -90,14 +90,15 @@ def test_what_is_reached_is_left_to_the_regression():
 
 
 @pytest.mark.parametrize(
-    ("place", "creeps"), [([0.28, 0.0, 0.4], 3e-3), ([0.12, 0.11, 0.55], 1e-3)]
+    "place",
+    [[0.28, 0.0, 0.4], [0.12, 0.11, 0.55], [0.3, 0.1, 0.5], [0.2, -0.2, 0.5], [0.5, 0.0, 0.3]],
 )
-def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place, creeps):
+def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
     frame = Frame(torch.tensor(place, dtype=torch.float64))
     found, search = searched(frame, neutral(), 350)
     lower, upper = limits()
     assert all(bool(((q >= lower) & (q <= upper)).all()) for q in found)
-    assert float((found[-1] - found[-6]).abs().max()) < creeps  # the first's valley is long
+    assert float((found[-1] - found[-6]).abs().max()) < 1e-4
     assert bool(search.active)
     # the best of many starts, within 5 % of its distance
     generator = torch.Generator().manual_seed(1)
