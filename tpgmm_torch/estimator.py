@@ -104,6 +104,7 @@ from tpgmm_torch.training.mixture_settings import (
     block_widths,
     check_operators,
     column_units,
+    fused_samples,
     kinematics_for,
     regularization,
 )
@@ -175,7 +176,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         N and the number of coordinates, for each component and operator, and falls as 1 / N
         (``oracle_approximating_intensity``); it also moderates the variances of coordinates of
         one unit by each other (``moderated_variances``), of which few demonstrations say
-        little. 0 is the paper's.
+        little, and lets joints give way to hands by what is left unknown of them, (N + 1) /
+        (N - 1) times their covariance (``predictive_scale``). 0 is the paper's.
     tol : float, default=1e-3
         EM stops when the mean log-likelihood gains less.
     max_iter : int, default=100
@@ -1222,7 +1224,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def regression(self) -> Regression:
         """The fitted mixture conditioned on time, prepared once: what every tick asks."""
         self._check_fitted()
+        shown = None if self.shown_ is None else self.shown_.n_demonstrations
+        n_samples = fused_samples(self.covariance_shrinkage, shown)
         key = (
+            n_samples,
             self.fusion,
             self.activation,
             self.epsilon,
@@ -1255,6 +1260,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 priorities=self._checked_priorities(
                     self.operators_, self.kinematics_, self.parts_
                 ),
+                n_samples=n_samples,
             )
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]

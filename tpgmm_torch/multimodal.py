@@ -679,13 +679,17 @@ class MultimodalController:
         times: Sequence[float],
         allowed: Array | float = 0.0,
     ) -> None:
-        """Compare modes, in each of which the robot is ``here`` at a time.
+        """Compare modes, in each of which the robot is ``here`` at a time, or was to be lately.
 
-        So much less likely than any demonstration as ``allowed`` it may be.
+        So much less likely than any demonstration as ``allowed`` it may be. What the bounds of
+        motion let fall behind is on its way, and as likely as the moment before.
         """
         model, begun = self._model, Situation(self._start, frames)
         there = [
-            model._excess(k, here.new_tensor([at]), here[None], frames)
+            min(
+                model._excess(k, here.new_tensor([at - behind]), here[None], frames)
+                for behind in (0.0, LOOK)
+            )
             for k, at in enumerate(times)
         ]
         novelty = np.array([_novelty(one, begun, self._midway) for one in model.models_])

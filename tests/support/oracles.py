@@ -164,6 +164,19 @@ class Answer:
     component_means: Array
 
 
+def with_wider_rest(local: Local, scales: Array) -> Local:
+    """The covariance given time times ``sqrt(s_a s_b)``; what time explains stays."""
+    widths = np.sqrt(scales)
+    covariances = []
+    for covariance in local.covariances:
+        slope = covariance[1:, 0] / covariance[0, 0]
+        explained = covariance[0, 0] * np.outer(slope, slope)
+        wider = covariance.copy()
+        wider[1:, 1:] = explained + np.outer(widths, widths) * (covariance[1:, 1:] - explained)
+        covariances.append(wider)
+    return Local(local.means, np.stack(covariances))
+
+
 def mix(weights: Array, means: Array, covariances: Array) -> tuple[Array, Array]:
     """Mean and covariance of a mixture, from its second moment about zero."""
     mean = weights @ means

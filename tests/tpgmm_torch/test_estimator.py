@@ -901,6 +901,8 @@ def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
         oracles.Local(mean.numpy(), covariance.numpy())
         for mean, covariance in zip(model.means_, model.covariances_, strict=True)
     ]
+    # four demonstrations let the joints give way
+    mixtures[1] = oracles.with_wider_rest(mixtures[1], np.full(len(at.joints), 5 / 3))
     # the oracle knows no signs of quaternions
     here = model.operators_[0].coordinates(state, demonstration.frames)
     for start in (3, 10):
@@ -919,6 +921,23 @@ def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
     )
     assert apart(estimate.joints, torch.from_numpy(answer.mean)) < 1e-5
     assert apart(estimate.activation, torch.from_numpy(answer.activation)) < 1e-5
+
+
+def test_joints_of_few_demonstrations_give_way(tmp_path):
+    model = small_bottle()
+    assert model.regression().n_samples == 4
+    [bottle] = model.predict(few_bottles()[:1])
+    model.save(tmp_path / "model.safetensors")
+    [again] = TaskParameterizedGMM.load(tmp_path / "model.safetensors").predict(
+        few_bottles()[:1]
+    )
+    assert torch.equal(again.joints, bottle.joints)
+    # who says how covariances are shrunk is taken at the word
+    for number in (0, 0.1):
+        said = bottle_model(4, tol=1e-1, covariance_shrinkage=number).fit(few_bottles())
+        assert said.regression().n_samples is None
+        said.set_params(covariance_shrinkage="auto")
+        assert said.regression().n_samples == 4  # what was prepared is not kept
 
 
 def test_predict_is_step_after_step():

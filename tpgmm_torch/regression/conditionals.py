@@ -11,7 +11,31 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 
-__all__ = ["Conditionals", "TimeMarginals"]
+__all__ = ["Conditionals", "TimeMarginals", "predictive_scale"]
+
+
+def _degrees_of_freedom(n_samples: float) -> float:
+    return max(n_samples - 1.0, 1.0)  # one sample leaves the widest law
+
+
+def predictive_scale(n_samples: float | None) -> float:
+    """How much wider a new sample spreads than the covariance of n samples says.
+
+    ``(n + 1) / (n - 1)``, which Student's t has for its scale matrix.
+
+    Parameters
+    ----------
+    n_samples : float or None
+        None says that the covariance is known, which gives 1.
+
+    References
+    ----------
+    A. Gelman et al.: Bayesian Data Analysis, 3rd ed., section 3.2: the posterior predictive
+    of a normal law of unknown mean and variance.
+    """
+    if n_samples is None:
+        return 1.0
+    return (n_samples + 1) / _degrees_of_freedom(n_samples)
 
 
 class _OfComponents:
@@ -147,17 +171,10 @@ class Conditionals(_OfComponents):
         n_samples : float, optional
             How many independent samples n a component was learned from. Given that, the
             density of a new one: Student's t with n - 1 degrees of freedom around the same
-            mean, of the scale matrix ``(n + 1) / (n - 1)`` times the covariance [1]_.
-
-        References
-        ----------
-        .. [1] A. Gelman et al.: Bayesian Data Analysis, 3rd ed., section 3.2: the posterior
-           predictive of a normal law of unknown mean and variance.
+            mean, of the scale matrix :func:`predictive_scale` times the covariance.
         """
         residuals = (local.unsqueeze(-2) - self.at(time)).movedim(-2, 0).mT
-        covariance, degrees = self.covariance, None
-        if n_samples is not None:
-            degrees = max(n_samples - 1.0, 1.0)  # one sample leaves the widest law
-            covariance = (n_samples + 1) / degrees * covariance
+        covariance = predictive_scale(n_samples) * self.covariance
+        degrees = None if n_samples is None else _degrees_of_freedom(n_samples)
         name = "the covariance of a component"
         return gaussians.log_density(residuals, covariance, name, degrees).mT

@@ -334,7 +334,7 @@ class _Cost:
         self.centre, self.frames = centre, frames
         self.state_at, self.factors = state_at, list[Tensor]()
         self.local = []
-        for operator, one in zip(regression.operators, regression.ranked, strict=True):
+        for operator, one in zip(regression.operators, regression.fused, strict=True):
             chosen = one.select(index)
             elapsed = (time - chosen.time_mean).unsqueeze(-1)
             mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)

@@ -19,10 +19,15 @@ from torch import Tensor
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate
-from tpgmm_torch.operators import Linearization, Operator
+from tpgmm_torch.operators import Canonical, Linearization, Operator
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.active_components import ActiveComponents
-from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
+from tpgmm_torch.regression.conditionals import (
+    Conditionals,
+    TimeMarginals,
+    predictive_scale,
+)
 from tpgmm_torch.regression.joint_limits import within
 from tpgmm_torch.regression.kalman_update import KalmanUpdate
 from tpgmm_torch.regression.prior import PRIOR_STD
@@ -127,7 +132,10 @@ class Regression:
         all.
     priorities : sequence of int, optional
         One per operator: those of a higher number are fulfilled as if the others were not
-        there, and these in what is left of the joints, see :attr:`ranked`.
+        there, and these in what is left of the joints, see :attr:`fused`.
+    n_samples : float, optional
+        Of each component, if joints shall give way by what few of them leave unknown, see
+        :attr:`fused`.
     """
 
     kinematics: Kinematics
@@ -140,6 +148,7 @@ class Regression:
     prior_std: float | Tensor = PRIOR_STD
     negligible: float = 1e-9
     priorities: Sequence[int] | None = None
+    n_samples: float | None = None
 
     def step(
         self,
@@ -311,20 +320,36 @@ class Regression:
         return tuple(map(Candidate, means, covariances, shares))
 
     @cached_property
-    def ranked(self) -> tuple[Conditionals, ...]:
-        """The conditionals as they are fused: covariances of what has priority are scaled down.
+    def fused(self) -> tuple[Conditionals, ...]:
+        """The conditionals as they are fused: with covariances that say who gives way.
 
-        As that scale goes to zero, the product (2) becomes a strict hierarchy: the mean is the
-        one of the higher operators, and in the null space of their Jacobians that of the
-        lower. A scale above zero is its damping.
+        Those of what has priority are scaled down. As that scale goes to zero, the product (2)
+        becomes a strict hierarchy: the mean is the one of the higher operators, and in the null
+        space of their Jacobians that of the lower. A scale above zero is its damping.
+
+        Those of joints beside other operators are scaled up, by :func:`predictive_scale` of the
+        samples. What hands do in the frame of an object is asked for in every situation alike;
+        where the joints are then depends on the situation, and few of them show too little of
+        it: where a new one is turned otherwise, joints would hold the hands back.
         """
-        if self.priorities is None:
-            return tuple(self.conditionals)
-        levels = sorted(set(self.priorities))
-        return tuple(
-            replace(one, covariance=one.covariance * STRICT ** levels.index(priority))
-            for one, priority in zip(self.conditionals, self.priorities, strict=True)
-        )
+        scales = [1.0] * len(self.operators)
+        if self.priorities is not None:
+            levels = sorted(set(self.priorities))
+            scales = [STRICT ** levels.index(priority) for priority in self.priorities]
+        members = [leaves([operator]) for operator in self.operators]
+        scale = predictive_scale(self.n_samples)
+        if all(isinstance(leaf, Canonical) for each in members for leaf in each):
+            scale = 1.0  # there is nobody to give way to
+        fused = []
+        for one, own, each in zip(self.conditionals, scales, members, strict=True):
+            if scale != 1 and any(isinstance(leaf, Canonical) for leaf in each):
+                widths = one.covariance.new_ones(one.covariance.shape[-1])
+                sizes = [leaf.dimension(self.kinematics) for leaf in each]
+                for leaf, part in zip(each, widths.split(sizes), strict=True):
+                    part.fill_(math.sqrt(scale) if isinstance(leaf, Canonical) else 1.0)
+                one = replace(one, covariance=one.covariance * widths[:, None] * widths)
+            fused.append(one if own == 1 else replace(one, covariance=one.covariance * own))
+        return tuple(fused)
 
     @cached_property
     def _update(self) -> KalmanUpdate | None:
@@ -334,7 +359,7 @@ class Regression:
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            return KalmanUpdate(self.kinematics, self.operators, self.ranked)
+            return KalmanUpdate(self.kinematics, self.operators, self.fused)
 
     @cached_property
     def _frame_names(self) -> tuple[str, ...]:
@@ -349,7 +374,7 @@ class Regression:
     @cached_property
     def _components(self) -> Components:
         """All of them."""
-        conditionals = self.ranked
+        conditionals = self.fused
         if self._update is not None:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)

@@ -77,7 +77,7 @@ def test_places_leave_the_error_of_the_grasp(folder, settings):
     result = Results(folder / "cells").read(cell)
     errors = [row["put_mm"] for row in result["episodes"]]
     assert np.median([row["grasp_mm"] for row in result["episodes"]]) < 10
-    assert min(errors) > 3 and np.median(errors) > 5
+    assert min(errors) > 2 and np.median(errors) > 5  # 0.5 where the bottle is seen
     assert {"put_deg", "standing", "peak_speed"} <= set(result["episodes"][0])
 
 

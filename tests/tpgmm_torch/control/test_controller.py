@@ -397,7 +397,7 @@ def test_a_robot_that_was_stopped_in_motion_goes_on_gently(holder, lead):
             stands = command.reference
         elif tick == 500:  # it is led with care if it holds something
             ahead = float((command.reference - stands).abs().max())
-        if tick == 660:  # what is left is small, and soon gone
+        if tick == 680:  # what is left is small, and soon gone
             assert (command.reference - command.estimate.joints).abs().max() < 1e-3
     assert ahead == pytest.approx(lead, rel=1e-3)
     # as fast as it was before and would have been at most, where it was 0.8 rad/s

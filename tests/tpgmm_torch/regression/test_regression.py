@@ -19,9 +19,10 @@ from tests.support.mixtures import (
     conditionals_of,
     times,
 )
-from tests.support.worlds import OBJECT, upper_body
-from tpgmm_torch import Frame
+from tests.support.worlds import LEFT, OBJECT, RIGHT, OnRobot, upper_body
+from tpgmm_torch import AbsolutePosition, Canonical, Frame, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 
 EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
@@ -61,6 +62,66 @@ def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion
             assert_close(activations[index], expected.activation)
             assert_close(estimate.joints[index], expected.mean)
             assert_close(estimate.covariance[index], expected.covariance)
+
+
+@ACTIVATIONS
+@FUSIONS
+@pytest.mark.parametrize(
+    "case",
+    [
+        CASES["the paper's"],
+        CASES["three"],
+        Case(
+            OnRobot(),
+            [Stack(RelativePosition(LEFT, OBJECT), Canonical()), AbsolutePosition(RIGHT)],
+            lambda at: [
+                oracles.stack(
+                    oracles.relative_position(at, LEFT, OBJECT), oracles.canonical(at)
+                ),
+                oracles.absolute_position(at, RIGHT),
+            ],
+        ),
+    ],
+    ids=["the paper's", "three", "stacked"],
+)
+def test_joints_give_way_by_what_few_samples_leave_unknown(case, activation, fusion):
+    problem = Problem.of(case, 3)
+    how = {"activation": activation, "fusion": fusion, "epsilon": EPSILON}
+    estimate = problem.regression(n_samples=3, **how).step(
+        times(), problem.state, problem.frames
+    )
+    plain = problem.regression(**how).step(times(), problem.state, problem.frames)
+    assert float((estimate.joints - plain.joints).abs().max()) > 1e-3
+    wider = []
+    for operator, local in zip(case.operators, problem.mixtures, strict=True):
+        scales = [
+            [2.0 if isinstance(leaf, Canonical) else 1.0]
+            * leaf.dimension(case.world.kinematics)
+            for leaf in leaves([operator])
+        ]
+        wider.append(oracles.with_wider_rest(local, np.concatenate(scales)))
+    options = {"activation": activation, **options_of(case, fusion)}
+    expected = replace(problem, mixtures=wider).answer(float(times()), **options)
+    assert_close(estimate.activation, expected.activation)
+    assert_close(estimate.joints, expected.mean)
+    assert_close(estimate.covariance, expected.covariance)
+    # the law of the demonstrations themselves is as it was
+    local = [
+        operator.coordinates(problem.state, problem.frames)[None] for operator in case.operators
+    ]
+    both = [
+        problem.regression(n_samples=n).log_density(times()[None], local) for n in (None, 3)
+    ]
+    assert torch.equal(*both)
+
+
+def test_joints_alone_have_nobody_to_give_way_to():
+    problem = Problem.of(CASES["canonical"], 3)
+    plain, few = (
+        problem.regression(n_samples=n).step(times(), problem.state, problem.frames)
+        for n in (None, 3)
+    )
+    assert_equal_estimates(plain, few)
 
 
 @EVERY_CASE

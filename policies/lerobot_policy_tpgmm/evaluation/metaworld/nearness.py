@@ -118,6 +118,7 @@ class Nearness:
             "robot": model.kinematics_,
             "holds": [],
             "parts": None,  # they are in the components
+            "covariance_shrinkage": 0.0,  # the prior says what few demonstrations do not
         }
         prior = TaskParameterizedGMM.from_parameters(
             model.weights_, model.means_, covariances, model.time_, **settings
