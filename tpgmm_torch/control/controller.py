@@ -187,6 +187,7 @@ class Controller:
         self._frames = self._converted(frames or {})
         self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
         self._trust, self._watch = trust, HoldWatch(kinematics)
+        self._said: frozenset[str] = frozenset()  # of whose holds somebody told
         self._inputs: Inputs | None = None
         if trust is not None:
             self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
@@ -309,11 +310,16 @@ class Controller:
             at = torch.where(measured.isnan(), at, measured)
         seen = None if frames is None else dict(self._frames)
         stands = at if measured is None else torch.where(measured.isnan(), at, measured)
+        self._said = self._said.union(told or ())
         if self._inputs is not None and self._inputs.poses and not told:
-            known = {hold.frame for hold in self.holding.holds}  # from when to when
+            begins: dict[str, float] = {}
+            for hold in self.holding.holds:
+                begins[hold.frame] = min(hold.begin, begins.get(hold.frame, math.inf))
+            said = begins.keys() & self._said
+            now = time.expand(stands.shape[:-1])
             self._watch, self.holding, seen = self._watch.look(
-                self._inputs.poses.keys() - known, self._frames, stands, self.holding,
-                _of_each(seconds, stands),
+                self._inputs.poses.keys() - said, self._frames, stands, self.holding,
+                _of_each(seconds, stands), {n: now < at for n, at in begins.items()},
             )  # fmt: skip
         self.holding = self.holding.advance(
             time, stands, seen, told, dt=_of_each(seconds, stands)

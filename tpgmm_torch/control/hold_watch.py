@@ -67,6 +67,9 @@ class HoldWatch:
     run away with it. One that moved otherwise was moved by somebody else. What was found to be
     held is free again once it is 5 cm from where the link would have it for 0.3 s.
 
+    An object that the skill holds later is taken to be where it is seen, and only watched for a
+    hand that takes it along too early; from the skill's own time on its hold counts again.
+
     Parameters
     ----------
     kinematics : Kinematics
@@ -87,6 +90,7 @@ class HoldWatch:
         joints: Tensor,
         holding: Holding,
         dt: float | Tensor,
+        free_yet: Mapping[str, Tensor],
     ) -> tuple[Self, Holding, dict[str, Frame]]:
         """What is held after one more look, and where objects are taken to be.
 
@@ -102,32 +106,51 @@ class HoldWatch:
             What is known to be held.
         dt : float or Tensor of shape (...)
             Since the last look [s].
+        free_yet : mapping of str to Tensor of bool, of shape (...)
+            Of objects that the skill holds, for which robots it does not yet.
         """
         rests, found, places = dict(self.rests), self.found, dict(frames)
+        for name, yet in free_yet.items():
+            if name in found and bool((~yet).any()):
+                holding = holding.untold(name, ~yet)
+            if not bool(yet.any()):  # of nobody's interest any more
+                found = found - {name}
+                rests.pop(name, None)
         for name in names:
-            seen, rest = frames[name], rests.get(name)
+            seen, rest, yet = frames[name], rests.get(name), free_yet.get(name)
+            if yet is not None and not bool(yet.any()):
+                continue
             if rest is None:
                 rests[name] = Rest(seen, seen, joints, joints.new_zeros(joints.shape[:-1]))
             elif rest.seen is not seen:
                 rest = replace(rest, seen=seen, since=rest.since + dt)
-                rest, holding, taken = self._taken(name, rest, joints, holding, dt)
+                rest, holding, taken = self._taken(name, rest, joints, holding, dt, yet)
                 found = found | {name} if taken else found
                 due = rest.since >= LOOK
                 if name in found and (due if isinstance(due, bool) else bool(due.any())):
-                    rest, holding = self._lost(name, rest, joints, holding, due)
+                    rest, holding = self._lost(name, rest, joints, holding, due, yet)
                 rests[name], places[name] = rest, rest.pose
             elif rest.pose is seen:  # it has not moved
                 rests[name] = replace(rest, joints=joints)
             else:
                 places[name] = rest.pose
+            if yet is not None:
+                places[name] = seen
         return replace(self, rests=rests, found=found), holding, places
 
     def _taken(
-        self, name: str, rest: Rest, joints: Tensor, holding: Holding, dt: float | Tensor
+        self,
+        name: str,
+        rest: Rest,
+        joints: Tensor,
+        holding: Holding,
+        dt: float | Tensor,
+        yet: Tensor | None,
     ) -> tuple[Rest, Holding, bool]:
         """Whether a link has taken an object along, or somebody else has moved it."""
         moved = rest.pose.change(rest.seen, MOVED, TURNED)
         free = holding.free(name, moved)
+        free = free if yet is None else free & yet
         rests = free & (moved < RESTING)
         settles, held, elsewhere = rests, torch.zeros_like(rests), torch.zeros_like(rests)
         if bool((asked := free & ~rests).any()):
@@ -156,12 +179,19 @@ class HoldWatch:
         return replace(rest, pose=pose, joints=stood), holding, bool(held.any())
 
     def _lost(
-        self, name: str, rest: Rest, joints: Tensor, holding: Holding, due: bool | Tensor
+        self,
+        name: str,
+        rest: Rest,
+        joints: Tensor,
+        holding: Holding,
+        due: bool | Tensor,
+        yet: Tensor | None,
     ) -> tuple[Rest, Holding]:
         """Let go what is not where its link would have it, of robots that are due."""
         carried = holding.carried(name, self.kinematics.state(joints))
         due = torch.as_tensor(due, device=joints.device)
         far = ~holding.free(name, rest.away)
+        far = far if yet is None else far & yet
         far = far & (carried.change(rest.seen, LOST, LOST_TURN) >= 1)
         away = torch.where(due, torch.where(far, rest.away + rest.since, 0.0), rest.away)
         lost = due & (away >= LOST_TIME)

@@ -244,6 +244,21 @@ class Holding:
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
 
+    def untold(self, name: str, where: Tensor) -> Self:
+        """The holds of the skill count again for an object, whatever was told before.
+
+        Parameters
+        ----------
+        name : str
+        where : Tensor of bool, of shape (...)
+            For which robots.
+        """
+        before = self.held[name]
+        told = torch.as_tensor(before.told)
+        if not bool((told & where).any()):
+            return self
+        return replace(self, held={**self.held, name: replace(before, told=told & ~where)})
+
     def carried(self, name: str, state: RobotState) -> Frame:
         """Where an object is that is or was held, if its link has it still."""
         return self._with(state, name, self.held[name]).pose(name)

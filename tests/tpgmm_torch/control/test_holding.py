@@ -20,6 +20,7 @@ from tests.support.worlds import LEFT, RIGHT, upper_body
 from tpgmm_torch import Frame, Hold, RelativeOrientation, RelativePosition, Situation
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.sensing.trust import Trust
 
 LATER = Frame([0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0])
 
@@ -369,6 +370,27 @@ def test_what_is_carried_is_put_exactly_however_it_was_grasped():
     assert float(placed(places, scene, slips).median()) > 0.02
     # what follows the bottle in its own hand goes nowhere
     assert float(placed(live, scene, slips).median()) > 0.05
+
+
+@pytest.mark.parametrize("early", [0.6, 1.2])
+def test_hands_do_not_run_away_with_what_they_take_too_early(early):
+    """8 to 15 cm beside the grasp that was shown: it moves with the hand from then on."""
+    model, scene = carrying_model(), scenes(4, seed=9)
+    controller = model.controller(scene.start, scene.frames, trust=Trust())
+    bottle, grasp, fastest = scene.bottle, None, 0.0
+    while float(controller.time.max()) < HELD.end + 0.1:
+        if float(controller.time.max()) < HELD.end:
+            hand = upper_body().state(controller.reference).pose(HAND)
+            if grasp is None and float(controller.time.max()) >= HELD.begin - early:
+                grasp = bottle.seen_from(hand)
+            bottle = bottle if grasp is None else hand.compose(grasp)
+        seen = {**scene.frames, "bottle": bottle}
+        command = controller.step(0.02, joints=controller.reference, frames=seen)
+        fastest = max(fastest, float(command.velocity.abs().max()))
+    assert float((bottle.position - scene.tray.position).norm(dim=-1).max()) < 1e-4
+    assert fastest < 3  # of 4 rad/s
+    # from when to when the skill holds it counts as ever
+    assert bool(controller.holding.free("bottle", controller.time.expand(4)).all())
 
 
 def test_a_prediction_carries_what_it_holds():
