@@ -110,10 +110,10 @@ class HoldWatch:
             Of objects that the skill holds, for which robots it does not yet.
         """
         rests, found, places = dict(self.rests), self.found, dict(frames)
-        for name, yet in free_yet.items():
-            if name in found and bool((~yet).any()):
-                holding = holding.untold(name, ~yet)
-            if not bool(yet.any()):  # of nobody's interest any more
+        for name, not_held in free_yet.items():
+            if name in found and not bool(not_held.all()):
+                holding = holding.untold(name, ~not_held)
+            if not bool(not_held.any()):  # the skill knows where it is
                 found = found - {name}
                 rests.pop(name, None)
         for name in names:
