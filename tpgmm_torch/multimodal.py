@@ -478,18 +478,18 @@ class MultimodalTaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         with torch.inference_mode():
             motions = model.predict(tried, candidates=False)
         return [
-            self._excess(mode, time, motion.joints, one.frames_at(time))
+            float(self._excess(mode, time, motion.joints, one.frames_at(time)).max())
             for one, motion in zip(tried, motions, strict=True)
         ]
 
     def _excess(
         self, mode: int, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]
-    ) -> float:
-        """By how much less likely than any demonstration a motion is in its worst moment."""
+    ) -> Array:
+        """By how much less likely than any demonstration each moment of a motion is, (T,)."""
         model = self.models_[mode]
         complete = model._completed(joints[0], frames)
         motion = Demonstration(time, joints, complete, model.kinematics_.joint_names)
-        return max(float(model.surprise([motion])[0].max() - self.limits_[mode]), 0.0)
+        return np.maximum(np.asarray(model.surprise([motion])[0]) - self.limits_[mode], 0.0)
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "models_"):
@@ -645,7 +645,7 @@ class MultimodalController:
         asked, allowed = self.controller.command, np.zeros(model.n_modes_)
         if asked is not None and bool(asked.estimate.joints.isfinite().all()):
             joints, at = asked.estimate.joints[None], here.new_tensor([times[self.mode]])
-            allowed[self.mode] = model._excess(self.mode, at, joints, places)
+            allowed[self.mode] = model._excess(self.mode, at, joints, places)[0]
         self._weigh(here, places, times, allowed)
         chances = self.choice.probabilities
         if chances[self.choice.mode] > CLEARLY * chances[self.mode]:
@@ -685,11 +685,9 @@ class MultimodalController:
         motion let fall behind is on its way, and as likely as the moment before.
         """
         model, begun = self._model, Situation(self._start, frames)
+        twice = here.expand(2, -1)
         there = [
-            min(
-                model._excess(k, here.new_tensor([at - behind]), here[None], frames)
-                for behind in (0.0, LOOK)
-            )
+            model._excess(k, here.new_tensor([at - LOOK, at]), twice, frames).min()
             for k, at in enumerate(times)
         ]
         novelty = np.array([_novelty(one, begun, self._midway) for one in model.models_])

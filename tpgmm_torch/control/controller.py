@@ -187,6 +187,9 @@ class Controller:
         self._frames = self._converted(frames or {})
         self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
         self._trust, self._watch = trust, HoldWatch(kinematics)
+        self._begins: dict[str, float] = {}  # when the skill first holds what it holds
+        for hold in self.holding.holds:
+            self._begins[hold.frame] = min(hold.begin, self._begins.get(hold.frame, math.inf))
         self._said: frozenset[str] = frozenset()  # of whose holds somebody told
         self._inputs: Inputs | None = None
         if trust is not None:
@@ -312,11 +315,8 @@ class Controller:
         stands = at if measured is None else torch.where(measured.isnan(), at, measured)
         self._said = self._said.union(told or ())
         if self._inputs is not None and self._inputs.poses and not told:
-            begins: dict[str, float] = {}
-            for hold in self.holding.holds:
-                begins[hold.frame] = min(hold.begin, begins.get(hold.frame, math.inf))
+            begins, now = self._begins, time.expand(stands.shape[:-1])
             said = begins.keys() & self._said
-            now = time.expand(stands.shape[:-1])
             self._watch, self.holding, seen = self._watch.look(
                 self._inputs.poses.keys() - said, self._frames, stands, self.holding,
                 _of_each(seconds, stands), {n: now < at for n, at in begins.items()},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -85,7 +85,7 @@ class HoldWatch:
 
     def look(
         self,
-        names: Iterable[str],
+        names: Set[str],
         frames: Mapping[str, Frame],
         joints: Tensor,
         holding: Holding,
@@ -96,7 +96,7 @@ class HoldWatch:
 
         Parameters
         ----------
-        names : iterable of str
+        names : set of str
             Objects that are seen at each tick.
         frames : mapping of str to Frame
             Where they are seen, of the batch's shape.
@@ -114,12 +114,10 @@ class HoldWatch:
             if name in found and not bool(not_held.all()):
                 holding = holding.untold(name, ~not_held)
             if not bool(not_held.any()):  # the skill knows where it is
-                found = found - {name}
+                found, names = found - {name}, names - {name}
                 rests.pop(name, None)
         for name in names:
-            seen, rest, yet = frames[name], rests.get(name), free_yet.get(name)
-            if yet is not None and not bool(yet.any()):
-                continue
+            seen, rest, yet = frames[name], rests.get(name), free_yet.get(name, True)
             if rest is None:
                 rests[name] = Rest(seen, seen, joints, joints.new_zeros(joints.shape[:-1]))
             elif rest.seen is not seen:
@@ -134,7 +132,7 @@ class HoldWatch:
                 rests[name] = replace(rest, joints=joints)
             else:
                 places[name] = rest.pose
-            if yet is not None:
+            if name in free_yet:
                 places[name] = seen
         return replace(self, rests=rests, found=found), holding, places
 
@@ -145,12 +143,11 @@ class HoldWatch:
         joints: Tensor,
         holding: Holding,
         dt: float | Tensor,
-        yet: Tensor | None,
+        yet: bool | Tensor,
     ) -> tuple[Rest, Holding, bool]:
         """Whether a link has taken an object along, or somebody else has moved it."""
         moved = rest.pose.change(rest.seen, MOVED, TURNED)
-        free = holding.free(name, moved)
-        free = free if yet is None else free & yet
+        free = holding.free(name, moved) & yet
         rests = free & (moved < RESTING)
         settles, held, elsewhere = rests, torch.zeros_like(rests), torch.zeros_like(rests)
         if bool((asked := free & ~rests).any()):
@@ -185,13 +182,12 @@ class HoldWatch:
         joints: Tensor,
         holding: Holding,
         due: bool | Tensor,
-        yet: Tensor | None,
+        yet: bool | Tensor,
     ) -> tuple[Rest, Holding]:
         """Let go what is not where its link would have it, of robots that are due."""
         carried = holding.carried(name, self.kinematics.state(joints))
         due = torch.as_tensor(due, device=joints.device)
-        far = ~holding.free(name, rest.away)
-        far = far if yet is None else far & yet
+        far = ~holding.free(name, rest.away) & yet
         far = far & (carried.change(rest.seen, LOST, LOST_TURN) >= 1)
         away = torch.where(due, torch.where(far, rest.away + rest.since, 0.0), rest.away)
         lost = due & (away >= LOST_TIME)

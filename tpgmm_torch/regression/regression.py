@@ -336,19 +336,24 @@ class Regression:
         if self.priorities is not None:
             levels = sorted(set(self.priorities))
             scales = [STRICT ** levels.index(priority) for priority in self.priorities]
-        members = [leaves([operator]) for operator in self.operators]
-        scale = predictive_scale(self.n_samples)
-        if all(isinstance(leaf, Canonical) for each in members for leaf in each):
-            scale = 1.0  # there is nobody to give way to
+        wider = math.sqrt(predictive_scale(self.n_samples))
+        if all(isinstance(leaf, Canonical) for leaf in leaves(self.operators)):
+            wider = 1.0  # there is nobody to give way to
         fused = []
-        for one, own, each in zip(self.conditionals, scales, members, strict=True):
-            if scale != 1 and any(isinstance(leaf, Canonical) for leaf in each):
-                widths = one.covariance.new_ones(one.covariance.shape[-1])
-                sizes = [leaf.dimension(self.kinematics) for leaf in each]
-                for leaf, part in zip(each, widths.split(sizes), strict=True):
-                    part.fill_(math.sqrt(scale) if isinstance(leaf, Canonical) else 1.0)
-                one = replace(one, covariance=one.covariance * widths[:, None] * widths)
-            fused.append(one if own == 1 else replace(one, covariance=one.covariance * own))
+        # what is made while inference mode is on could not serve where gradients are wanted
+        with torch.inference_mode(False):
+            for one, operator, own in zip(
+                self.conditionals, self.operators, scales, strict=True
+            ):
+                widths = one.covariance.new_tensor(
+                    [
+                        wider if isinstance(leaf, Canonical) else 1.0
+                        for leaf in leaves([operator])
+                        for _ in range(leaf.dimension(self.kinematics))
+                    ]
+                )
+                covariance = one.covariance * widths[:, None] * widths * own
+                fused.append(replace(one, covariance=covariance))
         return tuple(fused)
 
     @cached_property

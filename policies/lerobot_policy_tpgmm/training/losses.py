@@ -12,7 +12,6 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
 from tpgmm_torch import Frame, Kinematics, Operator, RobotState, quaternions
-from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.regression import Regression
@@ -59,7 +58,7 @@ def regression(
         first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
         local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
-    shown = None if config.shown is None else Shown.from_config(config.shown).n_demonstrations
+    shown = None if config.shown is None else config.shown["n_demonstrations"]
     weights = mixture.logits.softmax(0)
     covariances = [triangle @ triangle.mT for triangle in mixture.triangles()]
     return Regression(
