@@ -36,6 +36,7 @@ from lerobot_policy_tpgmm.observations import (
     poses_named,
 )
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
+from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
@@ -329,7 +330,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Begin a new episode with the next observation."""
         self._controller: SkillController | None = None
         self._chunk: Chunk | None = None
-        self._timestamp: Tensor | None = None
+        self._ticks = TickDurations()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -340,7 +341,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         batch : dict of str to Tensor
             ``observation.state`` (B, n_state) and what the frames are read from; in the middle
             of an episode they need not be finite. ``observation.timestamp`` (B, 1) says how
-            much time has passed [s], where it is there.
+            much time has passed [s], where it is there; what a tick comes late is caught up by
+            those that follow.
 
         Returns
         -------
@@ -393,9 +395,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ahead = last.first.resumed(
                 last.moments[passed], passed / self.config.rate, measured, poses
             )
-        told = self._timestamp
         references = [self._step(ahead, batch, 1 / self.config.rate)]
-        self._timestamp = told
         moments, first, ahead = [ahead], ahead, ahead.ahead()
         while len(references) < self.config.chunk_size:
             ahead.step(1 / self.config.rate)
@@ -414,7 +414,6 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _begin(self, batch: Mapping[str, Tensor]) -> SkillController:
         check_rate(batch, self.config.rate)
         model = self.to_estimator()
-        self._timestamp = None
         joints, frames = self._observed(batch), self.frames.frames(batch)
         if len(joints) == 1:  # one robot is sooner computed without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
@@ -451,12 +450,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return controller.reference.reshape(-1, start.shape[-1])
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
-        """Seconds since the last observation."""
+        """Seconds for which the next reference is."""
         period, now = 1 / self.config.rate, batch.get(TIMESTAMP)
-        if now is None:
-            return period
-        last, self._timestamp = self._timestamp, now.flatten().to(torch.float64).cpu()
-        return period if last is None else self._timestamp - last
+        return period if now is None else self._ticks.next(now, period)
 
     def _check_start(self, start: Tensor, wanted: Tensor) -> None:
         """Refuse to move robots that stand far from where the skill begins."""
