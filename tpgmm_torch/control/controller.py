@@ -321,8 +321,9 @@ class Controller:
                 self._inputs.poses.keys() - said, self._frames, stands, self.holding,
                 _of_each(seconds, stands), {n: now < at for n, at in begins.items()},
             )  # fmt: skip
+        shares = {} if self._inputs is None else self._inputs.shares
         self.holding = self.holding.advance(
-            time, stands, seen, told, dt=_of_each(seconds, stands)
+            time, stands, seen, told, dt=_of_each(seconds, stands), shares=shares
         )
         at = self._unbent(at)
         estimate = self._estimated(time, at)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Self
 
 import torch
@@ -56,6 +57,10 @@ class Held:
         Where it was seen first since it was taken, and last.
     rests : bool, or Tensor of bool, of shape (...)
         Whether the link has moved since then without it, and does not move it yet.
+    joints : Tensor of shape (..., n_joints), optional
+        Where the robots stood [rad or m], as late as it is seen; None if it is seen at once.
+    shown : Frame, optional
+        Its pose in the link when it was last seen not to move with it, both equally late.
     """
 
     carrier: int | Tensor = -1
@@ -67,6 +72,8 @@ class Held:
     first: Frame | None = None
     last: Frame | None = None
     rests: bool | Tensor = False
+    joints: Tensor | None = None
+    shown: Frame | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +87,9 @@ class Holding:
     held is seen anew. Afterwards what is seen is followed within seconds, while the link
     hardly moves: two hands that come together may have moved alike, and what is held may slip.
     While it is seen to rest although the link moves, the joints do not move it: it is not held
-    yet, whatever the skill's time says.
+    yet, whatever the skill's time says. What takes the noise from its pose makes that late:
+    joints become as late from when it is taken on, since how it is held is between poses of
+    one moment.
 
     Parameters
     ----------
@@ -145,6 +154,7 @@ class Holding:
         told: Mapping[str, str | None] | None = None,
         where: Tensor | None = None,
         dt: float | Tensor = 0.0,
+        shares: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> Self:
         """The next moment.
 
@@ -164,6 +174,9 @@ class Holding:
             For which robots that is told; by default for all.
         dt : float, or Tensor of shape (...), default=0
             Since the last moment [s].
+        shares : mapping of str to Tensor of shape (...), optional
+            Of objects that are seen late, how much of what they do now is in where they are
+            seen; the rest is what was seen before.
 
         Raises
         ------
@@ -193,7 +206,8 @@ class Holding:
                     live = _held(carrier) & ~_same(seen[name], before.taken)
                     if bool(live.any()):
                         state = self.kinematics.state(joints) if state is None else state
-                        held[name] = self._seen(held[name], seen[name], live, state, dt)
+                        late = _later(held[name], joints, shares.get(name))
+                        held[name] = self._seen(late, seen[name], live, state, dt)
                 continue
             state = self.kinematics.state(joints) if state is None else state
             now = self._now(name, place, before, seen.get(name), state)
@@ -340,8 +354,9 @@ class Holding:
         assert held.grasp is not None and held.stood is not None
         grasp, moving = held.grasp, held.stood.position.isinf().all(-1)
         dt, links = torch.as_tensor(dt, dtype=grasp.position.dtype), held.link
+        then = state if held.joints is None else self.kinematics.state(held.joints)
         for index in _indices(held.carrier) if bool(moving.any()) else ():
-            link = state.pose(self.kinematics.links[index])
+            link = then.pose(self.kinematics.links[index])
             before = link if links is None else links
             here = live & moving & torch.as_tensor(held.carrier == index)
             behind = before.change(link, MOVED, TURNED) / BEHIND
@@ -351,16 +366,26 @@ class Holding:
         held = replace(held, grasp=grasp, link=links)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
             return held
-        return self._shifted(held, seen, live, state)
+        return self._shifted(held, seen, live, state, then)
 
-    def _shifted(self, held: Held, seen: Frame, live: Tensor, state: RobotState) -> Held:
-        """The same after a look at what may be shifted in its link, for robots that see it."""
+    def _shifted(
+        self, held: Held, seen: Frame, live: Tensor, state: RobotState, then: RobotState
+    ) -> Held:
+        """The same after a look at what may be shifted in its link, for robots that see it.
+
+        Whether it moves with its link is asked of where the robots stood ``then``, as late as
+        it is seen. While it rests, it is not late, and in the hand where that is now.
+        """
         assert held.grasp is not None and held.stood is not None
         grasp, stood, rests = held.grasp, held.stood, torch.as_tensor(held.rests)
         begins, links, first = stood.position.isnan().all(-1), held.link, held.first
+        shown = grasp if held.shown is None else choose(begins, grasp, held.shown)
         for index in _indices(held.carrier):
-            link = state.pose(self.kinematics.links[index])
-            now = seen.seen_from(link)
+            link = then.pose(self.kinematics.links[index])
+            together = seen.seen_from(link)
+            now = together
+            if then is not state:
+                now = seen.seen_from(state.pose(self.kinematics.links[index]))
             here = live & torch.as_tensor(held.carrier == index)
             links = link if links is None else choose(here & begins, link, links)
             first = seen if first is None else choose(here & begins, seen, first)
@@ -368,18 +393,24 @@ class Holding:
             still = (stirred > STIRRED) & (first.change(seen, MOVED, TURNED) < RESTS * stirred)
             rests = torch.where(here, (rests & ~begins) | still, rests)
             moved = held.stood.change(link, MOVED, TURNED)
-            along = held.grasp.change(now, MOVED, TURNED) < PERHAPS * moved  # false of NaN
+            along = shown.change(together, MOVED, TURNED) < PERHAPS * moved  # false of NaN
+            goes = here & along & (moved >= 1)
             grasp = choose(here & ~along, now, grasp)
+            if then is not state:
+                grasp = choose(goes, together, grasp)
+            shown = choose(here & ~along, together, shown)
             stood = choose(here & ~along, link, stood)
-            stood = choose(here & along & (moved >= 1), _constant(stood, math.inf), stood)
+            stood = choose(goes, _constant(stood, math.inf), stood)
         moving = stood.position.isinf().all(-1)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
-            return Held(held.carrier, grasp, held.taken, held.told, stood, links)
+            return Held(
+                held.carrier, grasp, held.taken, held.told, stood, links, joints=held.joints
+            )
         last = seen if held.last is None else choose(live, seen, held.last)
-        rests = rests & ~moving
-        return Held(
-            held.carrier, grasp, held.taken, held.told, stood, links, first, last, rests
-        )
+        return replace(
+            held, grasp=grasp, stood=stood, link=links, first=first, last=last,
+            rests=rests & ~moving, shown=shown,
+        )  # fmt: skip
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""
@@ -400,6 +431,16 @@ class Holding:
 
 
 FREE = Held()
+
+
+def _later(held: Held, joints: Tensor, share: Tensor | None) -> Held:
+    """With joints that are as late as the object is seen."""
+    if share is None and held.joints is None:
+        return held
+    if share is None:
+        return replace(held, joints=None)
+    last = joints if held.joints is None else held.joints
+    return replace(held, joints=last + share.unsqueeze(-1) * (joints - last))
 
 
 def _constant(like: Frame, value: float) -> Frame:

@@ -155,6 +155,13 @@ class Inputs:
             value = np.where(reading.believed[..., None], value, np.nan)
         return torch.from_numpy(value).to(self.kinematics.lower)
 
+    @property
+    def shares(self) -> dict[str, Tensor]:
+        """Of the last look at an object in its pose (...), of those that filters make late."""
+        shares = {name: np.asarray(smooth.share) for name, smooth in self.filters.items()}
+        like = self.kinematics.lower
+        return {n: torch.from_numpy(s).to(like) for n, s in shares.items() if (s < 1).any()}
+
     def untrusted(self) -> Mask | None:
         """Robots (...) that have had nothing to believe for too long; None if there is none."""
         signals = self._signals()

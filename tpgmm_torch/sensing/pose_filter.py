@@ -89,6 +89,8 @@ class PoseFilter:
         The last one that was seen.
     history : ndarray of shape (15, ...)
         Squared second differences [m^2].
+    share : float, or ndarray of shape (...)
+        Of the last pose that was seen, in the pose: below 1, the pose is late.
     """
 
     settings: OneEuro
@@ -97,6 +99,7 @@ class PoseFilter:
     change: Floats
     last: Floats
     history: Floats
+    share: float | Floats = 1.0
 
     @classmethod
     def of(cls, settings: OneEuro, pose: Floats) -> Self:
@@ -129,15 +132,17 @@ class PoseFilter:
         speed = np.sqrt(np.square(velocity) @ METRIC)
         with np.errstate(divide="ignore"):
             cutoff = settings.cutoff * (1 + settings.noise**2 / variance)
-        share = _share(cutoff + settings.slope * speed, dt)[..., None]
+        weight = _share(cutoff + settings.slope * speed, dt)
+        share = weight[..., None]
         out = self.pose + share * (pose - self.pose)
         turn = out[..., 3:]
         out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
         # what passes whole passes bit for bit
         out = np.where(share == 1, pose, out)
         return self._with(
-            pose=out, velocity=velocity, change=change, last=pose, history=history
-        )
+            pose=out, velocity=velocity, change=change, last=pose, history=history,
+            share=weight,
+        )  # fmt: skip
 
     def _with(self, **changes: Floats) -> Self:
         """``dataclasses.replace`` without its checks, which take as long as the filter."""
