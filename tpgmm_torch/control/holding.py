@@ -195,6 +195,8 @@ class Holding:
             if name not in places:
                 continue
             before = held.get(name, FREE)
+            if name in seen and before.stood is not None:
+                held[name] = before = _later(before, joints, shares.get(name))
             carrier, is_told = self._carrier(name, time, before, told or {}, where)
             place = self.frames.get(name, places[name])
             if _equal(carrier, before.carrier):
@@ -202,18 +204,18 @@ class Holding:
                 places[name] = choose(_held(carrier), place, pose)
                 if is_told is not before.told:
                     held[name] = replace(before, told=is_told)
-                if before.stood is not None and before.taken is not None and name in seen:
-                    live = _held(carrier) & ~_same(seen[name], before.taken)
-                    if bool(live.any()):
-                        state = self.kinematics.state(joints) if state is None else state
-                        late = _later(held[name], joints, shares.get(name))
-                        held[name] = self._seen(late, seen[name], live, state, dt)
-                continue
-            state = self.kinematics.state(joints) if state is None else state
-            now = self._now(name, place, before, seen.get(name), state)
-            held[name] = self._taken(before, carrier, is_told, now, state)
-            still = _held(before.carrier) & _held(carrier)
-            places[name] = choose(still, place, now)
+            else:
+                state = self.kinematics.state(joints) if state is None else state
+                now = self._now(name, place, before, seen.get(name), state)
+                held[name] = self._taken(before, carrier, is_told, now, state)
+                still = _held(before.carrier) & _held(carrier)
+                places[name] = choose(still, place, now)
+            if name in seen and before.stood is not None and before.taken is not None:
+                live = _held(carrier) & torch.as_tensor(carrier == before.carrier)
+                live = live & ~_same(seen[name], before.taken)
+                if bool(live.any()):
+                    state = self.kinematics.state(joints) if state is None else state
+                    held[name] = self._seen(held[name], seen[name], live, state, dt)
         same = held.keys() == self.held.keys() and all(held[n] is self.held[n] for n in held)
         return replace(self, frames=places, held=self.held if same else held)
 
@@ -254,6 +256,7 @@ class Holding:
             taken=choose(where, place, place if before.taken is None else before.taken),
             told=where | torch.as_tensor(before.told),
             stood=None if stood is None else choose(where, _constant(stood, math.inf), stood),
+            joints=_anew(before.joints, where),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
         return replace(self, frames=frames, held={**self.held, name: now})
@@ -343,9 +346,11 @@ class Holding:
         if before.taken is not None:
             still = _held(before.carrier) | ~torch.as_tensor(_held(carrier))
             taken = choose(still, before.taken, now)
+        news = torch.as_tensor(_held(carrier)) & ~torch.as_tensor(_held(before.carrier))
         return replace(
-            before, carrier=carrier, grasp=grasp, taken=taken, told=told, stood=stood
-        )
+            before, carrier=carrier, grasp=grasp, taken=taken, told=told, stood=stood,
+            joints=_anew(before.joints, news),
+        )  # fmt: skip
 
     def _seen(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
@@ -354,7 +359,10 @@ class Holding:
         assert held.grasp is not None and held.stood is not None
         grasp, moving = held.grasp, held.stood.position.isinf().all(-1)
         dt, links = torch.as_tensor(dt, dtype=grasp.position.dtype), held.link
-        then = state if held.joints is None else self.kinematics.state(held.joints)
+        then = state
+        if held.joints is not None:
+            late = torch.where(held.joints.isnan(), state.joints, held.joints)
+            then = self.kinematics.state(late)
         for index in _indices(held.carrier) if bool(moving.any()) else ():
             link = then.pose(self.kinematics.links[index])
             before = link if links is None else links
@@ -378,7 +386,8 @@ class Holding:
         """
         assert held.grasp is not None and held.stood is not None
         grasp, stood, rests = held.grasp, held.stood, torch.as_tensor(held.rests)
-        begins, links, first = stood.position.isnan().all(-1), held.link, held.first
+        begins, moving = stood.position.isnan().all(-1), stood.position.isinf().all(-1)
+        links, first = held.link, held.first
         shown = grasp if held.shown is None else choose(begins, grasp, held.shown)
         for index in _indices(held.carrier):
             link = then.pose(self.kinematics.links[index])
@@ -394,10 +403,8 @@ class Holding:
             rests = torch.where(here, (rests & ~begins) | still, rests)
             moved = held.stood.change(link, MOVED, TURNED)
             along = shown.change(together, MOVED, TURNED) < PERHAPS * moved  # false of NaN
-            goes = here & along & (moved >= 1)
-            grasp = choose(here & ~along, now, grasp)
-            if then is not state:
-                grasp = choose(goes, together, grasp)
+            goes = here & along & (moved >= 1) & ~moving
+            grasp = choose(goes, together, choose(here & ~along, now, grasp))
             shown = choose(here & ~along, together, shown)
             stood = choose(here & ~along, link, stood)
             stood = choose(goes, _constant(stood, math.inf), stood)
@@ -435,12 +442,16 @@ FREE = Held()
 
 def _later(held: Held, joints: Tensor, share: Tensor | None) -> Held:
     """With joints that are as late as the object is seen."""
-    if share is None and held.joints is None:
-        return held
     if share is None:
-        return replace(held, joints=None)
+        return held if held.joints is None else replace(held, joints=None)
     last = joints if held.joints is None else held.joints
+    last = torch.where(last.isnan(), joints, last)
     return replace(held, joints=last + share.unsqueeze(-1) * (joints - last))
+
+
+def _anew(late: Tensor | None, where: Tensor) -> Tensor | None:
+    """Late joints that begin with the next look: an object that rested is not late."""
+    return late if late is None else late.masked_fill(where.unsqueeze(-1), math.nan)
 
 
 def _constant(like: Frame, value: float) -> Frame:

@@ -158,6 +158,40 @@ def test_noise_does_not_hide_how_a_hand_holds_what_it_lifts(seed):
     assert float(torch.stack(wrong[-1:]).max()) < 2.5e-3
 
 
+def test_robots_whose_objects_are_seen_late_are_each_as_if_alone():
+    start, joints = begun(3)
+    path = [joints + 0.003 * k for k in range(60)]
+    begins = torch.tensor([3, 20, 45])  # so that they are taken and carried in turns
+    place, random = start.frames["bottle"], torch.Generator().manual_seed(0)
+    grasps = [place[row].seen_from(hand(path[int(begins[row])][row])) for row in range(3)]
+
+    def looks(rows):
+        """What is held in the end."""
+        random.manual_seed(0)
+        first = joints[rows], {n: f[rows] for n, f in start.frames.items()}
+        inputs = Inputs(upper_body(), *first, Trust(), OneEuro())
+        holding = Holding.start(upper_body(), operators(), [HELD], first[1])
+        for k, now in enumerate(path):
+            taken = HELD.begin * (k >= begins).double()
+            bottle = Frame.stack(
+                [
+                    hand(now[row]).compose(grasps[row]) if k >= begins[row] else place[row]
+                    for row in range(3)
+                ]
+            )
+            noise = 1e-3 * torch.randn(3, 3, generator=random, dtype=torch.float64)
+            seen = Frame(bottle.position + noise, bottle.orientation)[rows]
+            inputs = inputs.hear(0.01, now[rows], {"bottle": seen})
+            holding = holding.advance(
+                taken[rows], now[rows], inputs.frames, dt=0.01, shares=inputs.shares
+            )
+        return holding.held["bottle"].grasp
+
+    together = looks(slice(None))
+    for row in range(3):
+        assert_at(together[row], looks(row))
+
+
 def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
     holding, joints = begun(2)
     lean = Frame([1e-3, 0.0, 0.0], [np.cos(0.01), np.sin(0.01), 0.0, 0.0])
