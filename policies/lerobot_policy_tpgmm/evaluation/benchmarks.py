@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -104,7 +105,8 @@ class Benchmark(ABC):
         """Write episodes as the LeRobot sets ``training`` and ``validation``.
 
         ``observation.state`` is what was measured in the environment, ``action`` the
-        reference. The first episodes for training are the same, however many there are.
+        reference. The first episodes for training are the same, however many there are. What
+        does not succeed by the rules of the environment is not kept, as people do not keep it.
 
         Parameters
         ----------
@@ -116,7 +118,7 @@ class Benchmark(ABC):
         Returns
         -------
         list of bool
-            Which episodes for training succeed by the rules of the environment.
+            Which attempts at episodes for training succeed: these are the episodes.
 
         Raises
         ------
@@ -148,36 +150,52 @@ class _HandlingBenchmark(Benchmark):
         """Those of the pool's demonstrations that have these numbers."""
 
     def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
-        """Let the environment follow generated demonstrations."""
+        """Let the environment follow generated demonstrations, and keep what succeeds."""
         if training > self.POOL or validation > self.RESERVED:
             raise DataError(
                 f"{self.env} offers {self.POOL} demonstrations for training and "
                 f"{self.RESERVED} for validation, {training} and {validation} are asked for"
             )
-        numbers = {
-            "training": range(training),
-            "validation": range(self.POOL, self.POOL + validation),
-        }
         env = gym.make(
             f"lerobot_policy_tpgmm/{self.gym_id}",
             fps=self.rate,
             **{**self.options, **self.recording},
         )
-        successes = {}
-        for name, chosen in numbers.items():
-            motions = self.motions(chosen, seed)
-            followed = [self._follow(env, *pair) for pair in zip(chosen, motions, strict=True)]
-            save_lerobot(
-                [measured for measured, _ in followed],
-                folder / name,
-                fps=self.rate,
-                task=self.task,
-                actions=[_references(motion) for motion in motions],
-                robot_type=self.robot_type,
-            )
-            successes[name] = [success for _, success in followed]
+        tried = self._keep(env, folder / "training", range(self.POOL), training, seed)
+        left = range(self.POOL - 1, len(tried) - 1, -1)  # in place of reserved ones that fail
+        reserved = [*range(self.POOL, self.POOL + self.RESERVED), *left]
+        self._keep(env, folder / "validation", reserved, validation, seed)
         env.close()
-        return successes["training"]
+        return tried
+
+    def _keep(
+        self, env: Any, folder: Path, numbers: Iterable[int], n: int, seed: int
+    ) -> list[bool]:
+        """Save the first ``n`` demonstrations that succeed; return which of the tried ones."""
+        tried: list[bool] = []
+        kept: list[tuple[Demonstration, torch.Tensor]] = []
+        waiting = iter(numbers)
+        while len(kept) < n:
+            chosen = list(islice(waiting, n - len(kept)))
+            if not chosen:
+                raise DataError(
+                    f"of {len(tried)} demonstrations of {self.env} {len(kept)} succeed, "
+                    f"{n} are asked for"
+                )
+            for number, motion in zip(chosen, self.motions(chosen, seed), strict=True):
+                measured, success = self._follow(env, number, motion)
+                tried.append(success)
+                if success:
+                    kept.append((measured, _references(motion)))
+        save_lerobot(
+            [measured for measured, _ in kept],
+            folder,
+            fps=self.rate,
+            task=self.task,
+            actions=[actions for _, actions in kept],
+            robot_type=self.robot_type,
+        )
+        return tried
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         """The options with which an episode begins as a demonstration does."""

@@ -38,8 +38,8 @@ def record(folder: Path, settings: Settings, n: int, seed: int = 0) -> None:
     place = settings.episodes_in(folder, seed)
     summary = place / "summary.json"
     if summary.exists():
-        recorded = json.loads(summary.read_text(encoding="utf-8"))["successes"]
-        if len(recorded) >= n:
+        tried = json.loads(summary.read_text(encoding="utf-8"))["successes"]
+        if sum(tried) >= n:
             return
     shutil.rmtree(place, ignore_errors=True)
     benchmark = settings.benchmark()

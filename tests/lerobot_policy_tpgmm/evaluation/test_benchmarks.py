@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from lerobot.envs import preprocess_observation
 
 from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
@@ -16,6 +17,7 @@ from tpgmm_datasets.bottle.carrying import slid
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.pose_names import POSE_PARTS
+from tpgmm_torch.exceptions import DataError
 
 NAMES = [f"{name}.{part}" for name in ("bottle", "tray") for part in POSE_PARTS]
 KINEMATIC = {"mode": "kinematic"}
@@ -69,6 +71,34 @@ def test_demonstrations_succeed_however_the_bottle_slides(folder, motions):
         "true"
     ) == DEMONSTRATIONS
     assert np.ptp([slid(motion)[0] for motion in motions[:DEMONSTRATIONS]]) > 0.01
+
+
+def test_demonstrations_that_fail_are_not_learned_from(settings, tmp_path, monkeypatch):
+    monkeypatch.setattr(CarryBenchmark, "POOL", 4)
+    monkeypatch.setattr(CarryBenchmark, "RESERVED", 1)
+    follow = CarryBenchmark._follow
+
+    def failing(self, env, number, motion):
+        measured, success = follow(self, env, number, motion)
+        return measured, success and number not in (1, 4)  # one of each
+
+    monkeypatch.setattr(CarryBenchmark, "_follow", failing)
+    benchmark, robot = settings.benchmark(), settings.benchmark().robot
+    assert benchmark.record(tmp_path / "two", 2, 1, 0) == [True, False, True]
+    for name, numbers in (("training", (0, 2)), ("validation", (3,))):
+        kept = load_lerobot(tmp_path / "two" / name, robot=robot)
+        wanted = benchmark.motions(numbers, 0)
+        for one, motion in zip(kept, wanted, strict=True):
+            torch.testing.assert_close(one.joints[0], motion.joints[0], atol=1e-5, rtol=0)
+    with pytest.raises(
+        DataError, match="of 4 demonstrations of carry_and_put 3 succeed"
+    ):
+        benchmark.record(tmp_path / "four", 4, 1, 0)
+    jobs.record(tmp_path, settings, 2)
+    monkeypatch.setattr(CarryBenchmark, "_follow", None)
+    jobs.record(tmp_path, settings, 2)  # what is there is enough
+    with pytest.raises(TypeError):
+        jobs.record(tmp_path, settings, 3)
 
 
 def test_places_leave_the_error_of_the_grasp(folder, settings):

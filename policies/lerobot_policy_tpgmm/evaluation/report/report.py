@@ -337,8 +337,8 @@ class _Sections:
         """What the data say about themselves."""
         for row in demonstration_table(self.out).itertuples():
             yield (
-                f"By the environment's own criteria {row.succeed} of the {row.recorded} "
-                f"recorded demonstrations of seed {row.seed} succeed."
+                f"By the environment's own criteria {row.succeed} of {row.tried} attempts at "
+                f"demonstrations of seed {row.seed} succeed; the others are not learned from."
             )
         trials = self.settings.episodes
         low, high = wilson(trials // 2, trials)

@@ -502,20 +502,20 @@ class _Summary:
     def _demonstrations(self) -> Iterator[str]:
         yield "## Demonstrations"
         yield (
-            "How many of the recorded ones succeed by the rules of their environment; "
-            f"{100 * ASKED:.0f} % are asked for."
+            "How many of the expert's attempts succeed by the rules of their environment, of "
+            f"which {100 * ASKED:.0f} % are asked for; what does not is not learned from."
         )
         rows: list[list[object]] = []
         for env, task in self.tasks.items():
             table = demonstration_table(task.folder)
-            recorded, succeed = int(table.recorded.sum()), int(table.succeed.sum())
-            if not recorded:
+            tried, succeed = int(table.tried.sum()), int(table.succeed.sum())
+            if not tried:
                 rows.append([env, "-", "not at hand", "-"])
                 continue
-            low, high = wilson(succeed, recorded)
-            share = markdown.share(succeed, recorded)
-            met = "yes" if succeed >= ASKED * recorded else "**no**"
-            text = f"{succeed}/{recorded} = {share} ({100 * low:.0f} to {100 * high:.0f} %)"
+            low, high = wilson(succeed, tried)
+            share = markdown.share(succeed, tried)
+            met = "yes" if succeed >= ASKED * tried else "**no**"
+            text = f"{succeed}/{tried} = {share} ({100 * low:.0f} to {100 * high:.0f} %)"
             rows.append([env, markdown.listed(table.seed), text, met])
         yield markdown.table(["task", "seeds", "succeed", "as asked"], rows)
 

@@ -104,7 +104,7 @@ def episode_table(results: Iterable[Mapping[str, Any]]) -> pd.DataFrame:
 
 
 def demonstration_table(folder: Path) -> pd.DataFrame:
-    """How many demonstrations of an environment succeed by its own criteria.
+    """How many attempts at demonstrations succeed by the environment's own criteria.
 
     Parameters
     ----------
@@ -114,14 +114,14 @@ def demonstration_table(folder: Path) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        ``seed`` of the demonstrations, how many were ``recorded``, how many ``succeed``.
+        ``seed`` of the demonstrations, how many were ``tried``, how many ``succeed``.
     """
     rows = []
     for summary in (folder / "episodes").glob("s*/summary.json"):
         successes = json.loads(summary.read_text(encoding="utf-8"))["successes"]
         seed = int(summary.parent.name.removeprefix("s"))
-        rows.append({"seed": seed, "recorded": len(successes), "succeed": sum(successes)})
-    table = pd.DataFrame(rows, columns=["seed", "recorded", "succeed"])
+        rows.append({"seed": seed, "tried": len(successes), "succeed": sum(successes)})
+    table = pd.DataFrame(rows, columns=["seed", "tried", "succeed"])
     return table.sort_values("seed", ignore_index=True)
 
 

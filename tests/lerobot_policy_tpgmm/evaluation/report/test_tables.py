@@ -78,5 +78,5 @@ def test_demonstrations_are_counted_by_seed(tmp_path):
         folder.mkdir(parents=True)
         (folder / "summary.json").write_text(json.dumps({"successes": successes}))
     table = demonstration_table(tmp_path)
-    assert table.to_dict("list") == {"seed": [2, 10], "recorded": [1, 2], "succeed": [1, 1]}
+    assert table.to_dict("list") == {"seed": [2, 10], "tried": [1, 2], "succeed": [1, 1]}
     assert demonstration_table(tmp_path / "none").empty
