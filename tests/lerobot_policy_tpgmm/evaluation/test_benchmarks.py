@@ -90,9 +90,7 @@ def test_demonstrations_that_fail_are_not_learned_from(settings, tmp_path, monke
         wanted = benchmark.motions(numbers, 0)
         for one, motion in zip(kept, wanted, strict=True):
             torch.testing.assert_close(one.joints[0], motion.joints[0], atol=1e-5, rtol=0)
-    with pytest.raises(
-        DataError, match="of 4 demonstrations of carry_and_put 3 succeed"
-    ):
+    with pytest.raises(DataError, match="of 4 demonstrations of carry_and_put 3 succeed"):
         benchmark.record(tmp_path / "four", 4, 1, 0)
     jobs.record(tmp_path, settings, 2)
     monkeypatch.setattr(CarryBenchmark, "_follow", None)
