@@ -50,7 +50,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("app",),
     ),
     "lerobot_policy_tpgmm": (
-        ("configuration_tpgmm", "control_rate"),
+        ("configuration_tpgmm", "control_rate", "tick_durations"),
         ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
         ("policy_files", "training"),
         ("modeling_tpgmm",),
