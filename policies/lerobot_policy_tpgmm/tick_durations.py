@@ -46,14 +46,14 @@ class TickDurations:
         -------
         float or Tensor of shape (B,)
             Of a robot whose time did not increase what it says itself, so that whoever is told
-            can refuse it: not positive, or NaN.
+            can refuse it: not positive, or not finite.
         """
         now, last = timestamps.flatten().to("cpu", torch.float64), self._last
         if last is None:
             self._last = now
             return usual
         passed = now - last
-        increased = passed > 0
+        increased = (passed > 0) & now.isfinite()
         self._last = torch.where(now.isfinite(), now, last)
         # a loop that stood for longer goes on as if it had stood for that long
         self._known.append(passed.clamp(max=Trust.longest_step).where(increased, torch.nan))
