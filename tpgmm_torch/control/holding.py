@@ -374,7 +374,7 @@ class Holding:
         held = replace(held, grasp=grasp, link=links)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
             return held
-        return self._shifted(held, seen, live, state, then)
+        return self._shifted(held, seen, live & ~moving, state, then)
 
     def _shifted(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, then: RobotState
@@ -386,15 +386,11 @@ class Holding:
         """
         assert held.grasp is not None and held.stood is not None
         grasp, stood, rests = held.grasp, held.stood, torch.as_tensor(held.rests)
-        begins, moving = stood.position.isnan().all(-1), stood.position.isinf().all(-1)
-        links, first = held.link, held.first
+        begins, links, first = stood.position.isnan().all(-1), held.link, held.first
         shown = grasp if held.shown is None else choose(begins, grasp, held.shown)
         for index in _indices(held.carrier):
-            link = then.pose(self.kinematics.links[index])
+            link, now = (s.pose(self.kinematics.links[index]) for s in (then, state))
             together = seen.seen_from(link)
-            now = together
-            if then is not state:
-                now = seen.seen_from(state.pose(self.kinematics.links[index]))
             here = live & torch.as_tensor(held.carrier == index)
             links = link if links is None else choose(here & begins, link, links)
             first = seen if first is None else choose(here & begins, seen, first)
@@ -403,21 +399,17 @@ class Holding:
             rests = torch.where(here, (rests & ~begins) | still, rests)
             moved = held.stood.change(link, MOVED, TURNED)
             along = shown.change(together, MOVED, TURNED) < PERHAPS * moved  # false of NaN
-            goes = here & along & (moved >= 1) & ~moving
-            grasp = choose(goes, together, choose(here & ~along, now, grasp))
+            goes = here & along & (moved >= 1)
+            grasp = choose(goes, together, choose(here & ~along, seen.seen_from(now), grasp))
             shown = choose(here & ~along, together, shown)
             stood = choose(here & ~along, link, stood)
             stood = choose(goes, _constant(stood, math.inf), stood)
         moving = stood.position.isinf().all(-1)
+        held = replace(held, grasp=grasp, stood=stood, link=links)
         if bool((moving | torch.as_tensor(held.carrier < 0)).all()):
-            return Held(
-                held.carrier, grasp, held.taken, held.told, stood, links, joints=held.joints
-            )
+            return replace(held, first=None, last=None, rests=False, shown=None)
         last = seen if held.last is None else choose(live, seen, held.last)
-        return replace(
-            held, grasp=grasp, stood=stood, link=links, first=first, last=last,
-            rests=rests & ~moving, shown=shown,
-        )  # fmt: skip
+        return replace(held, first=first, last=last, rests=rests & ~moving, shown=shown)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""

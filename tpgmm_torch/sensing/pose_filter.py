@@ -132,16 +132,15 @@ class PoseFilter:
         speed = np.sqrt(np.square(velocity) @ METRIC)
         with np.errstate(divide="ignore"):
             cutoff = settings.cutoff * (1 + settings.noise**2 / variance)
-        weight = _share(cutoff + settings.slope * speed, dt)
-        share = weight[..., None]
-        out = self.pose + share * (pose - self.pose)
+        share = _share(cutoff + settings.slope * speed, dt)
+        out = self.pose + share[..., None] * (pose - self.pose)
         turn = out[..., 3:]
         out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
         # what passes whole passes bit for bit
-        out = np.where(share == 1, pose, out)
+        out = np.where(share[..., None] == 1, pose, out)
         return self._with(
             pose=out, velocity=velocity, change=change, last=pose, history=history,
-            share=weight,
+            share=share,
         )  # fmt: skip
 
     def _with(self, **changes: Floats) -> Self:
