@@ -24,6 +24,7 @@ from lerobot_policy_tpgmm.environments.suite.task import (
     Pose,
     Style,
     SuiteTask,
+    raised,
     stands_in,
     upright_pose,
 )
@@ -48,9 +49,9 @@ LOWEST, HIGHEST, YAW = (0.24, 0.06, 0.10), (0.32, 0.13, 0.15), 20.0
 GRIP = {"l_hand": (0.0, RADIUS + 0.01, -0.035), "r_hand": (0.0, -RADIUS - 0.01, 0.035)}
 WAIT = {"l_hand": (-0.05, 0.1, -0.035), "r_hand": (-0.05, -0.1, 0.035)}
 #: Where it changes hands [m], and by how much that differs.
-MEETING, MEETING_SPREAD = (0.27, 0.0, 0.15), (0.02, 0.03, 0.015)
+MEETING, MEETING_SPREAD = (0.27, 0.0, 0.20), (0.02, 0.03, 0.015)
 #: How high it is carried above its place, and how near to it the hand opens [m].
-LIFT, PUT = 0.04, 0.01
+LIFT, PUT = 0.05, 0.01
 LIFTED = 0.02
 
 
@@ -66,6 +67,7 @@ class Handover(SuiteTask):
             "reach": 2.0,
             "close": 1.0,
             "hold": 0.6,
+            "raise": 0.8,
             "bring": 2.0,
             "meet": 1.2,
             "pass": 0.8,
@@ -141,7 +143,6 @@ class Handover(SuiteTask):
             stand.transform(torch.tensor((0.0, 0.0, FOOT), dtype=torch.float64)),
             stand.orientation,
         )
-        above = Frame(place.position + torch.tensor((0, 0, LIFT)), place.orientation)
 
         def at(pose: Frame, hand: str, points: Mapping[str, tuple[float, ...]]) -> Frame:
             return attached(pose, points[hand])
@@ -153,6 +154,7 @@ class Handover(SuiteTask):
         left = [
             Leg("reach", near(baton, "l_hand"), free=True),
             Leg("close", at(baton, "l_hand", GRIP)),
+            Leg("raise", at(raised(baton, LIFT), "l_hand", GRIP)),
             Leg("bring", at(meeting, "l_hand", GRIP), free=True),
             Leg("leave", near(meeting, "l_hand")),
             Leg("carry", starts["l_hand"], free=True),
@@ -160,7 +162,7 @@ class Handover(SuiteTask):
         right = [
             Leg("bring", near(meeting, "r_hand"), free=True),
             Leg("meet", at(meeting, "r_hand", GRIP)),
-            Leg("carry", at(above, "r_hand", GRIP), free=True),
+            Leg("carry", at(raised(place, LIFT), "r_hand", GRIP), free=True),
             Leg("lower", at(place, "r_hand", GRIP)),
             Leg("away", near(place, "r_hand")),
         ]

@@ -32,6 +32,7 @@ from lerobot_policy_tpgmm.environments.suite.task import (
     Pose,
     Style,
     SuiteTask,
+    raised,
     stands_in,
     upright_pose,
 )
@@ -190,13 +191,13 @@ class PegInHole(SuiteTask):
         left = [
             Leg("reach", waiting(block, "l_hand"), free=True),
             Leg("close", attached(block, GRIP["l_hand"])),
-            Leg("lift", attached(_raised(block), GRIP["l_hand"])),
+            Leg("lift", attached(raised(block, LIFT), GRIP["l_hand"])),
             Leg("bring", attached(meeting, GRIP["l_hand"]), free=True),
         ]
         right = [
             Leg("reach", waiting(peg, "r_hand"), free=True),
             Leg("close", attached(peg, GRIP["r_hand"])),
-            Leg("lift", attached(_raised(peg), GRIP["r_hand"])),
+            Leg("lift", attached(raised(peg, LIFT), GRIP["r_hand"])),
             Leg("bring", attached(beside, GRIP["r_hand"]), free=True),
             Leg("align", attached(begun, GRIP["r_hand"])),
             Leg("insert", attached(over(-IN), GRIP["r_hand"])),
@@ -250,12 +251,6 @@ def _depth(scene: SuiteScene) -> float:
     x, y, z = block.xmat.reshape(3, 3).T @ (tip - block.xpos)
     inside = max(abs(x), abs(y)) < RADIUS + CLEARANCE
     return max(0.0, HEIGHT - float(z)) if inside else 0.0
-
-
-def _raised(pose: Frame) -> Frame:
-    """Lifted off the table."""
-    up = torch.tensor((0.0, 0.0, LIFT), dtype=torch.float64)
-    return Frame(pose.position + up, pose.orientation)
 
 
 def _straighter(pose: Frame) -> Tensor:

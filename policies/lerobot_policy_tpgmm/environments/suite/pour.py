@@ -28,6 +28,7 @@ from lerobot_policy_tpgmm.environments.suite.task import (
     Pose,
     Style,
     SuiteTask,
+    raised,
     stands_in,
     upright_pose,
 )
@@ -55,8 +56,10 @@ LOWEST, HIGHEST, YAW = (0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0
 #: Where the palms touch them, and where they wait, in their frames [m].
 GRIP = {"l_hand": (0.0, JUG + 0.01, 0.01), "r_hand": (0.0, -CUP - 0.01, 0.0)}
 WAIT = {"l_hand": (-0.05, 0.1, 0.01), "r_hand": (-0.05, -0.1, 0.0)}
+#: How high the jug is lifted before it is carried [m].
+LIFT = 0.05
 #: Where the cup is held [m], and by how much it sways from there while it is poured into.
-MEETING, SWAY = (0.27, -0.02, 0.11), (0.02, 0.02, 0.0)
+MEETING, SWAY = (0.27, -0.02, 0.16), (0.02, 0.02, 0.0)
 #: From which side the jug comes, about the vertical, and by how much that differs [rad].
 SIDE, SIDE_SPREAD = math.radians(-35.0), math.radians(15.0)
 #: How far the jug is tilted [rad]; where its mouth is above the cup's rim, and how far beside
@@ -69,7 +72,7 @@ FLOW = 1 / 45
 #: A cup that leans more takes nothing [deg].
 UPRIGHT = 15.0
 #: Where the jug is in the end [m].
-ASIDE = (0.26, 0.1, 0.12)
+ASIDE = (0.26, 0.1, 0.16)
 GRAVITY = 9.81
 
 
@@ -87,6 +90,7 @@ class Pour(SuiteTask):
             "hold": 0.6,
             "lift": 1.6,
             "grip": 0.6,
+            "raise": 0.8,
             "bring": 2.0,
             "tilt": 1.6,
             "pour": 1.6,
@@ -174,6 +178,7 @@ class Pour(SuiteTask):
         left = [
             Leg("reach", near(jug, "l_hand"), free=True),
             Leg("lift", attached(jug, GRIP["l_hand"])),
+            Leg("raise", attached(raised(jug, LIFT), GRIP["l_hand"])),
             Leg("bring", attached(ready, GRIP["l_hand"]), free=True),
             pouring("tilt", minimum_jerk),
             pouring("pour", torch.ones_like),

@@ -27,7 +27,16 @@ from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
 from tpgmm_torch import Demonstration, Frame, Operator, Robot
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
-__all__ = ["Judge", "Leg", "Style", "SuiteTask", "hands_along", "stands_in", "upright_pose"]
+__all__ = [
+    "Judge",
+    "Leg",
+    "Style",
+    "SuiteTask",
+    "hands_along",
+    "raised",
+    "stands_in",
+    "upright_pose",
+]
 
 Pose = NDArray[np.float64]
 #: Durations differ by up to this share.
@@ -355,6 +364,12 @@ def hands_along(
                 pose = Frame(pose.position + bump[:, None] * aside, pose.orientation)
         poses.append(pose)
     return poses
+
+
+def raised(pose: Frame, height: float) -> Frame:
+    """Lifted straight up [m], as what stands on the table is before it is carried away."""
+    up = torch.tensor((0.0, 0.0, height), dtype=torch.float64)
+    return Frame(pose.position + up, pose.orientation)
 
 
 def upright_pose(
