@@ -50,6 +50,7 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._camera, self._picture_size = camera, picture_size
         self._renderer: Renderer | None = None
         self._picture: NDArray[np.uint8] | None = None
+        self._pictured = 0  # the step of it
         self._steps = 0
 
     def _simulation(self) -> tuple[Any, Any]:
@@ -69,8 +70,8 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         model, data = self._simulation()
         if self._renderer is None:
             self._renderer = Renderer(model, *self._picture_size, self._camera)
-        if self._picture is None or self._steps % max(1, round(self.fps / 25)) == 0:
-            self._picture = self._renderer(data)
+        if self._picture is None or self._steps - self._pictured >= max(1, round(self.fps / 25)):
+            self._picture, self._pictured = self._renderer(data), self._steps
         return self._picture
 
     def close(self) -> None:

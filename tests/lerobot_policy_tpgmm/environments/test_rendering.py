@@ -103,6 +103,10 @@ def test_pictures_change_25_times_per_second():
         pictures.append(env.render())
     new = [not np.array_equal(a, b) for a, b in itertools.pairwise(pictures)]
     assert new == [False, False, False, True] * 2
+    for _ in range(5):  # nobody looks meanwhile
+        action = action + 0.03
+        env.step(action)
+    assert not np.array_equal(env.render(), pictures[-1])
     env.close()
     env.reset(seed=0)
     np.testing.assert_array_equal(env.render(), pictures[0])
