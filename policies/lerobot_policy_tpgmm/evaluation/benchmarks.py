@@ -363,7 +363,7 @@ class AlohaBenchmark(Benchmark):
     fixed: ClassVar = {"task": "transfer_cube"}
     default_rate = 50
     synchronous = True
-    n_components = 20
+    n_components = 24
     figures: Mapping[str, tuple[str, int]] = {
         "max_reward": ("stage, 0 to 4", 0),
         "lift_mm": ("lift [mm]", 0),

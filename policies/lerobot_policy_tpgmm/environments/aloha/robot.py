@@ -52,6 +52,8 @@ PINCH_POINT = (0.14, 0.0, 0.0)
 def aloha_operators(task: str, orientation: bool = True) -> list[Operator]:
     """The subspaces of a task: each gripper seen from an object, and the joints.
 
+    Where peg and socket meet, also one gripper seen from the other.
+
     Parameters
     ----------
     task : {"transfer_cube", "insertion"}
@@ -69,7 +71,11 @@ def aloha_operators(task: str, orientation: bool = True) -> list[Operator]:
         raise UnknownNameError("task", task, "aloha_state", OBJECTS)
     pairs = {
         "transfer_cube": (("left_gripper", "cube"), ("right_gripper", "cube")),
-        "insertion": (("left_gripper", "socket"), ("right_gripper", "peg")),
+        "insertion": (
+            ("left_gripper", "socket"),
+            ("right_gripper", "peg"),
+            ("right_gripper", "left_gripper"),
+        ),
     }[task]
     if not orientation:
         return [*(RelativePosition(*pair) for pair in pairs), Canonical()]
