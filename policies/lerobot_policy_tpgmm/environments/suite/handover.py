@@ -49,7 +49,7 @@ LOWEST, HIGHEST, YAW = (0.24, 0.06, 0.10), (0.32, 0.13, 0.15), 20.0
 GRIP = {"l_hand": (0.0, RADIUS + 0.01, -0.035), "r_hand": (0.0, -RADIUS - 0.01, 0.035)}
 WAIT = {"l_hand": (-0.05, 0.1, -0.035), "r_hand": (-0.05, -0.1, 0.035)}
 #: Where it changes hands [m], and by how much that differs.
-MEETING, MEETING_SPREAD = (0.27, 0.0, 0.20), (0.02, 0.03, 0.015)
+MEETING, MEETING_SPREAD = (0.27, 0.0, 0.17), (0.02, 0.03, 0.015)
 #: How high it is carried above its place, and how near to it the hand opens [m].
 LIFT, PUT = 0.05, 0.01
 LIFTED = 0.02

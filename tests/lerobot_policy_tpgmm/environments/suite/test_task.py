@@ -27,7 +27,7 @@ from tpgmm_torch.exceptions import UnknownNameError
 
 #: The sum of all angles of a demonstration by the upper body, without regard to sign [rad].
 TOTALS = {
-    "handover": 1141.855435158312,
+    "handover": 1111.8646806073698,
     "lid": 1016.4567192942939,
     "peg_in_hole": 492.2491393930438,
     "pour": 1125.6969080842707,
