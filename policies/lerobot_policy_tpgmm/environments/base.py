@@ -70,7 +70,8 @@ class StateEnv(gym.Env[Observation, NDArray[np.float32]]):
         model, data = self._simulation()
         if self._renderer is None:
             self._renderer = Renderer(model, *self._picture_size, self._camera)
-        if self._picture is None or self._steps - self._pictured >= max(1, round(self.fps / 25)):
+        old = self._steps - self._pictured >= max(1, round(self.fps / 25))
+        if self._picture is None or old:
             self._picture, self._pictured = self._renderer(data), self._steps
         return self._picture
 
