@@ -50,7 +50,8 @@ GRIP = {"l_hand": (0.0, RADIUS + 0.01, -0.035), "r_hand": (0.0, -RADIUS - 0.01, 
 WAIT = {"l_hand": (-0.05, 0.1, -0.035), "r_hand": (-0.05, -0.1, 0.035)}
 #: Where it changes hands [m], and by how much that differs.
 MEETING, MEETING_SPREAD = (0.27, 0.0, 0.17), (0.02, 0.03, 0.015)
-#: How high it is carried above its place, and how near to it the hand opens [m].
+#: How high it is lifted before it is carried and lowered, and how near to its place the hand
+#: opens [m].
 LIFT, PUT = 0.05, 0.01
 LIFTED = 0.02
 
