@@ -54,8 +54,9 @@ def compare(
             help="Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, "
             "as in 0.1.0), tpgmm-even-clock, tpgmm-places (objects are where they were at "
             "first), tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, "
-            "key-poses-posture, dmp, promp; act, diffusion, mlp, knn, each also told the time, "
-            "-phase; nearest, mean; all, of tpgmm with all parts and without orientation; or "
+            "key-poses-posture, dmp, promp; act, act-large (LeRobot's sizes), diffusion, mlp, "
+            "knn, each also told the time, -phase; nearest, mean; all, of tpgmm with all parts "
+            "and without orientation, of act the small one; or "
             "quick: of these, all that no gradient trains. A "
             "tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the "
             "open loop is always there.",
@@ -171,7 +172,7 @@ def _policies(text: str) -> list[str]:
     from lerobot_policy_tpgmm.evaluation.policies.baselines import RECIPES
     from lerobot_policy_tpgmm.evaluation.trainings import ABLATIONS
 
-    rare = {*ABLATIONS} - {"tpgmm-position-only"}
+    rare = {*ABLATIONS, "act-large", "act-large-phase"} - {"tpgmm-position-only"}
     usual = [name for name in POLICIES if name not in rare]
     groups = {"all": usual, "quick": [name for name in usual if name not in RECIPES]}
     return _named(text, groups)

@@ -52,6 +52,9 @@ DESCRIPTIONS = {
     "posture and on the key poses by inverse kinematics",
     "act": "LeRobot's Action Chunking Transformer on joints and object poses",
     "act-phase": "the same, informed of the time and learning from episodes on a common clock",
+    "act-large": "it again, with LeRobot's own sizes: forty million weights",
+    "act-large-phase": "the same, informed of the time and learning from episodes on a common "
+    "clock",
     "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
     "diffusion-phase": "the same, informed of the time and learning from episodes on a common "
     "clock",
