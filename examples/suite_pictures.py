@@ -23,6 +23,7 @@ WIDTH, HEIGHT = 422, 343
 SHOWN = {
     UPPER_BODY: (slice(5, 265), slice(100, 356)),
     "viperx": (slice(70, 320), slice(5, 400)),
+    "g1": (slice(5, 265), slice(100, 356)),
 }
 
 

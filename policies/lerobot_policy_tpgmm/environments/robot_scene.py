@@ -48,13 +48,15 @@ def robot_spec() -> mujoco.MjSpec:
     return controlled(mujoco.MjSpec.from_string(upper_body_urdf()))
 
 
-def controlled(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def controlled(spec: mujoco.MjSpec, gain: float = 1.0) -> mujoco.MjSpec:
     """Give a robot position control, palms, a light and a camera before it.
 
     Parameters
     ----------
     spec : mujoco.MjSpec
         A robot alone, with bodies ``l_hand`` and ``r_hand``, whose first geoms are the palms.
+    gain : float, default=1
+        By what stiffness and damping are multiplied.
 
     Returns
     -------
@@ -66,7 +68,7 @@ def controlled(spec: mujoco.MjSpec) -> mujoco.MjSpec:
     for joint in spec.joints:
         motor = spec.add_actuator(name=joint.name, target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        motor.set_to_position(kp=STIFFNESS, kv=DAMPING)
+        motor.set_to_position(kp=gain * STIFFNESS, kv=gain * DAMPING)
     for body in spec.bodies[1:]:
         body.gravcomp = 1.0  # as the controllers of such robots do
     for hand in HANDS:

@@ -44,7 +44,8 @@ def compare(
             metavar="NAME,...",
             help="Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), "
             "aloha_insertion, ... (a wrong name lists them); suite: all of the upper body; "
-            "suite-viperx: its tasks on gym-aloha's arms (lid-viperx, ...); all.",
+            "suite-viperx: its tasks on gym-aloha's arms (lid-viperx, ...), suite-g1: on a "
+            "Unitree G1; all.",
         ),
     ] = "bottle_shaking",
     policies: Annotated[

@@ -62,8 +62,9 @@ def test_disturbed_policies_stand_beside_the_open_loop(
     [
         ("carry_and_put", ["carry_and_put"]),
         ("carry_and_put,aloha_state,carry_and_put", ["carry_and_put", "aloha_state"]),
-        ("suite", [n for n in BENCHMARKS if "aloha" not in n and "viperx" not in n]),
+        ("suite", ["bottle_shaking", "carry_and_put", *SUITE]),
         ("suite-viperx", [f"{task}-viperx" for task in SUITE]),
+        ("suite-g1", [f"{task}-g1" for task in SUITE]),
         ("aloha_state,all", ["aloha_state", *(n for n in BENCHMARKS if n != "aloha_state")]),
     ],
 )

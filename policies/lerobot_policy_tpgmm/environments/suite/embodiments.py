@@ -16,6 +16,7 @@ from lerobot_policy_tpgmm.environments.aloha.pair import (
 )
 from lerobot_policy_tpgmm.environments.bottle.conditions import skill
 from lerobot_policy_tpgmm.environments.robot_scene import robot_spec
+from lerobot_policy_tpgmm.environments.suite.g1 import g1_posture, g1_robot, g1_spec
 from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import UnknownNameError
@@ -57,9 +58,14 @@ def _viperx() -> Embodiment:
     return Embodiment(pair_robot(), pair_posture(), pair_spec)
 
 
+def _g1() -> Embodiment:
+    return Embodiment(g1_robot(), g1_posture(), g1_spec)
+
+
 EMBODIMENTS: dict[str, Callable[[], Embodiment]] = {
     UPPER_BODY: _upper_body,
     "viperx": _viperx,
+    "g1": _g1,
 }
 
 

@@ -80,7 +80,8 @@ class SuiteEnv(ControlledEnv):
     task : str
         ``handover``, ``lid``, ``peg_in_hole``, ``pour`` or ``wipe``.
     robot : str, default="upper_body"
-        The 17-joint ``upper_body``, or ``viperx``, gym-aloha's two arms of 6 joints.
+        The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
+        waist and arms of a Unitree G1, 17 joints.
     fps, episode_length, pushes, noise, condition, render_mode, render_width, render_height
         As for :class:`~lerobot_policy_tpgmm.environments.bottle.shaking.BottleShakingEnv`; an
         episode takes as long as the slowest demonstration and a second by default. Nobody puts
@@ -91,7 +92,7 @@ class SuiteEnv(ControlledEnv):
     DataError, UnknownNameError
         If an option is not one of the above.
     DependencyError
-        Without gym-aloha, where its arms are asked for.
+        Without gym-aloha, where its arms are asked for, or example-robot-data for ``g1``.
     """
 
     _scene: SuiteScene

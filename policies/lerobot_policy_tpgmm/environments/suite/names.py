@@ -10,7 +10,7 @@ __all__ = ["ROBOTS", "SUITE", "UPPER_BODY"]
 #: Who does the tasks unless another is named.
 UPPER_BODY = "upper_body"
 #: How many joints each robot has.
-ROBOTS: Mapping[str, int] = MappingProxyType({UPPER_BODY: 17, "viperx": 12})
+ROBOTS: Mapping[str, int] = MappingProxyType({UPPER_BODY: 17, "viperx": 12, "g1": 17})
 
 #: What is observed in each task, in that order.
 SUITE: Mapping[str, tuple[str, ...]] = MappingProxyType(
