@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from lerobot_policy_tpgmm.environments.suite.embodiments import Embodiment
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import Embodiment
 from lerobot_policy_tpgmm.environments.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands

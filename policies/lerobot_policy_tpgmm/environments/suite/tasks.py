@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import functools
 
-from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.handover import Handover
 from lerobot_policy_tpgmm.environments.suite.lid import Lid
 from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
 from lerobot_policy_tpgmm.environments.suite.peg_in_hole import PegInHole
 from lerobot_policy_tpgmm.environments.suite.pour import Pour
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.task import SuiteTask
 from lerobot_policy_tpgmm.environments.suite.wipe import Wipe
 from tpgmm_torch.exceptions import UnknownNameError

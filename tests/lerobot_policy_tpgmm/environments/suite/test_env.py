@@ -19,10 +19,10 @@ from lerobot_policy_tpgmm.environments.disturbances import (
     Stopped,
     displaced,
 )
-from lerobot_policy_tpgmm.environments.suite.embodiments import EMBODIMENTS, embodiment
 from lerobot_policy_tpgmm.environments.suite.env import SUITE_CONDITIONS, SuiteEnv
 from lerobot_policy_tpgmm.environments.suite.handover import GRIP, LEFT, RIGHT
 from lerobot_policy_tpgmm.environments.suite.names import ROBOTS, SUITE
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import EMBODIMENTS, embodiment
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from tests.support.suite_expert import TRIED, replay, start_of, tick
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError

@@ -8,9 +8,13 @@ import pytest
 import torch
 from gym_aloha import constants
 
-from lerobot_policy_tpgmm.environments.aloha.pair import BASE, pair_robot, pair_spec
 from lerobot_policy_tpgmm.environments.aloha.robot import SIDES
-from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import embodiment
+from lerobot_policy_tpgmm.environments.suite.robots.viperx import (
+    BASE,
+    viperx_robot,
+    viperx_spec,
+)
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DependencyError
 
@@ -18,7 +22,7 @@ ROBOT = embodiment("viperx").robot
 
 
 def physics():
-    model = pair_spec().compile()
+    model = viperx_spec().compile()
     return model, mujoco.MjData(model)
 
 
@@ -64,6 +68,6 @@ def test_one_arm_is_the_mirror_image_of_the_other():
 
 def test_without_gym_aloha_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gym_aloha.constants", None)
-    for make in (pair_robot, pair_spec):
+    for make in (viperx_robot, viperx_spec):
         with pytest.raises(DependencyError, match=r"viperx needs gym-aloha: pip install"):
             make()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
 from lerobot_policy_tpgmm.environments.suite.names import SUITE, UPPER_BODY
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import embodiment
 from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
 from lerobot_policy_tpgmm.evaluation.benchmarks import benchmark
 from tests.support.suite_expert import TRIED, replay

@@ -9,15 +9,15 @@ from dataclasses import dataclass
 import mujoco
 from torch import Tensor
 
-from lerobot_policy_tpgmm.environments.aloha.pair import (
-    pair_posture,
-    pair_robot,
-    pair_spec,
-)
 from lerobot_policy_tpgmm.environments.bottle.conditions import skill
 from lerobot_policy_tpgmm.environments.robot_scene import robot_spec
-from lerobot_policy_tpgmm.environments.suite.g1 import g1_posture, g1_robot, g1_spec
 from lerobot_policy_tpgmm.environments.suite.names import UPPER_BODY
+from lerobot_policy_tpgmm.environments.suite.robots.g1 import g1_posture, g1_robot, g1_spec
+from lerobot_policy_tpgmm.environments.suite.robots.viperx import (
+    viperx_posture,
+    viperx_robot,
+    viperx_spec,
+)
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import UnknownNameError
 
@@ -55,7 +55,7 @@ def _upper_body() -> Embodiment:
 
 
 def _viperx() -> Embodiment:
-    return Embodiment(pair_robot(), pair_posture(), pair_spec)
+    return Embodiment(viperx_robot(), viperx_posture(), viperx_spec)
 
 
 def _g1() -> Embodiment:

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lerobot_policy_tpgmm.environments.suite import g1
-from lerobot_policy_tpgmm.environments.suite.embodiments import embodiment
+from lerobot_policy_tpgmm.environments.suite.robots import g1
+from lerobot_policy_tpgmm.environments.suite.robots.embodiments import embodiment
 from tests.support.robot_zoo import G1_JOINTS, G1_PATH
 from tpgmm_torch.exceptions import DependencyError
 

@@ -21,7 +21,7 @@ from tpgmm_torch import Robot, quaternions
 from tpgmm_torch.exceptions import DependencyError
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
-__all__ = ["pair_posture", "pair_robot", "pair_spec"]
+__all__ = ["viperx_posture", "viperx_robot", "viperx_spec"]
 
 #: Where the left arm stands [m]; the right one is its mirror image. This, and how hands are
 #: mounted, comes from a search: how far six joints stay, in all that the experts ask for, from
@@ -40,13 +40,13 @@ POSTURE = (-1.67, -0.24, 0.82, 1.07, 1.48, -2.17)
 MIRRORED = (-1.0, 1.0, 1.0, -1.0, 1.0, -1.0)
 
 
-def pair_posture() -> Tensor:
+def viperx_posture() -> Tensor:
     """Where both arms wait, shape (12,) [rad]."""
     left, mirror = (torch.tensor(row, dtype=torch.float64) for row in (POSTURE, MIRRORED))
     return torch.cat((left, mirror * left))
 
 
-def pair_robot() -> Robot:
+def viperx_robot() -> Robot:
     """The kinematics of both arms: the six joints of the left one, then the right one's.
 
     Returns
@@ -72,7 +72,7 @@ def pair_robot() -> Robot:
     return Robot.from_urdf(text, HANDS, joints=joints)
 
 
-def pair_spec() -> mujoco.MjSpec:
+def viperx_spec() -> mujoco.MjSpec:
     """Both arms alone, simulated under position control.
 
     Returns

@@ -1,0 +1,1 @@
+"""Who does the tasks of the suite: the upper body, two ViperX arms, a Unitree G1."""
