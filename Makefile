@@ -11,6 +11,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint
 PACKAGES_bench := .[bench]
 PACKAGES_cli := .[cli]
 PACKAGES_compare := .[cli] ./policies[evaluation]
+PACKAGES_evidence := .[cli] ./policies[evaluation,g1]
 PACKAGES_metaworld := . ./policies[metaworld]
 PACKAGES_mutation := .[mutation]
 PACKAGES_test := .[test] ./policies[test]
@@ -34,7 +35,7 @@ demo: $(VENV)/.installed-cli ## Run the paper's experiment; results in out/demo
 compare: $(VENV)/.installed-compare ## Look at all tasks for half an hour: TP-GMM and quick baselines; out/compare
 	$(COMPARE) --env suite --demonstrations 3,10 --policies quick --episodes 10 --workers 2 --out out/compare
 
-evidence: $(VENV)/.installed-compare ## Measure everything, for days: WORKERS=8; out/evidence
+evidence: $(VENV)/.installed-evidence ## Measure everything, for days: WORKERS=8; out/evidence
 	$(COMPARE) --env all --demonstrations 3,10 --seeds 0,1,2 --policies all --episodes 100 --budget 30 \
 	    --workers $(WORKERS) --out out/evidence
 	$(COMPARE) --env all --demonstrations 10 --seeds 0,1,2 --policies tpgmm --conditions all --episodes 100 \

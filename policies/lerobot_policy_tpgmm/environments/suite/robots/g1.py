@@ -26,7 +26,7 @@ __all__ = ["g1_posture", "g1_robot", "g1_spec"]
 PACKAGE = "example-robot-data"
 FOLDER = "cmeel.prefix/share/example-robot-data/robots/g1_description"
 URDF, MESHES = f"{FOLDER}/urdf/g1_29dof_rev_1_0.urdf", f"{FOLDER}/meshes"
-#: Where the pelvis stands, seen from the origin of the tasks [m]. Of nine places it was the
+#: Where the pelvis stands, seen from the origin of the tasks [m]. Of twelve places it was the
 #: one where, in all that experts ask for, joints stay furthest from their ends.
 BASE = (-0.08, 0.0, 0.0)
 #: How far before the last joint of a wrist the middle of the palm is [m].
@@ -38,8 +38,10 @@ PALM = (0.025, 0.01, 0.04)
 TURN = "0 -1.5707963267948966 0"
 SIDES = ("left", "right")
 WAIST = ("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint")
-ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
-ARM += ("wrist_roll", "wrist_pitch", "wrist_yaw")
+ARM = (
+    *("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
+    *("wrist_roll", "wrist_pitch", "wrist_yaw"),
+)
 #: Its joints are so much stiffer than the upper body's, whose hands yield less.
 GAIN = 2.0
 #: Of the left arm: hands wait as those of the upper body do [rad].
