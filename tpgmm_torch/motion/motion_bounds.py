@@ -32,6 +32,9 @@ MARGIN = 3.0
 #: Seconds in which every joint may reach its speed limit: those that demonstrations moved
 #: little, and those of which none tell.
 SLOW, UNTOLD = 0.25, 0.1
+#: Speeds to which arms are limited [rad/s]. Descriptions that name greater ones may mean motors
+#: without load, 37 rad/s, which is no reason to go there in a quarter of a second.
+BELIEVED = 4.0
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
 #: What rounding may add to a bound, as a share of it.
@@ -124,8 +127,9 @@ class MotionBounds:
 
         Accelerations and jerks that neither the user nor the description of the robot gives
         are three times those demonstrated, and let every joint reach its speed limit in
-        0.25 s; without demonstrations, in 0.1 s. Every joint may reach its greatest
-        acceleration in 0.025 s.
+        0.25 s, but of one above 4 rad/s (or m/s) only 4, or what three times the greatest
+        acceleration of all joints makes; without demonstrations, in 0.1 s. Every joint may
+        reach its greatest acceleration in 0.025 s.
 
         Parameters
         ----------
@@ -191,6 +195,8 @@ class MotionBounds:
             # of a joint without limit of speed, what was demonstrated is all that is known
             unknown = torch.isinf(acceleration) & (peaks > 0)
             slow = torch.where(unknown, 0.0, acceleration)
+            most = max(BELIEVED / SLOW, MARGIN * float(peaks.max()))
+            slow = torch.where(slow.isfinite(), slow.clamp(max=most), slow)
             acceleration, jerk = torch.maximum(slow, MARGIN * peaks), MARGIN * jerks
         told = torch.isfinite(bound["acceleration"])
         bound["acceleration"] = torch.where(told, bound["acceleration"], acceleration)

@@ -49,10 +49,12 @@ needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="needs g
 EXAMPLE = Path(__file__).parents[3] / "examples" / "deployment_cpp"
 URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="lower"/>
 <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/>
-<axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="300" effort="1"/></joint>
+<axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="300" acceleration="1200"
+deceleration="1200" jerk="48000" effort="1"/></joint>
 <joint name="bend" type="revolute"><parent link="upper"/><child link="lower"/>
 <origin xyz="0.3 0 0"/><axis xyz="0 0 1"/>
-<limit lower="-2" upper="2" velocity="300" effort="1"/>
+<limit lower="-2" upper="2" velocity="300" acceleration="1200"
+deceleration="1200" jerk="48000" effort="1"/>
 </joint></robot>"""
 START, DT, TICKS = [0.02, 0.51], 0.01, 130
 

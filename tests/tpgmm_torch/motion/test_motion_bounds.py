@@ -49,6 +49,16 @@ def test_without_limits_of_speed_demonstrations_alone_tell():
     assert MotionBounds.of(ROBOT).acceleration.tolist() == [torch.inf] * 2
 
 
+def test_speeds_of_motors_without_load_are_no_reason_to_hurry():
+    """A description of 37 rad/s: as fast as one of 4, or as the joint that moved most."""
+    text = ZOO.replace('velocity="3"/>', 'velocity="37"/>')
+    robot = Robot.from_urdf(text, ("flange",), joints=["elbow"])
+    calm, lively = (MotionBounds.of(robot, peaks([most], [0.0])) for most in (0.1, 9.0))
+    assert (calm.acceleration.tolist(), lively.acceleration.tolist()) == ([16.0], [27.0])
+    assert calm.velocity.tolist() == [37.0]
+    assert MotionBounds.of(robot).acceleration.tolist() == pytest.approx([370.0])
+
+
 def test_what_the_description_says_wins():
     limit = 'velocity="3" acceleration="7" deceleration="6" jerk="50"/>'
     robot = Robot.from_urdf(ZOO.replace('velocity="3"/>', limit), ("flange",), joints=["elbow"])
