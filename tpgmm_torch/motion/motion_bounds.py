@@ -127,9 +127,9 @@ class MotionBounds:
 
         Accelerations and jerks that neither the user nor the description of the robot gives
         are three times those demonstrated, and let every joint reach its speed limit in
-        0.25 s, but of one above 4 rad/s (or m/s) only 4, or what three times the greatest
-        acceleration of all joints makes; without demonstrations, in 0.1 s. Every joint may
-        reach its greatest acceleration in 0.025 s.
+        0.25 s; without demonstrations, in 0.1 s. Of a limit above 4 rad/s (or m/s) that is
+        only 4, or what three times the greatest acceleration of all joints makes. Every joint
+        may reach its greatest acceleration in 0.025 s.
 
         Parameters
         ----------
@@ -180,8 +180,7 @@ class MotionBounds:
                 MissingLimitsWarning,
                 stacklevel=2,
             )
-        acceleration = bound["velocity"] / (UNTOLD if demonstrated is None else SLOW)
-        jerk = torch.zeros_like(acceleration)
+        peaks = jerks = torch.zeros_like(endless)
         if demonstrated is not None:
             peaks, jerks = (
                 as_tensor(x, "demonstrated peaks").to(endless) for x in demonstrated
@@ -192,12 +191,13 @@ class MotionBounds:
                         f"demonstrated peaks have shape ({len(names)},), got "
                         f"{tuple(found.shape)}"
                     )
-            # of a joint without limit of speed, what was demonstrated is all that is known
-            unknown = torch.isinf(acceleration) & (peaks > 0)
-            slow = torch.where(unknown, 0.0, acceleration)
-            most = max(BELIEVED / SLOW, MARGIN * float(peaks.max()))
-            slow = torch.where(slow.isfinite(), slow.clamp(max=most), slow)
-            acceleration, jerk = torch.maximum(slow, MARGIN * peaks), MARGIN * jerks
+        seconds = UNTOLD if demonstrated is None else SLOW
+        quick = bound["velocity"] / seconds
+        most = max(BELIEVED / seconds, MARGIN * float(peaks.max()))
+        # of a joint without limit of speed, what was demonstrated is all that is known
+        untold = torch.where(peaks > 0, 0.0, torch.inf)
+        quick = torch.where(quick.isinf(), untold, quick.clamp(max=most))
+        acceleration, jerk = torch.maximum(quick, MARGIN * peaks), MARGIN * jerks
         told = torch.isfinite(bound["acceleration"])
         bound["acceleration"] = torch.where(told, bound["acceleration"], acceleration)
         jerk = torch.maximum(jerk, bound["acceleration"] / ONSET)
