@@ -16,6 +16,7 @@ __all__ = [
     "CAMERA",
     "DAMPING",
     "PALM",
+    "PALM_SIZE",
     "STIFFNESS",
     "TIMESTEP",
     "RobotScene",
@@ -35,6 +36,8 @@ _DIVERGED = [
 ]
 #: What the palms collide with, as a bit; no other part of the robot collides.
 PALM = 2
+#: Half the sides of the upper body's palms, which robots without palms are given [m].
+PALM_SIZE = (0.025, 0.01, 0.04)
 
 
 def robot_spec() -> mujoco.MjSpec:

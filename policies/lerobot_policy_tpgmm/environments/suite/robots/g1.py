@@ -16,7 +16,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from lerobot_policy_tpgmm.environments.robot_scene import controlled
+from lerobot_policy_tpgmm.environments.robot_scene import PALM_SIZE, controlled
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DependencyError
@@ -31,18 +31,19 @@ URDF, MESHES = f"{FOLDER}/urdf/g1_29dof_rev_1_0.urdf", f"{FOLDER}/meshes"
 BASE = (-0.08, 0.0, 0.0)
 #: How far before the last joint of a wrist the middle of the palm is [m].
 AHEAD = 0.09
-#: Half the sides of a palm, as those of the upper body [m].
-PALM = (0.025, 0.01, 0.04)
 #: A hand comes to things along its own -z, which is where the wrist's x is: turns about x, y, z
 #: [rad].
 TURN = "0 -1.5707963267948966 0"
 SIDES = ("left", "right")
+#: What the names of the legs' links and joints have in them.
+LEGS = ("hip", "knee", "ankle")
 WAIST = ("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint")
 ARM = (
     *("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow"),
     *("wrist_roll", "wrist_pitch", "wrist_yaw"),
 )
-#: Its joints are so much stiffer than the upper body's, whose hands yield less.
+#: How much stiffer its joints are than the upper body's: with equal gains its hands yield more,
+#: and press hardly hard enough to wipe.
 GAIN = 2.0
 #: Of the left arm: hands wait as those of the upper body do [rad].
 POSTURE = (0.209, 0.337, -0.135, -0.066, 0.17, 0.323, -0.372)
@@ -99,7 +100,7 @@ def g1_spec() -> mujoco.MjSpec:
     SubElement(SubElement(robot, "mujoco"), "compiler", keep)
     spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
     for hand in HANDS:
-        spec.body(hand).add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM, mass=0)
+        spec.body(hand).add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=0)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     return controlled(spec, GAIN)
@@ -114,8 +115,9 @@ def _description() -> Element:
             link.remove(shape)
         for mesh in link.iter("mesh"):
             mesh.set("filename", str(meshes / Path(mesh.get("filename", "")).name))
-    for side in SIDES:
-        _cut(robot, f"{side}_hip_pitch_joint")
+    for part in [*robot]:
+        if any(leg in part.get("name", "") for leg in LEGS):
+            robot.remove(part)
     _fix(robot, "origin", "pelvis", "{} {} {}".format(*BASE), "0 0 0")
     SubElement(robot, "link", name="origin")
     for side, hand in zip(SIDES, HANDS, strict=True):
@@ -146,18 +148,3 @@ def _fix(robot: Element, parent: str, child: str, place: str, turn: str) -> None
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
     SubElement(joint, "origin", xyz=place, rpy=turn)
-
-
-def _cut(robot: Element, name: str) -> None:
-    """Remove a joint and all that hangs on it."""
-    for joint in robot.findall("joint"):
-        if joint.get("name") != name:
-            continue
-        robot.remove(joint)
-        child = joint.find("child").get("link")  # type: ignore[union-attr]
-        for link in robot.findall("link"):
-            if link.get("name") == child:
-                robot.remove(link)
-        for below in robot.findall("joint"):
-            if below.find("parent").get("link") == child:  # type: ignore[union-attr]
-                _cut(robot, below.get("name", ""))

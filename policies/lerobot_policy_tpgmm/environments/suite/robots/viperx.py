@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_tpgmm.environments.aloha.robot import ARM_JOINTS, HOW_TO_INSTALL, SIDES
-from lerobot_policy_tpgmm.environments.robot_scene import controlled
+from lerobot_policy_tpgmm.environments.robot_scene import PALM_SIZE, controlled
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch import Robot, quaternions
 from tpgmm_torch.exceptions import DependencyError
@@ -30,8 +30,8 @@ BASE = (0.03, 0.4, -0.19)
 #: How the left hand is mounted: so far ahead of ``gripper_link`` [m], and that is turned to the
 #: left and down by so much where the hand is level and straight [rad].
 AHEAD, OUTWARDS, DOWN = 0.08, math.radians(6.0), math.radians(27.0)
-#: Half the sides of a palm [m], as those of the upper body, and the mass of a hand [kg].
-PALM, MASS = (0.025, 0.01, 0.04), 0.1
+#: Of a hand [kg].
+MASS = 0.1
 #: Of all joints, as in the manufacturer's description [rad/s].
 SPEED = math.pi
 #: Of the left arm: hands wait where those of the upper body do, level [rad].
@@ -112,7 +112,7 @@ def _arms() -> mujoco.MjSpec:
             joint = spec.joint(f"{arm}/{name}")
             joint.name, joint.frictionloss = f"{side}_arm_{name}", 0.0
         palm = gripper.add_body(name=hand, pos=(AHEAD, 0, 0), quat=_mounted(sign).numpy())
-        palm.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM, mass=MASS)
+        palm.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=PALM_SIZE, mass=MASS)
     for geom in spec.geoms:
         geom.contype = geom.conaffinity = 0
     return spec
