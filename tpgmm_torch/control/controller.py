@@ -209,7 +209,8 @@ class Controller:
         self._search, self._via = PostureSearch(), via
         self._late: Tensor | None = None  # robots whose time did not increase in this tick
         self._taken: Follower | None = None  # of this tick, where all can be followed
-        self._velocity, self._asked = torch.zeros_like(self.reference), self.reference
+        self._velocity = torch.zeros_like(self.reference)
+        self._wanted = self._asked = self.reference
         self._gap_before: NDArray[np.float64] | None = None  # reference and robot, last tick
         self._pushed: NDArray[np.float64] | float = 0.0
         shape = self.reference.shape[:-1]
@@ -632,7 +633,7 @@ class Controller:
         goal: Tensor | None = None,
     ) -> Command:
         """The command that brings robots to where they are wanted, or are led."""
-        last, self._wanted, lost = self.reference, wanted, None
+        last, before_that, self._wanted, lost = self.reference, self._wanted, wanted, None
         wanted = wanted if goal is None else goal
         each = _of_each(dt, last)
         each = each.unsqueeze(-1) if isinstance(each, Tensor) else each
@@ -646,9 +647,9 @@ class Controller:
         elif self.command is not None:  # the first reference is where robots stand
             if halted is not None:  # what is not finite brings a robot to rest
                 wanted = torch.where(halted.unsqueeze(-1), torch.nan, wanted)
-            if self._follower is None:
+            if self._follower is None:  # a gap to where the skill begins is no speed
                 fastest = self._bounds.velocity
-                moving = ((wanted - last) / each).clamp(-fastest, fastest)
+                moving = ((wanted - before_that) / each).clamp(-fastest, fastest)
                 self._follower = Follower.at(self._bounds, last, moving)
             before, (follower, self._taken) = self._follower, (self._taken, None)
             if follower is None or follower.reference is not wanted:

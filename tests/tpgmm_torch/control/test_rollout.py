@@ -213,6 +213,27 @@ def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
 # Limits
 
 
+def test_a_gap_to_where_the_skill_begins_is_no_speed():
+    problem = Problem.of(CASES["canonical"], 3, 1)
+    time = grid(161)
+    [free] = run(problem.regression(), situations(problem, time), blend=0)
+    kinematics = copy.copy(problem.case.world.kinematics)
+    kinematics.velocity = torch.full_like(kinematics.velocity, torch.inf)
+    kinematics.lower = torch.full_like(kinematics.lower, -torch.inf)
+    kinematics.upper = torch.full_like(kinematics.upper, torch.inf)
+    peaks = torch.full_like(kinematics.lower, 5.0), torch.full_like(kinematics.lower, 100.0)
+    regression = replace(problem.regression(), kinematics=kinematics)
+    begin = free.joints[0] + 0.5
+    given = [replace(situations(problem, time)[0], joints=begin)]
+    options = {"blend": 0, "candidates": False, "holds": (), "via": None}
+    bounds = MotionBounds.of(kinematics, peaks)
+    [bounded] = rollout(regression, given, grid(), bounds=bounds, **options)
+    assert_close(bounded.joints[0], begin)
+    # taken for a speed, 0.5 within a tick of 12.5 ms led 50 beyond
+    assert (bounded.joints - free.joints).abs().max() <= 0.5 + 1e-9
+    assert_close(bounded.joints[-1], free.joints[-1])
+
+
 def test_references_keep_the_limits_of_position_and_speed():
     problem = Problem.of(CASES["the paper's"], 4, 2)
     slow = copy.copy(problem.case.world.kinematics)
