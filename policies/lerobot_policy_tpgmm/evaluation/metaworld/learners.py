@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -71,20 +70,14 @@ def apart(references: Rows) -> list[int]:
     return kept[1:]
 
 
-def of_one_kind(episodes: Sequence[Recorded], longest: float, fewest: int) -> list[Recorded]:
-    """Those in which the gripper switches as often as in most, and that need no second try.
+def direct(episodes: Sequence[Recorded], longest: float) -> list[Recorded]:
+    """Those that take no more than ``longest`` times the shortest of them.
 
-    Experts try again where they missed. In a tie those with the fewest switches are of one
-    kind; what takes more than ``longest`` times their median is not. All, where fewer than
-    ``fewest`` would be left.
+    Experts try again where they missed, and that takes time. A mean over episodes in which
+    the hand comes once and in which it comes twice comes neither once nor twice.
     """
-    counts = [len(apart(one.references)) for one in episodes]
-    often = Counter(counts)
-    usual = min(often, key=lambda count: (-often[count], count))
-    alike = [one for one, count in zip(episodes, counts, strict=True) if count == usual]
-    median = np.median([len(one.references) for one in alike])
-    alike = [one for one in alike if len(one.references) <= longest * median]
-    return alike if len(alike) >= fewest else list(episodes)
+    shortest = min(len(one.references) for one in episodes)
+    return [one for one in episodes if len(one.references) <= longest * shortest]
 
 
 def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
@@ -124,8 +117,8 @@ class TaskParameterized:
         The speed of the reproduction, as a share of the demonstrations'. The experts move the
         target as fast as Meta-World lets them: at their own pace, what differs from them falls
         behind, and cuts the corners and the depth of a push.
-    longest, at_least : float, int
-        What ``of_one_kind`` keeps is learned from.
+    longest : float
+        What takes more than so many times the shortest demonstration is not learned from.
     steps_per_component : int
         How much of the skill one Gaussian is for, of at least ``fewest``.
     fewest : int
@@ -144,7 +137,6 @@ class TaskParameterized:
 
     pace: float = 0.8
     longest: float = 1.4
-    at_least: int = 3
     steps_per_component: int = 3
     fewest: int = 8
     warping: dict[str, Any] = field(
@@ -166,8 +158,8 @@ class TaskParameterized:
         robot = metaworld_robot()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            alike = of_one_kind(episodes, self.longest, self.at_least)
-            demonstrations = self._aligned(paced(alike, self.pace), robot)
+            learned = direct(episodes, self.longest)
+            demonstrations = self._aligned(paced(learned, self.pace), robot)
             n_steps = len(demonstrations[0])
             model = TaskParameterizedGMM(
                 max(self.fewest, n_steps // self.steps_per_component),
@@ -185,7 +177,7 @@ class TaskParameterized:
                 },
             ).fit(demonstrations)
         if self.nearness is not None:
-            model = self.nearness.applied(model, len(alike))
+            model = self.nearness.applied(model, len(learned))
         frames = {
             name: list(range(7 * i, 7 * i + 7))
             for i, name in enumerate(FRAMES)

@@ -15,7 +15,7 @@ from lerobot_policy_tpgmm.evaluation.metaworld import recordings
 from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     TaskParameterized,
-    of_one_kind,
+    direct,
     paced,
     switches,
 )
@@ -175,16 +175,15 @@ def test_events_are_the_switches_that_all_demonstrations_have():
 
 
 def test_second_tries_are_not_learned_from():
-    episodes = [reaching(seed) for seed in range(6)]
-    episodes[1].references[50:, -1] = 1.0  # opened again
-    episodes[4] = reaching(4, 90)
-    kept = [episodes[i] for i in (0, 2, 3, 5)]
-    assert of_one_kind(episodes, longest=1.4, fewest=3) == kept
-    assert of_one_kind(episodes, longest=1.6, fewest=3) == [*kept[:3], episodes[4], kept[3]]
-    assert of_one_kind(episodes, longest=1.4, fewest=5) == episodes
-    # as many of one as of the other kind: those with fewer switches
-    assert of_one_kind(episodes[:2], longest=1.4, fewest=1) == episodes[:1]
-    assert of_one_kind(episodes[1::-1], longest=1.4, fewest=1) == episodes[:1]
+    episodes = [reaching(seed, length) for seed, length in enumerate((80, 60, 84, 85, 60))]
+    assert direct(episodes, longest=1.4) == [episodes[i] for i in (0, 1, 2, 4)]
+    assert direct(episodes, longest=1.3) == [episodes[i] for i in (1, 4)]
+    assert direct(episodes[:1], longest=1.4) == episodes[:1]
+    learner = TaskParameterized()
+    few, all_of_them = (learner.fit(some, 0).policy for some in (episodes[:3], episodes[:4]))
+    assert torch.equal(few.mixture.means[0], all_of_them.mixture.means[0])
+    most = replace(learner, longest=2.0).fit(episodes[:4], 0).policy
+    assert not torch.equal(few.mixture.means[0], most.mixture.means[0])
 
 
 def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
