@@ -41,7 +41,7 @@ class Network:
     name: str
     recipe: Recipe
     control: str = "displacement"
-    budget: float = 30.0
+    budget: float = 600.0
 
     def fit(
         self, episodes: Sequence[Recorded], seed: int, validation: Sequence[Recorded]
