@@ -633,7 +633,8 @@ class Controller:
         goal: Tensor | None = None,
     ) -> Command:
         """The command that brings robots to where they are wanted, or are led."""
-        last, before_that, self._wanted, lost = self.reference, self._wanted, wanted, None
+        last, wanted_before, lost = self.reference, self._wanted, None
+        self._wanted = wanted
         wanted = wanted if goal is None else goal
         each = _of_each(dt, last)
         each = each.unsqueeze(-1) if isinstance(each, Tensor) else each
@@ -649,7 +650,7 @@ class Controller:
                 wanted = torch.where(halted.unsqueeze(-1), torch.nan, wanted)
             if self._follower is None:  # a gap to where the skill begins is no speed
                 fastest = self._bounds.velocity
-                moving = ((wanted - before_that) / each).clamp(-fastest, fastest)
+                moving = ((wanted - wanted_before) / each).clamp(-fastest, fastest)
                 self._follower = Follower.at(self._bounds, last, moving)
             before, (follower, self._taken) = self._follower, (self._taken, None)
             if follower is None or follower.reference is not wanted:

@@ -42,7 +42,9 @@ def situations(problem: Problem, *grids: Tensor, moves: bool = False) -> list[Si
 
 def run(regression: Regression, given: list[Situation], **options) -> list[Trajectory]:
     options = {"blend": 0.5, "keep_limits": False, "candidates": True} | options
-    bounds = MotionBounds.of(regression.kinematics) if options.pop("keep_limits") else None
+    peaks = options.pop("peaks", None)
+    keeps = options.pop("keep_limits")
+    bounds = MotionBounds.of(regression.kinematics, peaks) if keeps else None
     return rollout(regression, given, grid(), bounds=bounds, **options)
 
 
@@ -225,9 +227,7 @@ def test_a_gap_to_where_the_skill_begins_is_no_speed():
     regression = replace(problem.regression(), kinematics=kinematics)
     begin = free.joints[0] + 0.5
     given = [replace(situations(problem, time)[0], joints=begin)]
-    options = {"blend": 0, "candidates": False, "holds": (), "via": None}
-    bounds = MotionBounds.of(kinematics, peaks)
-    [bounded] = rollout(regression, given, grid(), bounds=bounds, **options)
+    [bounded] = run(regression, given, blend=0, keep_limits=True, peaks=peaks)
     assert_close(bounded.joints[0], begin)
     # taken for a speed, 0.5 within a tick of 12.5 ms led 50 beyond
     assert (bounded.joints - free.joints).abs().max() <= 0.5 + 1e-9

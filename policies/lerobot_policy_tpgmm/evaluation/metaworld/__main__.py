@@ -57,7 +57,7 @@ def run(
     ] = 12,
     budget: Annotated[
         float, typer.Option(min=0, help="Minutes of the processor for each network at most.")
-    ] = 10.0,
+    ] = Network.budget / 60,
     tuning: Annotated[
         bool, typer.Option(help="Try in other situations than those that are reported.")
     ] = False,
