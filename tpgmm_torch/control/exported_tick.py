@@ -27,7 +27,7 @@ from tpgmm_torch.control.compiled_tick import CompiledRegression, Tick, check_co
 from tpgmm_torch.control.exported import FORMAT, here
 from tpgmm_torch.control.exported_clock import exported_clock
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.motion.follower import CRUISE, HASTE, MEMORY, ROUNDING
+from tpgmm_torch.motion.follower import CRUISE, MEMORY, ROUNDING
 from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.regression import Regression
@@ -334,10 +334,10 @@ class BrakingLaw:
         fits = fits & (exact_slope.abs() <= self.velocity * (1 + ROUNDING))
         fits = fits & (keeps | ~is_behind) & self._stops(exact, low, high) & moves
 
-        fastest = torch.minimum(self.velocity, HASTE * self.acceleration)
         moved = (target - before) / dt
-        turn = torch.where(moved.abs() <= fastest, moved - drift, 0.0)
-        drift = drift + (dt / MEMORY).clamp(max=1.0) * turn
+        slower = torch.where(drift * moved < 0, 0.0, moved)
+        rising = drift + (dt / MEMORY).clamp(max=1.0) * (moved - drift)
+        drift = torch.where(slower.abs() < rising.abs(), slower, rising)
         drift = torch.clamp(drift, -CRUISE * self.velocity, CRUISE * self.velocity)
         start = position, velocity, acceleration
         towards = self._towards(start, target, drift, dt, low, high)

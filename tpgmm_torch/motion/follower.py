@@ -56,15 +56,13 @@ Mask = NDArray[np.bool_]
 
 #: What rounding may add to a bound, as a share of it.
 ROUNDING = 1e-9
-#: Seconds over which the velocity of a posture that is not reached is averaged.
+#: Seconds after which a posture that is not reached is expected to move on as it does.
 MEMORY = 0.05
 #: Of the speed limit, how much a wanted posture is believed to move on with.
 CRUISE = 0.9
 #: What is planned for is a multiple of ``1 / GRID`` [rad or m]: a plan enlarges a difference of
 #: rounding ten million times.
 GRID = 2.0**20
-#: A wanted posture that is faster than this many seconds of full acceleration has jumped.
-HASTE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,9 +342,11 @@ class Moment(NamedTuple):
         )
         each = dt if isinstance(dt, float) else np.broadcast_to(dt, asked.shape)[asked]
         drift, moved = self.drift[asked], (target - before) / each
-        # what is faster than the joint is a jump, not a motion
-        moves = np.abs(moved) <= np.minimum(speed, HASTE * acceleration)
-        drift = drift + np.minimum(1.0, each / MEMORY) * np.where(moves, moved - drift, 0.0)
+        # that it moves on is believed little by little, and that it does not at once: what has
+        # jumped is not expected further on
+        slower = np.where(drift * moved < 0, 0.0, moved)
+        rising = drift + np.minimum(1.0, each / MEMORY) * (moved - drift)
+        drift = np.where(np.abs(slower) < np.abs(rising), slower, rising)
         drift = np.clip(drift, -CRUISE * speed, CRUISE * speed)
         part = first_part(start, target, drift, each, speed, acceleration, jerk)
         unsafe = ~self._stops(part, asked, bounds)

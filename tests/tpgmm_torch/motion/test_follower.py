@@ -134,6 +134,23 @@ def test_a_jump_is_reached_as_fast_as_bounds_allow_and_then_followed():
     assert 0.6 < first * DT < 1.1
 
 
+@pytest.mark.parametrize(
+    ("speed", "acceleration", "jerk"), [(2.0, 10.0, 200.0), (np.inf, 250.0, 1e4)]
+)
+@pytest.mark.parametrize("ticks", [1, 2, 3])
+def test_a_posture_that_stops_is_not_overshot(speed, acceleration, jerk, ticks):
+    one = torch.ones(1, dtype=torch.float64)
+    limits = MotionBounds(-9 * one, 9 * one, speed * one, acceleration * one, jerk * one)
+    away = 0.5 if np.isinf(speed) else 0.95 * speed * DT * ticks
+    # it stands, moves on for some ticks, and stands
+    path = np.interp(np.arange(200), [9, 9 + ticks], [0.0, away])
+    wanted = torch.from_numpy(path[:, None])
+    followers = follow(Follower.at(limits, [0.0]), wanted, [DT] * len(wanted))
+    references = torch.stack([one.reference for one in followers])
+    assert bool((references <= away + 1e-9).all())
+    assert torch.equal(references[-1], wanted[-1])
+
+
 @pytest.mark.parametrize("velocity", [None, [1.0, -1.0, 0.5], [5.0, -9.0, 3.0]])
 def test_a_start_outside_comes_back_and_stays(velocity):
     limits = bounds()
