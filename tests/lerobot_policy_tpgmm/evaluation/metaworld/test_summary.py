@@ -167,11 +167,20 @@ def test_switches_are_where_the_gripper_jumps():
 def test_events_are_the_switches_that_all_demonstrations_have():
     once, twice = reaching(0), reaching(1)
     twice.references[50:, -1] = 1.0
-    first, second = paced([once, twice], 0.5)
-    assert first.events == second.events == {"switch 1": pytest.approx(30 / 80 / 0.5)}
-    assert float(first.time[-1]) == pytest.approx(59 / 80 / 0.5)
+    first, second = paced([once, twice], 1.0)
+    assert first.events == second.events == {"switch 1": pytest.approx(30 / 80)}
     once.references[30:, -1] = 1.0  # never closed: nothing is common
     assert not any(one.events for one in paced([once, twice], 0.5))
+
+
+def test_fingers_are_told_later_where_the_hand_is_slower():
+    shown = reaching(0)
+    [one] = paced([shown], 0.5)
+    assert float(one.time[-1]) == pytest.approx(59 / 80 / 0.5)
+    # the hand takes twice as long to where it was 0.19 s after the switch, fingers do not
+    assert one.events["switch 1"] == pytest.approx(2 * 30 / 80 + 0.19, abs=0.5 / 80 / 0.5)
+    assert one.joints[:, 3].tolist() == [1.0] * 38 + [0.0] * 22
+    assert np.array_equal(one.joints[:, :3], shown.references[:, :3])
 
 
 def test_second_tries_are_not_learned_from():
@@ -250,6 +259,16 @@ def test_one_demonstration_is_enough_to_reach_another_goal():
     blind = TaskParameterized(nearness=None).fit([shown], 0)
     blind.begin(new.observed[:1])
     assert np.linalg.norm(blind.act(0, 10**6, new.observed[-1])[:3] - goal) > 0.02
+
+
+def test_the_gripper_switches_as_it_was_shown():
+    shown, new = [reaching(i) for i in (1, 2, 3)], reaching(4)
+    actor = TaskParameterized().fit(shown, 0)
+    actor.begin(new.observed[:1])
+    plan = np.array([actor.act(0, step, new.observed[0])[3] for step in range(90)])
+    # from all to nothing within two steps, and no further; as an arm's joint it took five
+    assert np.flatnonzero(plan < 0.1)[0] - np.flatnonzero(plan > 0.9)[-1] <= 2
+    assert plan.min() >= -1e-6 and plan.max() <= 1 + 1e-6
 
 
 def test_reading_the_hand_at_every_step_gives_the_same_references_if_it_follows():
