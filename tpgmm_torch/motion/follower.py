@@ -27,7 +27,7 @@ acceleration and of the jerk. So a tick may be exact or generated, joint by join
 A wanted posture is taken exactly where ``|a_k| <= A``, ``|a_k - a_{k-1}| <= J dt``, and where
 the motion (F1) can be stopped within the bounds of speed and position. Elsewhere an on-line
 trajectory generator plans the fastest motion to the wanted posture, seen as one that moves on
-with the velocity it has had, and its first ``dt`` is taken.
+with the velocity it has had for a while, and its first ``dt`` is taken.
 """
 
 from __future__ import annotations
