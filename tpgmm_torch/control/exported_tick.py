@@ -326,15 +326,15 @@ class BrakingLaw:
         fits = (exact_bend.abs() <= self.acceleration) & (
             change <= self.jerk * ((dt + 2 * ago) / 3)
         )
-        is_behind = behind > 0
-        exact_drift = torch.where(is_behind, (target - before) / dt, exact_slope)
+        is_behind, moved = behind > 0, (target - before) / dt
+        exact_drift = torch.where(is_behind, moved, exact_slope)
         joining, onset = (exact_drift - exact_slope) / dt, self.jerk * dt
         keeps = joining.abs() <= torch.minimum(self.acceleration, onset)
         keeps = keeps & ((joining - exact_bend).abs() <= onset)
         fits = fits & (exact_slope.abs() <= self.velocity * (1 + ROUNDING))
         fits = fits & (keeps | ~is_behind) & self._stops(exact, low, high) & moves
 
-        moved = (target - before) / dt
+        # as in Moment.generated: believed to move on little by little, to have stopped at once
         slower = torch.where(drift * moved < 0, 0.0, moved)
         rising = drift + (dt / MEMORY).clamp(max=1.0) * (moved - drift)
         drift = torch.where(slower.abs() < rising.abs(), slower, rising)

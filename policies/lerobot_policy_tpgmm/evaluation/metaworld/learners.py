@@ -94,7 +94,7 @@ def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     others do not need it.
     """
     later = round(CLOSING * (1 - pace) * FPS)
-    episodes = [_gripping(episode, later) for episode in episodes]
+    episodes = [_told_later(episode, later) for episode in episodes]
     demonstrations = [episode.demonstration() for episode in episodes]
     found = [apart(one.references) for one in episodes]
     return [
@@ -110,7 +110,7 @@ def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     ]
 
 
-def _gripping(episode: Recorded, later: int) -> Recorded:
+def _told_later(episode: Recorded, later: int) -> Recorded:
     """The same, with the wanted opening so many steps later."""
     references = episode.references.copy()
     steps = np.arange(len(references))
