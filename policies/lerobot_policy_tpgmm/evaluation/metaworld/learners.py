@@ -36,8 +36,8 @@ SWITCH = 0.2
 #: what is between them is too little to learn from.
 APART = 3
 #: The opening is a force, which may change from all to nothing within a step: bounds of its
-#: acceleration and jerk that leave room for that.
-STEPPING = {"acceleration": {JOINTS[-1]: 2.0 * FPS**2}, "jerk": {JOINTS[-1]: 4.0 * FPS**3}}
+#: acceleration and jerk that leave room for that [1/s^2, 1/s^3].
+ACCELERATION, JERK = 2.0 * FPS**2, 4.0 * FPS**3
 #: Fingers need so long for nine tenths of their way, at whatever pace the hand moves [s]: the
 #: median of experts' first switches, between 0.15 and 0.24 in each task of the tuned half.
 CLOSING = 0.19
@@ -212,7 +212,8 @@ class TaskParameterized:
             smoothing=None,
             chunk_size=round(float(model.time_[-1] - model.time_[0]) * FPS) + 1,
             largest_start_gap=None,
-            **STEPPING,
+            acceleration={JOINTS[-1]: ACCELERATION},
+            jerk={JOINTS[-1]: JERK},
         )
         return TaskParameterizedActor(policy, self.clock is None)
 
