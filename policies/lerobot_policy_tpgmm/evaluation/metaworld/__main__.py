@@ -27,7 +27,13 @@ from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
     successes,
     validation,
 )
-from lerobot_policy_tpgmm.evaluation.metaworld.summary import cost_table, summary, task_table
+from lerobot_policy_tpgmm.evaluation.metaworld.summary import (
+    comparison_table,
+    cost_table,
+    draw_groups,
+    summary,
+    task_table,
+)
 from lerobot_policy_tpgmm.evaluation.metaworld.trials import trials
 from lerobot_policy_tpgmm.evaluation.report.tables import episode_table, write_table
 from tpgmm_torch.atomic import replacing
@@ -171,13 +177,17 @@ def _measure(
 
 
 def report(results: Results, out: Path) -> None:
-    """Write ``results.md`` and ``episodes.parquet`` of all cells that are there."""
+    """Write ``results.md``, its picture and ``episodes.parquet`` of all finished cells."""
     found = results.read_all(typer.echo)
     if not found:
         return
     experts = {(one["cell"]["env"], one["cell"]["seed"]): one["expert"] for one in found}
     asked = sum(expert["episodes"] for expert in experts.values())
     solved = sum(expert["successes"] for expert in experts.values())
+    # its demonstrations are those of the training seed
+    shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
+    rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
+    episodes = episode_table(rows)
     text = "\n".join(
         [
             "# Meta-World: successes in per cent",
@@ -185,16 +195,17 @@ def report(results: Results, out: Path) -> None:
             f"The scripted experts solved {solved} of {asked} situations.",
             "",
             summary(found),
+            "![Success over demonstrations, a panel for each group of tasks](success.webp)",
+            "",
+            comparison_table(episodes),
             task_table(found),
             cost_table(found),
         ]
     )
+    draw_groups(episodes, out / "success")
+    write_table(episodes, out / "episodes")
     with replacing(out / "results.md") as file:
         file.write_text(text, encoding="utf-8")
-    # its demonstrations are those of the training seed
-    shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
-    rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
-    write_table(episode_table(rows), out / "episodes")
     typer.echo(summary(found))
 
 

@@ -1,12 +1,14 @@
-"""Tables of what was measured: groups of tasks, and numbers of demonstrations."""
+"""What was measured, in tables and a picture: groups of tasks, numbers of demonstrations."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from lerobot_policy_tpgmm.environments.metaworld.tasks import (
     DIFFICULTIES,
@@ -14,9 +16,12 @@ from lerobot_policy_tpgmm.environments.metaworld.tasks import (
     TUNED,
     difficulty,
 )
+from lerobot_policy_tpgmm.evaluation.report.panels import line_of, success_panels, write
+from lerobot_policy_tpgmm.evaluation.report.significance import REFERENCE, over_tasks
 from lerobot_policy_tpgmm.evaluation.report.tables import wilson
+from tpgmm_torch.plotting import BLUE, GREEN, PURPLE, VERMILION
 
-__all__ = ["GROUPS", "cost_table", "summary", "task_table"]
+__all__ = ["GROUPS", "comparison_table", "cost_table", "draw_groups", "summary", "task_table"]
 
 #: Rows of the summary, and the tasks that they are about.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -25,14 +30,24 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "tuned half": TUNED,
     "held half": tuple(sorted({*TASKS} - {*TUNED})),
 }
+#: The learners in their order, and what their lines look like.
+LOOKS = {
+    REFERENCE: line_of("TP-GMM", VERMILION, "o"),
+    "perceptron": line_of("perceptron", PURPLE, "s", "--"),
+    "act": line_of("ACT", BLUE, "^", "-."),
+    "diffusion": line_of("Diffusion Policy", GREEN, "D", ":"),
+}
+#: So many tasks are named in which TP-GMM loses most.
+NAMED = 6
 Result = Mapping[str, Any]
 
 
 def summary(results: Iterable[Result]) -> str:
     """Successes in per cent, with 95 % intervals of Wilson over episodes, as Markdown.
 
-    Where there are several training seeds, the interval is followed by each seed's figure.
-    An interval is that of more episodes of these tasks, not of other tasks.
+    Where there are several training seeds, the interval is followed by the figure of each that
+    was tried in all these tasks, and where not all tasks of a group were tried, by how many
+    were. An interval is that of more episodes of these tasks, not of other tasks.
 
     Parameters
     ----------
@@ -45,7 +60,10 @@ def summary(results: Iterable[Result]) -> str:
     lines.append(_line(["---"] * (1 + len(columns))))
     for group, tasks in GROUPS.items():
         cells = [
-            _entry([r for r in results if _place(r) == place and r["cell"]["env"] in tasks])
+            _entry(
+                [r for r in results if _place(r) == place and r["cell"]["env"] in tasks],
+                len(tasks),
+            )
             for place in columns
         ]
         if any(cells):
@@ -95,6 +113,58 @@ def cost_table(results: Iterable[Result]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def comparison_table(episodes: pd.DataFrame) -> str:
+    """TP-GMM beside each other policy, over the tasks that both were tried in, as Markdown.
+
+    Parameters
+    ----------
+    episodes : DataFrame
+        As :func:`~lerobot_policy_tpgmm.evaluation.report.tables.episode_table` makes it.
+    """
+    heading = ["beside", "tasks", "TP-GMM", "other", "difference", "better", "worse", "p"]
+    lines = [_line([*heading, "loses most"]), _line(["---"] * (len(heading) + 1))]
+    for row in over_tasks(episodes).itertuples():
+        lost = row.differences[row.differences < 0].sort_values().head(NAMED)
+        lines.append(
+            _line(
+                [
+                    f"{row.policy}, {row.demonstrations}",
+                    str(len(row.differences)),
+                    f"{100 * row.success:.1f}",
+                    f"{100 * row.other_success:.1f}",
+                    f"{100 * row.difference:.1f} ({100 * row.low:.0f} to {100 * row.high:.0f})",
+                    str(int((row.differences > 0).sum())),
+                    str(int((row.differences < 0).sum())),
+                    f"{row.p:.2g}",
+                    ", ".join(f"{task} {100 * by:.0f}" for task, by in lost.items()),
+                ]
+            )
+        )
+    return "\n".join(lines) + "\n" if len(lines) > 2 else ""
+
+
+def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
+    """Success over the number of demonstrations, a panel for each group of tasks.
+
+    A training seed of a policy is in a panel where it was tried in as many of its tasks as any
+    other: shares of some tasks are no rivals of shares of all.
+
+    Parameters
+    ----------
+    episodes : DataFrame
+        As of :func:`comparison_table`.
+    path : Path
+        Without suffix; ``.pdf`` and ``.webp`` are written.
+    """
+    panels = []
+    for group, tasks in GROUPS.items():
+        part = episodes[episodes.env.isin(tasks)]
+        place = ["policy", "demonstrations", "training_seed"]
+        tried = part.groupby(place).env.transform("nunique")
+        panels.append(part[tried == tried.max()].assign(env=group))
+    write(success_panels(pd.concat(panels), LOOKS), path)
+
+
 def _action_seconds(result: Result) -> float:
     episodes = result["episodes"]
     acting = sum(episode["acting_seconds"] for episode in episodes)
@@ -106,29 +176,33 @@ def _place(result: Result) -> tuple[str, int]:
 
 
 def _columns(results: Sequence[Result]) -> list[tuple[str, int]]:
-    return sorted({_place(result) for result in results}, key=lambda p: (p[0] != "tpgmm", *p))
+    return sorted({_place(result) for result in results}, key=lambda p: (p[0] != REFERENCE, *p))
 
 
 def _episodes(results: Sequence[Result]) -> list[bool]:
     return [episode["success"] for result in results for episode in result["episodes"]]
 
 
-def _entry(results: Sequence[Result]) -> str:
+def _entry(results: Sequence[Result], tasks: int) -> str:
     successes = _episodes(results)
     if not successes:
         return ""
-    low, high = wilson(sum(successes), len(successes))
     # each task counts alike, however many of its episodes there are
     by_task: dict[str, list[bool]] = {}
     for result in results:
         by_task.setdefault(result["cell"]["env"], []).extend(_episodes([result]))
-    mean = np.mean([np.mean(values) for values in by_task.values()])
+    mean = float(np.mean([np.mean(values) for values in by_task.values()]))
+    low, high = wilson(round(mean * len(successes)), len(successes))
     text = f"{100 * mean:.1f} ({100 * low:.0f} to {100 * high:.0f})"
-    seeds = sorted({result["cell"]["seed"] for result in results})
-    if len(seeds) > 1:
-        of_seed = [_episodes([r for r in results if r["cell"]["seed"] == s]) for s in seeds]
-        text += " [" + ", ".join(f"{100 * np.mean(values):.0f}" for values in of_seed) + "]"
-    return text
+    of_seed: dict[int, list[Result]] = {}
+    for result in results:
+        of_seed.setdefault(result["cell"]["seed"], []).append(result)
+    # figures of fewer tasks are no figures of the same
+    whole = [of_seed[seed] for seed in sorted(of_seed) if len(of_seed[seed]) == len(by_task)]
+    if len(whole) > 1:
+        shares = [100 * np.mean(_episodes(one)) for one in whole]
+        text += " [" + ", ".join(f"{share:.0f}" for share in shares) + "]"
+    return text if len(by_task) == tasks else f"{text}, in {len(by_task)} of {tasks}"
 
 
 def _counts(results: Sequence[Result]) -> str:

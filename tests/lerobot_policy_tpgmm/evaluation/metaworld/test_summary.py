@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from lerobot_policy_tpgmm.environments.metaworld.hand import metaworld_robot
-from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED
+from lerobot_policy_tpgmm.environments.metaworld.tasks import TASKS, TUNED, difficulty
 from lerobot_policy_tpgmm.evaluation.cells import Cell, Results
 from lerobot_policy_tpgmm.evaluation.metaworld import recordings
+from lerobot_policy_tpgmm.evaluation.metaworld import summary as summaries
 from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
     TaskParameterized,
@@ -30,10 +31,13 @@ from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
 )
 from lerobot_policy_tpgmm.evaluation.metaworld.summary import (
     GROUPS,
+    comparison_table,
     cost_table,
+    draw_groups,
     summary,
     task_table,
 )
+from lerobot_policy_tpgmm.evaluation.report.tables import episode_table
 from tests.support.reaching import reaching
 from tpgmm_torch.exceptions import DataError
 
@@ -57,10 +61,13 @@ def test_groups_are_all_tasks_and_two_halves_that_share_none():
 def test_the_summary_has_means_over_tasks_with_intervals_and_every_seed():
     results = [cell("push-v3", 3, 4), cell("reach-v3", 3, 2), cell("push-v3", 3, 2, seed=1)]
     rows = {row.split("|")[1].strip(): row for row in summary(results).splitlines()}
-    # push 6 of 8, reach 2 of 4: (75 + 50) / 2; the interval is that of 8 of 12
-    assert "| 62.5 (39 to 86) [75, 50] |" in rows["all (50)"]
-    assert "| 75.0 " in rows["hard (6)"]
+    # push 6 of 8, reach 2 of 4: (75 + 50) / 2; the interval is that of 7.5 of 12, rounded.
+    # Seed 1 was tried in one task only
+    assert "| 62.5 (39 to 86), in 2 of 50 |" in rows["all (50)"]
+    assert "| 75.0 (41 to 93) [100, 50], in 1 of 6 |" in rows["hard (6)"]
     assert "medium (11)" not in rows
+    whole = [cell(task, 3, i % 3 + 1, seed=s) for s in (0, 1) for i, task in enumerate(TASKS)]
+    assert "[50, 50] |" in summary(whole).splitlines()[2]
 
 
 def test_tables_put_tpgmm_first_and_leave_room_where_nothing_was_measured():
@@ -92,9 +99,46 @@ def test_a_report_is_written_of_all_cells_that_are_there(tmp_path):
     report(results, tmp_path)
     text = (tmp_path / "results.md").read_text(encoding="utf-8")
     assert "solved 22 of 24" in text and "| push-v3 | hard, tuned | 6/8 |" in text
+    assert {"success.pdf", "success.webp"} <= {file.name for file in tmp_path.iterdir()}
     table = pd.read_parquet(tmp_path / "episodes.parquet")
     assert table["demonstration_seed"].tolist() == [0] * 4 + [7] * 4
     assert table["success"].sum() == 6
+
+
+def episodes_of(cells):
+    rest = {"settings": {"demonstration_seed": 0}, "versions": {}}
+    return episode_table([one | rest for one in cells])
+
+
+def test_policies_are_compared_over_the_tasks_that_both_were_tried_in():
+    ours = {"push-v3": 4, "reach-v3": 2, "sweep-v3": 1, "soccer-v3": 3}
+    theirs = {"push-v3": 1, "reach-v3": 3, "sweep-v3": 1, "hammer-v3": 4}
+    table = comparison_table(
+        episodes_of(
+            [cell(task, 3, solved) for task, solved in ours.items()]
+            + [cell(task, 3, solved, policy="act") for task, solved in theirs.items()]
+        )
+    ).splitlines()
+    row = [entry.strip() for entry in table[2].split("|")[1:-1]]
+    # 4, 2 and 1 of 4 beside 1, 3 and 1
+    assert row[:4] == ["act, 3", "3", "58.3", "41.7"]
+    assert row[4].startswith("16.7 (") and row[5:7] == ["1", "1"]
+    assert row[8] == "reach-v3 -25"
+    assert comparison_table(episodes_of([cell("push-v3", 3, 1)])) == ""
+
+
+def test_a_picture_leaves_out_who_was_tried_in_fewer_tasks(monkeypatch):
+    drawn = []
+    monkeypatch.setattr(summaries, "success_panels", lambda episodes, _: drawn.append(episodes))
+    monkeypatch.setattr(summaries, "write", lambda figure, path: None)
+    pair = [task for task in TASKS if difficulty(task) == "hard"][:2]
+    cells = [cell(task, 3, 1, policy=policy) for task in pair for policy in ("tpgmm", "act")]
+    cells += [cell(pair[0], 3, 1, seed=1), cell(pair[0], 3, 1, policy="diffusion")]
+    draw_groups(episodes_of(cells), None)
+    [shown] = drawn
+    assert {"all", "hard"} <= set(shown.env) <= set(GROUPS)
+    assert set(shown[shown.env == "all"].policy) == {"tpgmm", "act"}
+    assert set(shown[shown.env == "all"].training_seed) == {0}
 
 
 def test_situations_of_demonstrations_tuning_and_evaluation_are_different():

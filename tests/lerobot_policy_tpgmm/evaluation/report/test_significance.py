@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
-from lerobot_policy_tpgmm.evaluation.report.significance import holm, mcnemar, paired, verdict
+from lerobot_policy_tpgmm.evaluation.report.significance import (
+    holm,
+    mcnemar,
+    over_tasks,
+    paired,
+    verdict,
+)
 from lerobot_policy_tpgmm.evaluation.report.tables import episode_table
 from tests.support.comparison import result
 from tpgmm_torch.exceptions import DataError
@@ -116,3 +122,25 @@ def test_without_others_there_is_nothing_to_compare():
 )
 def test_verdicts(counts, p, told):
     assert verdict(*counts, p) == told
+
+
+def test_tasks_count_alike_however_many_pairs_they_have():
+    ours, theirs = (20, 20, 15, 20, 10), (5, 10, 15, 5, 15)
+    results = []
+    for env, one, other in zip("abcde", ours, theirs, strict=True):
+        results += [result("tpgmm", 5, one, env=env), result("act", 5, other, env=env)]
+    results += [result(policy, 5, 20, seed=1, env="a") for policy in ("tpgmm", "act")]
+    [row] = over_tasks(episode_table(results)).itertuples()
+    # a: 40 of 40 beside 25
+    assert row.differences.to_dict() == {"a": 0.375, "b": 0.5, "c": 0, "d": 0.75, "e": -0.25}
+    assert row.difference == pytest.approx(row.success - row.other_success)
+    assert row.difference == pytest.approx(0.275)
+    assert -0.15 < row.low < 0 < row.difference < row.high < 0.65
+    # of 0.25, 0.375, 0.5 and 0.75 the first is negative: 2 of 16 signs are no less one-sided
+    assert row.p == pytest.approx(2 * 2 / 16)
+
+
+def test_policies_that_are_level_in_all_tasks_are_not_told_apart():
+    results = [result(policy, 5, 9, env=env) for env in "ab" for policy in ("tpgmm", "act")]
+    [row] = over_tasks(episode_table(results)).itertuples()
+    assert (row.difference, row.low, row.high, row.p) == (0, 0, 0, 1)
