@@ -188,13 +188,14 @@ def report(results: Results, out: Path) -> None:
     shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
     rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
     episodes = episode_table(rows)
+    successes_by_group = summary(found)
     text = "\n".join(
         [
             "# Meta-World: successes in per cent",
             "",
             f"The scripted experts solved {solved} of {asked} situations.",
             "",
-            summary(found),
+            successes_by_group,
             "![Success over demonstrations, a panel for each group of tasks](success.webp)",
             "",
             comparison_table(episodes),
@@ -206,7 +207,7 @@ def report(results: Results, out: Path) -> None:
     write_table(episodes, out / "episodes")
     with replacing(out / "results.md") as file:
         file.write_text(text, encoding="utf-8")
-    typer.echo(summary(found))
+    typer.echo(successes_by_group)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,15 @@ from lerobot_policy_tpgmm.evaluation.report.significance import REFERENCE, over_
 from lerobot_policy_tpgmm.evaluation.report.tables import wilson
 from tpgmm_torch.plotting import BLUE, GREEN, PURPLE, VERMILION
 
-__all__ = ["GROUPS", "comparison_table", "cost_table", "draw_groups", "summary", "task_table"]
+__all__ = [
+    "GROUPS",
+    "LOOKS",
+    "comparison_table",
+    "cost_table",
+    "draw_groups",
+    "summary",
+    "task_table",
+]
 
 #: Rows of the summary, and the tasks that they are about.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -156,10 +164,9 @@ def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
     path : Path
         Without suffix; ``.pdf`` and ``.webp`` are written.
     """
-    panels = []
+    panels, place = [], ["policy", "demonstrations", "training_seed"]
     for group, tasks in GROUPS.items():
         part = episodes[episodes.env.isin(tasks)]
-        place = ["policy", "demonstrations", "training_seed"]
         tried = part.groupby(place).env.transform("nunique")
         panels.append(part[tried == tried.max()].assign(env=group))
     write(success_panels(pd.concat(panels), LOOKS), path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
@@ -16,10 +15,10 @@ from matplotlib.ticker import PercentFormatter
 
 from lerobot_policy_tpgmm.evaluation.jobs import POLICIES
 from lerobot_policy_tpgmm.evaluation.report.panels import (
-    COLUMNS,
     add_legend,
     line_of,
     over_demonstrations,
+    panels_for,
     spread,
     success_panels,
     write,
@@ -133,12 +132,9 @@ def draw_errors(
     ``path`` has no suffix.
     """
     shown = [key for key in figures if key in episodes]
-    columns = min(COLUMNS, len(shown))
-    rows = math.ceil(len(shown) / columns)
-    figure = Figure(figsize=(1.9 * columns + 0.6, 2.1 * rows + 0.8), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, grid = panels_for(len(shown))
     looks = _looks(episodes)
-    for axes, key in zip(grid, shown, strict=False):
+    for axes, key in zip(grid, shown, strict=True):
         for index, (policy, look) in enumerate(looks.items()):
             groups = episodes[episodes.policy == policy].groupby("demonstrations")[key]
             low, middle, high = (
@@ -156,9 +152,7 @@ def draw_errors(
         positive = episodes[key][episodes[key] > 0]
         if len(positive) and positive.max() > 30 * positive.median():
             axes.set_yscale("log")
-    for axes in grid[len(shown) :]:
-        axes.remove()
-    add_legend(figure, grid[: len(shown)], looks)
+    add_legend(figure, grid, looks)
     write(figure, path)
 
 

@@ -18,10 +18,10 @@ from lerobot_policy_tpgmm.evaluation.report.tables import wilson
 from tpgmm_torch.plotting import STYLE, save
 
 __all__ = [
-    "COLUMNS",
     "add_legend",
     "line_of",
     "over_demonstrations",
+    "panels_for",
     "spread",
     "success_panels",
     "write",
@@ -45,6 +45,20 @@ def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, 
     }
 
 
+def panels_for(
+    count: int, *, narrowest: float = 0.0, sharey: bool = False
+) -> tuple[Figure, list[Axes]]:
+    """A figure of so many panels, row by row, of at least a width [inch]."""
+    columns = min(COLUMNS, count)
+    rows = math.ceil(count / columns)
+    size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey).ravel()
+    for axes in grid[count:]:
+        axes.remove()
+    return figure, list(grid[:count])
+
+
 @rc_context(STYLE)
 def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Success over the number of demonstrations: a panel for each environment.
@@ -65,12 +79,8 @@ def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]
     Figure
     """
     tasks = list(dict.fromkeys(episodes.env))
-    columns = min(COLUMNS, len(tasks))
-    rows = math.ceil(len(tasks) / columns)
-    size = (max(4.2, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for axes, task in zip(grid, tasks, strict=False):
+    figure, grid = panels_for(len(tasks), narrowest=4.2, sharey=True)
+    for axes, task in zip(grid, tasks, strict=True):
         part = episodes[episodes.env == task]
         for index, (policy, look) in enumerate(looks.items()):
             chosen = part[part.policy == policy]
@@ -81,11 +91,9 @@ def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]
         axes.set_title(task, fontsize="medium")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.set_ylim(-0.05, 1.05)
-    for axes in grid[len(tasks) :]:
-        axes.remove()
-    for axes in grid[::columns]:
+    for axes in grid[::COLUMNS]:
         axes.set_ylabel("success")
-    add_legend(figure, grid[: len(tasks)], looks)
+    add_legend(figure, grid, looks)
     return figure
 
 

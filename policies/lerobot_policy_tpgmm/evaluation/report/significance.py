@@ -181,7 +181,8 @@ def over_tasks(episodes: pd.DataFrame, reference: str = REFERENCE) -> pd.DataFra
             }
         )
     columns = ["policy", "demonstrations", "differences", "success", "other_success"]
-    return pd.DataFrame(rows, columns=[*columns, "difference", "low", "high", "p"])
+    columns += ["difference", "low", "high", "p"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def verdict(only_reference: int, only_other: int, p: float) -> str:

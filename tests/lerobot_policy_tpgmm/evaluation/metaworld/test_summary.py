@@ -15,6 +15,7 @@ from lerobot_policy_tpgmm.evaluation.metaworld import recordings
 from lerobot_policy_tpgmm.evaluation.metaworld import summary as summaries
 from lerobot_policy_tpgmm.evaluation.metaworld.__main__ import report
 from lerobot_policy_tpgmm.evaluation.metaworld.learners import (
+    LEARNERS,
     TaskParameterized,
     direct,
     paced,
@@ -31,6 +32,7 @@ from lerobot_policy_tpgmm.evaluation.metaworld.recordings import (
 )
 from lerobot_policy_tpgmm.evaluation.metaworld.summary import (
     GROUPS,
+    LOOKS,
     comparison_table,
     cost_table,
     draw_groups,
@@ -103,6 +105,10 @@ def test_a_report_is_written_of_all_cells_that_are_there(tmp_path):
     table = pd.read_parquet(tmp_path / "episodes.parquet")
     assert table["demonstration_seed"].tolist() == [0] * 4 + [7] * 4
     assert table["success"].sum() == 6
+
+
+def test_every_learner_has_a_line_in_the_picture():
+    assert set(LOOKS) == set(LEARNERS)
 
 
 def episodes_of(cells):
