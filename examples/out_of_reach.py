@@ -111,7 +111,7 @@ def distances(
     """Where robots are (n,), and the least from many starts (n,)."""
     regression, robot = model.regression(), BottleShaking().robot
     time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
-    activation = regression.tick(time, joints, frames).activation
+    activation = regression.estimate(time, joints, frames).activation
     index = (activation > NEGLIGIBLE).nonzero()[:, 0]
     weights = (activation[index] / activation[index].sum()).unsqueeze(-1)
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
         Stack,
         TaskParameters,
     )
-    from tpgmm_torch.regression.regression import Estimate
+    from tpgmm_torch.regression.estimate import Estimate
     from tpgmm_torch.regression.via_points import ViaPoint
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
@@ -133,7 +133,7 @@ _HOMES = {
         "TaskParameters",
     ),
     "robots.tracked_poses": ("Poses",),
-    "regression.regression": ("Estimate",),
+    "regression.estimate": ("Estimate",),
     "regression.via_points": ("ViaPoint",),
     "robots.robot": ("Robot",),
     "sensing.pose_filter": ("OneEuro",),

@@ -71,8 +71,9 @@ from tpgmm_torch.plausibility.situations import situations_report, tick_report
 from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.conditioning import Conditioning
+from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.prior import PRIOR_STD, given_widths, prior_widths
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -838,7 +839,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         limits = (like, kinematics.upper) if self.keep_limits else None
         if not candidates and not isinstance(state, RobotState):
             joints = state if isinstance(state, Tensor) else kinematics.joint_tensor(state)
-            return regression.tick(now, joints, known, limits)
+            return regression.estimate(now, joints, known, limits)
         if not isinstance(state, RobotState):
             state = kinematics.state(state)
         return regression.step(now, state, known, candidates, limits)
@@ -883,7 +884,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             here = Frame(like.new_zeros(*batch, 3))
             limits = (self.kinematics_.lower, self.kinematics_.upper)
             frames = dict.fromkeys(self.frame_names_, here)
-            self.regression().tick(like[0], start, frames, limits if self.keep_limits else None)
+            self.regression().estimate(
+                like[0], start, frames, limits if self.keep_limits else None
+            )
         except BaseException:
             self._backend = previous
             raise
@@ -1226,8 +1229,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._check_fitted()
         shown = None if self.shown_ is None else self.shown_.n_demonstrations
         n_samples = fused_samples(self.covariance_shrinkage, shown)
+        limited = self.keep_limits and self._limited
         key = (
             n_samples,
+            limited,
+            tuple(self.holds_),
             self.fusion,
             self.activation,
             self.epsilon,
@@ -1261,6 +1267,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                     self.operators_, self.kinematics_, self.parts_
                 ),
                 n_samples=n_samples,
+                begin=float(self.time_[0]),
+                end=float(self.time_[-1]),
+                holds=tuple(self.holds_),
+                motion_bounds=self.motion_bounds() if limited else None,
+                novelty=None if self.shown_ is None else self.shown_.novelty,
             )
             self._prepared = prepared = ((key, backend), self.means_, regression)
         return prepared[2]

@@ -30,7 +30,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("operators", "mixture", "impedance"),
         ("training", "persistence", "metrics", "motion", "sensing", "novelty"),
         ("regression", "plausibility"),
-        ("events",),
+        ("events", "skills"),
         ("structure",),
         ("control", "hub"),
         ("estimator",),

@@ -23,7 +23,8 @@ from tpgmm_torch import (
     Stack,
 )
 from tpgmm_torch.regression.conditionals import Conditionals
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import Regression
 
 Rows = Callable[[oracles.At], list[oracles.Row]]
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import Frame
-from tpgmm_torch.control.clocks import Clock, Observation, Progress
+from tpgmm_torch.control.clocks import Clock, Progress
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Observation
 
 #: What happens to robots at a time since the start, in place of what their servos do.
 Disturbance = Callable[[float, Tensor], Tensor]
@@ -48,7 +49,7 @@ class Run:
         return self.estimate.joints
 
     def _tick(self, last: Tensor) -> object:
-        return self.regression.tick(self.progress.time, last, self.frames)
+        return self.regression.estimate(self.progress.time, last, self.frames)
 
     def tick(self, disturbance: Disturbance | None = None, seen: bool = True) -> None:
         """The servos run, the clock looks, the next reference is found."""

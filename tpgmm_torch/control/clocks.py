@@ -23,14 +23,15 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.control.localization import MODE, SPREAD, Localizer, Look, local_mode, move
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.skills.skill import Observation
 
 __all__ = [
     "Clock",
     "EvenClock",
     "LocalizingClock",
-    "Observation",
     "Progress",
     "WaitingClock",
     "format_clock",
@@ -75,38 +76,6 @@ PAUSE = 0.1
 STANDS = 0.05
 #: The most that time hurries, in units of its speed.
 HURRY = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """What a clock may look at before the next tick.
-
-    Parameters
-    ----------
-    joints : Tensor of shape (..., n_joints), optional
-        Where the robots stand [rad or m]; None if that was not measured. NaN stands for a
-        coordinate without a sensor.
-    reference : Tensor of shape (..., n_joints)
-        What they were told at the last tick [rad or m].
-    velocity : Tensor of shape (..., n_joints), optional
-        Of the reference [rad/s or m/s].
-    frames : mapping of str to Frame
-        Present poses of the objects.
-    estimate : Estimate, optional
-        What the reference was made from.
-    attach : callable, optional
-        Adds what robots carry to their state: :meth:`Holding.state`.
-    pushed : Tensor of bool of shape (...), optional
-        Robots that somebody else has just moved, faster than their references.
-    """
-
-    joints: Tensor | None
-    reference: Tensor
-    velocity: Tensor | None
-    frames: Mapping[str, Frame]
-    estimate: Estimate | None = None
-    attach: Callable[[RobotState], RobotState] | None = None
-    pushed: Tensor | None = None
 
 
 class Progress(ABC):

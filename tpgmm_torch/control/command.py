@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance
-from tpgmm_torch.regression.regression import Estimate
+from tpgmm_torch.regression.estimate import Estimate
 
 __all__ = ["Command", "Status"]
 

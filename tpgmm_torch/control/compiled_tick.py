@@ -25,7 +25,8 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.operators.pose_terms import pose_terms
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
-from tpgmm_torch.regression.regression import Components, Estimate, Regression
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import Components, Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 
@@ -76,16 +77,16 @@ class CompiledRegression(Regression):
 
     backend: str = "inductor"
 
-    def tick(
+    def estimate(
         self,
         time: Tensor,
         joints: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
-        """One tick from the joints q_{t-1}; see :meth:`Regression.tick`."""
+        """One tick from the joints q_{t-1}; see :meth:`Regression.estimate`."""
         if isinstance(joints, RobotState):
-            return super().tick(time, joints, frames, bounds)
+            return super().estimate(time, joints, frames, bounds)
         names, like = self.served_frames, self.kinematics.lower
         poses = [frames[name] for name in names if name in frames]
         learning = torch.is_grad_enabled() and joints.requires_grad
@@ -95,7 +96,7 @@ class CompiledRegression(Regression):
         count = batch.numel()
         fits = joints.shape[-1:] == like.shape and len(poses) == len(names)
         if time.ndim or learning or large or not fits or count == 0:
-            return super().tick(time, joints, frames, bounds)
+            return super().estimate(time, joints, frames, bounds)
         rows = [joints, *(pose.position for pose in poses)]
         rows += [pose.orientation for pose in poses]
         # a graph does not ask what it is given
@@ -115,7 +116,7 @@ class CompiledRegression(Regression):
             for parts in list(zip(*results, strict=True))[:2]
         )
         if not math.isfinite(mean.sum().item()):  # the plain tick says what is wrong
-            return super().tick(time, joints, frames, bounds)
+            return super().estimate(time, joints, frames, bounds)
         estimate = Estimate(mean, covariance, results[0][2] @ components.places)
         return self.bounded(estimate, bounds)
 

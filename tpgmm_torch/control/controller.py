@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Observation, Progress
+from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Progress
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
@@ -29,12 +29,14 @@ from tpgmm_torch.motion.trajectory_generator import Seconds
 from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.regression.conditioning import Conditioning
+from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.skills.skill import Observation
 
 __all__ = ["Controller", "SkillController"]
 
@@ -498,7 +500,7 @@ class Controller:
             state = self.holding.state(self._regression.kinematics.state(at))
         frames, bounds = self.holding.frames, self._position_bounds
         try:
-            return self._regression.tick(time, state, frames, bounds)
+            return self._regression.estimate(time, state, frames, bounds)
         except TPGMMError:
             if self._trust is None or self.command is None:
                 raise  # nothing moves yet, or who predicts wants to know
@@ -513,7 +515,7 @@ class Controller:
             here = {n: f.expand(batch)[index] for n, f in frames.items()}
             now = time[index] if time.ndim else time
             try:
-                estimate = self._regression.tick(now, one, here, bounds)
+                estimate = self._regression.estimate(now, one, here, bounds)
             except TPGMMError:
                 continue
             joints[index], covariance[index] = estimate.joints, estimate.covariance

@@ -23,7 +23,8 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.operators import Operator, Stack
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 
 __all__ = ["Coordinates", "Instants", "Localizer", "Look", "local_mode", "move"]

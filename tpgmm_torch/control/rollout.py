@@ -15,7 +15,8 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.conditioning import Conditioning
-from tpgmm_torch.regression.regression import PART, Estimate, Regression
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import PART, Regression
 
 __all__ = ["rollout"]
 

@@ -2,7 +2,8 @@
 
 What is wanted now and how to get there are two questions. A tick asks them in this order::
 
-    estimate = regression.tick(time, follower.reference, frames, (bounds.lower, bounds.upper))
+    box = bounds.lower, bounds.upper
+    estimate = skill.estimate(time, follower.reference, frames, box)
     following = None if search.active is not None else follower.take(estimate.joints, dt)
     if following is None:  # a limit, a jump, or something out of reach
         asked = ~follower.fits(estimate.joints, dt)

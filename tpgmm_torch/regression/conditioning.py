@@ -45,8 +45,9 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import Residual
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -269,7 +270,7 @@ class _Look:
     def __call__(self, time: Tensor, joints: Tensor) -> Estimate:
         """At ``time``, linearised at ``joints``."""
         given = joints if self.attach is None else self.state(joints)
-        return self.regression.tick(time, given, self.frames)
+        return self.regression.estimate(time, given, self.frames)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,9 +41,10 @@ from tpgmm_torch.operators import (
 )
 from tpgmm_torch.operators.base import Reference
 from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.fusion import TASKS
 from tpgmm_torch.regression.joint_limits import step_within
-from tpgmm_torch.regression.kalman_update import TASKS
-from tpgmm_torch.regression.regression import Estimate, Regression
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["PostureSearch", "Residual"]

@@ -18,9 +18,12 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
+from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.operators import Canonical, Linearization, Operator
-from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.active_components import ActiveComponents
 from tpgmm_torch.regression.conditionals import (
@@ -28,13 +31,13 @@ from tpgmm_torch.regression.conditionals import (
     TimeMarginals,
     predictive_scale,
 )
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.joint_limits import within
-from tpgmm_torch.regression.kalman_update import KalmanUpdate
 from tpgmm_torch.regression.prior import PRIOR_STD
-from tpgmm_torch.regression.projections import Projection
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Components", "Estimate", "Regression"]
+__all__ = ["Components", "Regression"]
 
 #: Robots at a time on a processor: few enough that its cache holds what is between the
 #: operations, and that this memory is not given back and asked for again each time.
@@ -42,34 +45,6 @@ PART = 256
 
 #: The covariance of an operator, as a share of what it would be one priority below.
 STRICT = 1e-4
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """The joint references of one control tick.
-
-    Parameters
-    ----------
-    joints : Tensor of shape (..., n_joints)
-        Mean of the fused mixture, the reference q_hat_t.
-    covariance : Tensor of shape (..., n_joints, n_joints)
-        Of the fused mixture, within the components and between them.
-    activation : Tensor of shape (..., K)
-        Mixing weights h_i of the components.
-    candidates : tuple of Candidate
-        Each operator's own estimate; empty unless asked for.
-    """
-
-    joints: Tensor
-    covariance: Tensor
-    activation: Tensor
-    candidates: tuple[Candidate, ...] = ()
-
-    def __repr__(self) -> str:
-        return (
-            f"Estimate(joints of shape {tuple(self.joints.shape)}, "
-            f"{self.activation.shape[-1]} components, {len(self.candidates)} candidates)"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +82,7 @@ class Components:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """A fitted mixture, ready to be asked for joint references.
+    """A fitted mixture conditioned on time: a :class:`~tpgmm_torch.skills.skill.Skill`.
 
     Parameters
     ----------
@@ -136,6 +111,14 @@ class Regression:
     n_samples : float, optional
         Of each component, if joints shall give way by what few of them leave unknown, see
         :attr:`fused`.
+    begin, end : float
+        Start and end of the skill [s].
+    holds : tuple of Hold
+        Intervals in which a link holds an object.
+    motion_bounds : MotionBounds, optional
+        Of position, speed, acceleration and jerk.
+    novelty : Novelty, optional
+        Distance of a situation from the demonstrations.
     """
 
     kinematics: Kinematics
@@ -149,6 +132,11 @@ class Regression:
     negligible: float = 1e-9
     priorities: Sequence[int] | None = None
     n_samples: float | None = None
+    begin: float = -math.inf
+    end: float = math.inf
+    holds: tuple[Hold, ...] = ()
+    motion_bounds: MotionBounds | None = None
+    novelty: Novelty | None = None
 
     def step(
         self,
@@ -162,15 +150,15 @@ class Regression:
 
         ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
         """
-        estimate = self.bounded(self._estimate(time, state, frames), bounds)
+        estimate = self.bounded(self._unbounded(time, state, frames), bounds)
         if not candidates:
             return estimate
         return replace(estimate, candidates=self.candidates(time, state, frames, estimate))
 
-    def tick(
+    def estimate(
         self,
         time: Tensor,
-        joints: Tensor | RobotState,
+        state: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
@@ -179,15 +167,14 @@ class Regression:
         Many robots run part by part, of those that are at about the same time: few components
         count for them. Robots that carry something are given by their states.
         """
-        given = None
-        if isinstance(joints, RobotState):
-            given, joints = joints, joints.joints
-        poses = {name: frames[name] for name in self._frame_names if name in frames}
+        given = state if isinstance(state, RobotState) else None
+        joints = state.joints if isinstance(state, RobotState) else state
+        poses = {name: frames[name] for name in self.frame_names if name in frames}
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
-            state = self.kinematics.state(joints) if given is None else given
-            return self.bounded(self._estimate(time, state, frames), bounds)
+            whole = self.kinematics.state(joints) if given is None else given
+            return self.bounded(self._unbounded(time, whole, frames), bounds)
         if given is not None:
             given = given.flatten(batch)
         joints = joints.expand(*batch, -1).flatten(0, -2)
@@ -196,9 +183,9 @@ class Regression:
         order = time.argsort() if time.ndim else torch.arange(batch.numel())
         parts = []
         for part in order.split(PART):
-            state = self.kinematics.state(joints[part]) if given is None else given[part]
+            some = self.kinematics.state(joints[part]) if given is None else given[part]
             here = {name: pose[part] for name, pose in poses.items()}
-            parts.append(self._estimate(time[part] if time.ndim else time, state, here))
+            parts.append(self._unbounded(time[part] if time.ndim else time, some, here))
         back = order.argsort()
         mean = torch.cat([part.joints for part in parts])[back].unflatten(0, batch)
         covariance = torch.cat([part.covariance for part in parts])[back].unflatten(0, batch)
@@ -367,8 +354,14 @@ class Regression:
             return KalmanUpdate(self.kinematics, self.operators, self.fused)
 
     @cached_property
-    def _frame_names(self) -> tuple[str, ...]:
+    def frame_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.frame_names`."""
         return frame_names(self.operators, self.kinematics)
+
+    @cached_property
+    def carried_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.carried_names`."""
+        return carried_objects(self.operators, self.kinematics)
 
     @cached_property
     def _marginals(self) -> TimeMarginals:
@@ -444,7 +437,7 @@ class Regression:
             curvature = curvature + 1 / one.time_variance
         return self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
 
-    def _estimate(
+    def _unbounded(
         self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]
     ) -> Estimate:
         components = self._components_at(time)

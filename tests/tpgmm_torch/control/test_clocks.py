@@ -17,7 +17,6 @@ from tpgmm_torch.control.clocks import (
     Clock,
     EvenClock,
     LocalizingClock,
-    Observation,
     WaitingClock,
     format_clock,
     parse_clock,
@@ -25,6 +24,7 @@ from tpgmm_torch.control.clocks import (
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Observation
 
 START = wave(torch.zeros(1, dtype=torch.float64))[0]
 WAITING, LOCALIZING = WaitingClock(), LocalizingClock()
@@ -188,7 +188,7 @@ def test_a_coordinate_that_is_not_measured_says_nothing_others_do(regression):
 
 def test_what_the_model_leaves_open_is_no_error(regression):
     """Half a radian away: nothing where the fused Gaussian is that wide."""
-    estimate = regression.tick(torch.tensor(1.0, dtype=torch.float64), START, {})
+    estimate = regression.estimate(torch.tensor(1.0, dtype=torch.float64), START, {})
     wide = torch.eye(3, dtype=torch.float64) * 0.5**2
     for covariance, rate in ((estimate.covariance, 0.0), (wide, 1.0)):
         told = type(estimate)(estimate.joints, covariance, estimate.activation)
@@ -252,7 +252,7 @@ def shaking() -> Regression:
 
 def localizing(regression: Regression, *batch: int, **options) -> Run:
     clock = options.pop("clock", LOCALIZING)
-    start = regression.tick(torch.zeros((), dtype=torch.float64), torch.zeros(5), {}).joints
+    start = regression.estimate(torch.zeros((), dtype=torch.float64), torch.zeros(5), {}).joints
     options = {"joints": start.expand(*batch, 5), **options}
     return Run(regression, clock, 0.0, END, **options)
 
@@ -260,7 +260,9 @@ def localizing(regression: Regression, *batch: int, **options) -> Run:
 def posture(regression: Regression, time: float | Tensor) -> Tensor:
     """Where a robot is that follows."""
     time = torch.as_tensor(time, dtype=torch.float64)
-    return regression.tick(time, torch.zeros(*time.shape, 5, dtype=torch.float64), {}).joints
+    return regression.estimate(
+        time, torch.zeros(*time.shape, 5, dtype=torch.float64), {}
+    ).joints
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
@@ -472,7 +474,7 @@ def test_a_robot_that_carries_something_is_localised_with_it():
         reference = passed[-1] if estimate is None else estimate.joints
         holding = holding.advance(progress.time, reference)
         state = holding.state(upper_body().state(reference))
-        estimate = regression.tick(progress.time, state, holding.frames)
+        estimate = regression.estimate(progress.time, state, holding.frames)
         joints = estimate.joints + 0.5 * (joints - estimate.joints)
         if progress.time > 4.0 or 0 < pushed < 8:
             joints, pushed = (passed[75], pushed + 1) if pushed < 8 else (joints, pushed)

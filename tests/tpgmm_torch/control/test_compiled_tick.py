@@ -147,7 +147,7 @@ def test_the_graphs_of_the_default_backend():
     # nor about types
     single = {OBJECT: Frame(cup()[OBJECT].position.float())}
     now, near = torch.tensor(0.4), compiled.kinematics_.joint_tensor([0.2, 0.5])
-    actual = compiled.regression().tick(now, near.float(), single)
+    actual = compiled.regression().estimate(now, near.float(), single)
     assert_same(actual, plain.step(0.4, [0.2, 0.5], cup()), atol=1e-7)
     with pytest.raises(ShapeError, match=r"shape \(\.\.\., 2\)"):
         compiled.step(0.4, near[:1], cup())

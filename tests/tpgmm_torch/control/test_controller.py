@@ -234,10 +234,10 @@ def test_what_the_model_cannot_tell_stops_one_robot():
         controller.step(0.01)
 
     class Failing(type(regression)):
-        def tick(self, time, joints, frames, bounds=None):
+        def estimate(self, time, joints, frames, bounds=None):
             if joints.ndim == 2 or torch.equal(joints, controller.reference[1]):
                 raise DataError("singular")
-            return super().tick(time, joints, frames, bounds)
+            return super().estimate(time, joints, frames, bounds)
 
     controller._regression = Failing(
         **{f.name: getattr(regression, f.name) for f in fields(regression)}

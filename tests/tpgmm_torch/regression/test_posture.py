@@ -23,7 +23,7 @@ def searched(frame, start, ticks, time=TIME, asked=True, **options):
     regression, search, found = small_bottle().regression(), PostureSearch(), []
     asked = torch.full(start.shape[:-1], asked)
     for _ in range(ticks):
-        estimate = regression.tick(time, start, {"bottle": frame}, limits())
+        estimate = regression.estimate(time, start, {"bottle": frame}, limits())
         start, search = search.advance(
             regression, time, start, {"bottle": frame}, estimate, limits(), asked, **options
         )
@@ -35,7 +35,7 @@ def costs(frame, joints, time=TIME, component=None):
     """Of a component, the heaviest if none is named, for joints (N, n)."""
     regression = small_bottle().regression()
     if component is None:
-        component = regression.tick(time, joints[0], {"bottle": frame}).activation.argmax()
+        component = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
     index = torch.as_tensor(component).expand(1, len(joints))
     frames = {"bottle": frame.expand(joints.shape[:1])}
     return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
@@ -62,7 +62,7 @@ def test_the_gradient_is_that_of_the_cost(frame):
 
 def test_who_is_not_asked_keeps_the_estimate():
     regression = small_bottle().regression()
-    estimate = regression.tick(TIME, neutral(), {"bottle": HIGH}, limits())
+    estimate = regression.estimate(TIME, neutral(), {"bottle": HIGH}, limits())
     wanted, search = PostureSearch().advance(
         regression, TIME, neutral(), {"bottle": HIGH}, estimate, limits(), torch.tensor(False)
     )
@@ -72,15 +72,15 @@ def test_who_is_not_asked_keeps_the_estimate():
 def test_what_is_reached_is_left_to_the_regression():
     regression, joints = small_bottle().regression(), neutral()
     for _ in range(30):
-        joints = regression.tick(TIME, joints, {"bottle": REACHED}, limits()).joints
+        joints = regression.estimate(TIME, joints, {"bottle": REACHED}, limits()).joints
     near = joints + 0.001
     found, search = searched(REACHED, near, 1, asked=False)
-    assert torch.equal(found[0], regression.tick(TIME, near, {"bottle": REACHED}).joints)
+    assert torch.equal(found[0], regression.estimate(TIME, near, {"bottle": REACHED}).joints)
     assert search.active is None
     # a search that was begun ends there
     found, search = searched(REACHED, near, 3)
     assert float((found[-1] - joints).abs().max()) < 1e-3
-    estimate = regression.tick(TIME, near, {"bottle": REACHED}, limits())
+    estimate = regression.estimate(TIME, near, {"bottle": REACHED}, limits())
     begun = PostureSearch()
     for asked in (True, False):
         wanted, begun = begun.advance(
@@ -116,7 +116,7 @@ def test_between_two_components_what_cannot_be_reached_is_approached_too():
     times = torch.linspace(3, 5, 201, dtype=torch.float64)
     regression = small_bottle().regression()
     shares = torch.stack(
-        [regression.tick(t, neutral(), {"bottle": frame}).activation for t in times]
+        [regression.estimate(t, neutral(), {"bottle": frame}).activation for t in times]
     )
     time = times[shares.amax(-1).argmin()]
     weights = shares[shares.amax(-1).argmin()]
@@ -161,7 +161,7 @@ def test_a_search_that_ended_begins_anew_where_the_robot_is():
     one = search.ended(torch.tensor([True, False]))
     assert one.active is not None and one.active.tolist() == [False, True]
     regression = small_bottle().regression()
-    estimate = regression.tick(TIME, elsewhere, {"bottle": REACHED}, limits())
+    estimate = regression.estimate(TIME, elsewhere, {"bottle": REACHED}, limits())
     asked = torch.ones(2, dtype=torch.bool)
     steps = [
         before.advance(

@@ -12,7 +12,7 @@ from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import information
 from tpgmm_torch.regression import regression as module
-from tpgmm_torch.regression.projections import Projection
+from tpgmm_torch.regression.fusion import Projection
 
 NOW = torch.tensor(0.8, dtype=torch.float64)
 PROBLEM = Problem.of(CASES["three"], 1)

@@ -362,7 +362,7 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
     generator = torch.Generator().manual_seed(0)
     joints = few_bottles()[0].joints[:1].to(torch.float64)
     joints = joints + 0.3 * torch.randn(1, 17, generator=generator, dtype=torch.float64)
-    index = regression.tick(time, joints[0], {"bottle": frame}).activation.argmax()
+    index = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
     cost = _Cost(
         regression, index.expand(1, 1), time, joints, {"bottle": frame.expand((1,))},
         regression.kinematics.state,

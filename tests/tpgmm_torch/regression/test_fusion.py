@@ -10,7 +10,7 @@ from tests.support.mixtures import CASES, Problem, conditionals_of, random_local
 from tests.support.worlds import CARRIED, GRASP, OBJECT, RIGHT
 from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression.kalman_update import KalmanUpdate
+from tpgmm_torch.regression.fusion import KalmanUpdate
 from tpgmm_torch.regression.regression import PART
 
 
@@ -66,7 +66,7 @@ def test_thousands_of_robots_are_parts_of_a_few(alike):
     problem = Problem.of(CASES["the paper's"], 5, count)
     regression = problem.regression()
     now = times() if alike else times(count)
-    whole = regression.tick(now, problem.state.joints, problem.frames)
+    whole = regression.estimate(now, problem.state.joints, problem.frames)
     for index in (0, PART - 1, PART, count - 1):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
         one = regression.step(now if alike else now[index], problem.state[index], frames)
@@ -78,8 +78,8 @@ def test_frames_that_no_operator_asks_for_make_no_batch():
     problem = Problem.of(CASES["the paper's"], 5)
     regression, at = problem.regression(), (times(), problem.state.joints)
     other = Frame(torch.zeros(PART + 1, 3, dtype=torch.float64))
-    alone = regression.tick(*at, problem.frames)
-    assert_same(regression.tick(*at, {**problem.frames, "other": other}), alone)
+    alone = regression.estimate(*at, problem.frames)
+    assert_same(regression.estimate(*at, {**problem.frames, "other": other}), alone)
 
 
 def test_float32_is_float64_to_its_own_precision():
@@ -176,7 +176,7 @@ def test_robots_at_their_own_times_are_each_as_if_it_were_alone(negligible):
     wide = problem.regression(negligible=negligible)
     narrow = [replace(one, time_variance=one.time_variance / 40) for one in wide.conditionals]
     regression = replace(wide, conditionals=narrow)
-    together = regression.tick(times(count), problem.state.joints, problem.frames)
+    together = regression.estimate(times(count), problem.state.joints, problem.frames)
     left_out = 0
     for index in range(count):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
@@ -192,12 +192,12 @@ def test_a_grid_of_many_robots_may_have_times_along_one_side():
     problem = Problem.of(CASES["the paper's"], 4, rows, columns)
     regression = problem.regression()
     for now in (times(columns), times(rows)[:, None], times(rows, columns)):
-        whole = regression.tick(now, problem.state.joints, problem.frames)
+        whole = regression.estimate(now, problem.state.joints, problem.frames)
         assert whole.joints.shape == problem.state.joints.shape
         for place in ((0, 0), (2, 1), (1, columns - 1)):
             frames = {name: frame[place] for name, frame in problem.frames.items()}
             time = now.expand(rows, columns)[place]
-            one = regression.tick(time, problem.state.joints[place], frames)
+            one = regression.estimate(time, problem.state.joints[place], frames)
             torch.testing.assert_close(whole.joints[place], one.joints, rtol=0, atol=1e-8)
             torch.testing.assert_close(
                 whole.covariance[place], one.covariance, rtol=0, atol=1e-8

@@ -1,0 +1,198 @@
+"""The protocol of a skill: what controllers, clocks and rollouts run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.novelty import Novelty
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.posture import PostureSearch
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+
+__all__ = ["Observation", "Skill"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Measurements of a batch of robots at one tick.
+
+    Parameters
+    ----------
+    joints : Tensor of shape (..., n_joints), optional
+        Measured joints [rad or m]; None if nothing was measured. NaN stands for a coordinate
+        without a sensor.
+    reference : Tensor of shape (..., n_joints)
+        The last reference [rad or m].
+    velocity : Tensor of shape (..., n_joints), optional
+        Of the reference [rad/s or m/s].
+    frames : mapping of str to Frame
+        Present poses of the objects; of a held one, its pose when it was last free.
+    estimate : Estimate, optional
+        What the reference was made from.
+    attach : callable, optional
+        Adds the objects that robots hold to their state: :meth:`Holding.state`.
+    pushed : Tensor of bool of shape (...), optional
+        Robots that were displaced, faster than their references moved.
+    """
+
+    joints: Tensor | None
+    reference: Tensor
+    velocity: Tensor | None
+    frames: Mapping[str, Frame]
+    estimate: Estimate | None = None
+    attach: Callable[[RobotState], RobotState] | None = None
+    pushed: Tensor | None = None
+
+
+class Skill(Protocol):
+    """A motion that can be run: Gaussian estimates of the joints over time.
+
+    A fitted mixture conditioned on time (:class:`Regression`) is a skill. So are wrappers that
+    hold other skills and condition, chain or choose between their estimates. Skills are
+    immutable; whatever one remembers from tick to tick is in the skill that :meth:`advance`
+    returns. Those who subclass this protocol inherit what is not abstract.
+    """
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """The robot."""
+        ...
+
+    @property
+    def begin(self) -> float:
+        """Start of the skill [s]."""
+        ...
+
+    @property
+    def end(self) -> float:
+        """End of the skill [s]."""
+        ...
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Frames that :meth:`estimate` needs."""
+        ...
+
+    @property
+    def carried_names(self) -> tuple[str, ...]:
+        """Those frames that move with a link of the robot while it holds them."""
+        return ()
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """Intervals in which a link holds an object."""
+        return ()
+
+    @property
+    def motion_bounds(self) -> MotionBounds | None:
+        """Bounds of position, speed, acceleration and jerk; None if there are none."""
+        return None
+
+    @property
+    def novelty(self) -> Novelty | None:
+        """Distance of a situation from the demonstrations; None if that is not known."""
+        return None
+
+    def estimate(
+        self,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """Gaussian of the joints at a time, given the state q_{t-1} and the objects' poses.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+            In the skill, for all robots or of each one [s].
+        state : Tensor of shape (..., n_joints), or RobotState
+            Joints [rad or m], or the state with the objects that robots hold.
+        frames : mapping of str to Frame
+            Of shapes that broadcast with the batch.
+        bounds : tuple of two Tensor of shape (..., n_joints), optional
+            The lowest and the highest joints allowed [rad or m].
+
+        Raises
+        ------
+        DataError, ShapeError, UnknownNameError
+            If frames are missing or do not fit the robots, or there is no finite estimate.
+        """
+        ...
+
+    def log_likelihood(
+        self,
+        times: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        window: slice = slice(None),
+    ) -> Tensor:
+        """Log-density of observed robots at each time, up to a constant of each robot.
+
+        Parameters
+        ----------
+        times : Tensor of shape (G,)
+            An ascending grid from the beginning of the skill to its end [s].
+        state : RobotState
+            Of B robots, or of one without a batch.
+        frames : mapping of str to Frame
+            Of shapes () or (B,).
+        window : slice, optional
+            The part of the grid that is asked for.
+
+        Returns
+        -------
+        Tensor of shape (B, G)
+            Of the times in the window; zeros for robots with an observation that is not finite.
+        """
+        ...
+
+    def observed(self, names: frozenset[str]) -> Skill | None:
+        """The skill of those operators whose frames and links are observed.
+
+        Parameters
+        ----------
+        names : frozenset of str
+            The frames and links that are observed.
+
+        Returns
+        -------
+        Skill or None
+            None if no operator is left.
+        """
+        return self
+
+    def posture_search(self) -> PostureSearch | None:
+        """Search for the nearest posture where an estimate cannot be followed, or None."""
+        return None
+
+    def advance(
+        self, dt: float | Tensor, time: Tensor, observation: Observation
+    ) -> tuple[Skill, Tensor | None]:
+        """The skill to run from the next tick on; called at the end of each tick.
+
+        Parameters
+        ----------
+        dt : float or Tensor of shape (...)
+            Seconds since the last tick.
+        time : Tensor of shape () or (...)
+            Progress of this tick [s].
+        observation : Observation
+            Of this tick, with the estimate that this skill gave.
+
+        Returns
+        -------
+        skill : Skill
+            ``self``, or the same with what it remembers, or another one, into which the
+            controller fades within the bounds of motion.
+        time : Tensor of shape (), or None
+            Where in that one the robots are [s]; None if the time goes on.
+        """
+        return self, None
