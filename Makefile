@@ -8,13 +8,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --constraint constraints.txt
 
+PROJECTS := $(addsuffix pyproject.toml,./ policies/ environments/ evaluation/)
 PACKAGES_bench := .[bench]
 PACKAGES_cli := .[cli]
-PACKAGES_compare := .[cli] ./policies[evaluation]
-PACKAGES_evidence := .[cli] ./policies[evaluation,g1]
-PACKAGES_metaworld := . ./policies[metaworld]
+PACKAGES_compare := .[cli] ./policies ./environments ./evaluation[compare]
+PACKAGES_evidence := .[cli] ./policies ./environments[g1] ./evaluation[compare]
+PACKAGES_metaworld := . ./policies ./environments ./evaluation[metaworld]
 PACKAGES_mutation := .[mutation]
-PACKAGES_test := .[test] ./policies[test]
+PACKAGES_test := .[test] ./policies[test] ./environments[test] ./evaluation[test]
 
 COMPARE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/tpgmm compare
 # Processes of one thread each that `make evidence` runs at a time.
@@ -49,7 +50,7 @@ bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_A
 
 metaworld: ## Try all tasks of Meta-World; ARGS="--tasks reach-v3 --demonstrations 1,3"; out/metaworld
 	$(MAKE) $(METAWORLD)/.installed-metaworld VENV=$(METAWORLD)
-	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(METAWORLD)/bin/python -m lerobot_policy_tpgmm.evaluation.metaworld $(ARGS)
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(METAWORLD)/bin/python -m tpgmm_evaluation.metaworld $(ARGS)
 
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
@@ -61,9 +62,9 @@ oldest: ## Run the tests of the core with the oldest versions promised, in .venv
 	    --constraint constraints-oldest.txt '.[cli,view,hub,simulation]' \
 	    'pytest>=8.2' 'pytest-timeout>=2.3' 'hypothesis>=6.100' 'gmr>=2.0' 'packaging>=24.2' 'pytorch-kinematics>=0.10' \
 	    'example-robot-data>=4.1' pin==2.7.0
-	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_datasets \
+	OMP_NUM_THREADS=1 .venv-oldest/bin/python -m pytest tests/tpgmm_torch tests/tpgmm_datasets tests/tpgmm_tools \
 	    --continue-on-collection-errors -o filterwarnings=default \
-	    --ignore tests/tpgmm_torch/viewing/test_rerun_recording.py --ignore tests/tpgmm_datasets/app \
+	    --ignore tests/tpgmm_tools/viewing/test_rerun_recording.py --ignore tests/tpgmm_tools/app \
 	    --ignore tests/tpgmm_datasets/lerobot/test_calibration.py \
 	    --deselect tests/tpgmm_datasets/test_writer.py::test_lerobot_opens_what_is_written_and_the_other_way_round \
 	    --deselect 'tests/tpgmm_datasets/lerobot/test_episodes.py::test_rows_that_are_wrong_are_refused_and_located[nan-nulls-place3]' \
@@ -72,7 +73,7 @@ oldest: ## Run the tests of the core with the oldest versions promised, in .venv
 newest: ## Run the tests with the newest versions that are allowed, in .venv-newest
 	$(firstword $(wildcard $(BIN)/python) python3) -m venv .venv-newest
 	.venv-newest/bin/python -m pip install --disable-pip-version-check --upgrade \
-	    --upgrade-strategy eager '.[test]' './policies[test]'
+	    --upgrade-strategy eager $(foreach package,$(PACKAGES_test),'$(package)')
 	OMP_NUM_THREADS=1 .venv-newest/bin/python -m pytest -n 2 -o filterwarnings=default $(PYTEST_ARGS)
 
 fuzz: $(VENV)/.installed-test ## Damage thousands of files, kill hundreds of saves, lie to controllers: half an hour
@@ -95,9 +96,10 @@ docs: $(VENV)/.installed-test ## Build the documentation; open docs/_build/html/
 
 check: lint types test docs ## All four
 
-dist: $(VENV)/.installed-test ## Build both distributions, sdist and wheel, into dist
-	$(BIN)/python -m build --no-isolation --outdir dist .
-	$(BIN)/python -m build --no-isolation --outdir dist policies
+dist: $(VENV)/.installed-test ## Build all distributions, sdist and wheel, into dist
+	for project in . policies environments evaluation; do \
+	    $(BIN)/python -m build --no-isolation --outdir dist $$project || exit; \
+	done
 
 constraints: $(VENV)/.installed-test ## Write the versions in .venv into constraints.txt
 	{ grep '^#' constraints.txt; $(BIN)/python -m pip freeze --all --exclude-editable \
@@ -109,14 +111,14 @@ clean: ## Remove results and caches; the environment stays
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
 
 # A stamp is older than the files below when they ask for other packages than are installed.
-$(VENV)/.installed-%: pyproject.toml policies/pyproject.toml constraints.txt | $(BIN)/pip
+$(VENV)/.installed-%: $(PROJECTS) constraints.txt | $(BIN)/pip
 	$(INSTALL) $(foreach package,$(PACKAGES_$*),--editable '$(package)')
 	@touch $@
 
 $(METAWORLD)/constraints.txt: constraints.txt | $(METAWORLD)/bin/pip
 	grep -v -i -E '^(mujoco|dm-control|metaworld)==' constraints.txt > $@
 
-$(METAWORLD)/.installed-metaworld: pyproject.toml policies/pyproject.toml $(METAWORLD)/constraints.txt
+$(METAWORLD)/.installed-metaworld: $(PROJECTS) $(METAWORLD)/constraints.txt
 	$(METAWORLD)/bin/python -m pip install --disable-pip-version-check \
 	    --constraint $(METAWORLD)/constraints.txt $(foreach package,$(PACKAGES_metaworld),--editable '$(package)')
 	@touch $@

@@ -24,14 +24,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from lerobot_policy_tpgmm.environments.bottle.carrying import CarryAndPutEnv
-from lerobot_policy_tpgmm.environments.bottle.handling import BottleEnv
-from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
-from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark, CarryBenchmark
+from lerobot_env_bimanual.bottle.carrying import CarryAndPutEnv
+from lerobot_env_bimanual.bottle.handling import BottleEnv
+from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
+from tpgmm_evaluation.benchmarks import BottleBenchmark, CarryBenchmark
+from tpgmm_tools.plotting import BLUE, VERMILION
 from tpgmm_torch import Frame, Impedance, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.command import Command, Status
-from tpgmm_torch.plotting import BLUE, VERMILION
 
 #: File, task, condition of the environment, what happens.
 EPISODES = {

@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -22,7 +23,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 
 # %%
 # The robot

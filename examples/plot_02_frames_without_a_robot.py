@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, SKY, STYLE, VERMILION
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -21,7 +22,6 @@ from tpgmm_torch import (
     RelativePosition,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, SKY, STYLE, VERMILION
 
 # %%
 # Demonstrations

@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, SKY, STYLE, VERMILION
 from tpgmm_torch import (
     AbsoluteOrientation,
     Canonical,
@@ -23,7 +24,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.plotting import BLUE, SKY, STYLE, VERMILION
 
 # %%
 # A hand that turns, recorded by a tracker that flips signs

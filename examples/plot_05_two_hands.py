@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_tools.plotting import STYLE
 from tpgmm_torch import AbsolutePosition, Robot, Stack
-from tpgmm_torch.plotting import STYLE
 
 # %%
 # The Jacobian of both hands

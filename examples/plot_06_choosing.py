@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from sklearn.model_selection import GridSearchCV, KFold
 
+from tpgmm_tools.plotting import STYLE
 from tpgmm_torch import (
     AbsolutePosition,
     Demonstration,
@@ -24,7 +25,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.metrics import make_scorer, reproduction_scorer
-from tpgmm_torch.plotting import STYLE
 
 # %%
 # Demonstrations

@@ -24,10 +24,10 @@ import torch
 
 from tpgmm_datasets import describe_lerobot, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_tools.plotting import STYLE, VERMILION
 from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import joint_rmse
-from tpgmm_torch.plotting import STYLE, VERMILION
 
 torch.set_num_threads(1)  # the matrices are small
 

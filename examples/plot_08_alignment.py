@@ -12,9 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import STYLE
 from tpgmm_torch import Demonstration
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
-from tpgmm_torch.plotting import STYLE
 
 # %%
 # Demonstrations out of step

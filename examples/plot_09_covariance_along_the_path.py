@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -23,7 +24,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 # %%
 # Through a gate

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_tools.plotting import STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -25,7 +26,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import STYLE, VERMILION
 
 # %%
 # The operator

@@ -12,8 +12,8 @@ every frame, and says why it kept what it kept.
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_tools.plotting import STYLE, plot_relevance
 from tpgmm_torch import Demonstration, Frame, OperatorSelection, Poses, TaskParameterizedGMM
-from tpgmm_torch.plotting import STYLE, plot_relevance
 
 # %%
 # Demonstrations

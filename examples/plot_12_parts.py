@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.pipeline import make_pipeline
 
+from tpgmm_tools.plotting import STYLE, plot_parts
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -22,7 +23,6 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.plotting import STYLE, plot_parts
 
 # %%
 # Demonstrations

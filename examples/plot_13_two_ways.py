@@ -12,6 +12,7 @@ model of each, and goes the way that suits the situation.
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_tools.plotting import BLUE, ORANGE, SKY, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -22,7 +23,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, ORANGE, SKY, STYLE, VERMILION
 
 # %%
 # Demonstrations

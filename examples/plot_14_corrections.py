@@ -13,9 +13,9 @@ import copy
 import matplotlib.pyplot as plt
 import numpy as np
 
+from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoint
 from tpgmm_torch.corrections import in_skill_time
-from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 # %%
 # A skill of one joint

@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -23,7 +24,6 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 torch.set_num_threads(1)  # the matrices are small
 

@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import (
     AbsoluteOrientation,
     Demonstration,
@@ -22,7 +23,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.plotting import BLUE, STYLE, VERMILION
 
 # %%
 # A tool that turns

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -20,7 +21,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, ORANGE, STYLE, VERMILION
 
 # %%
 # A skill that was shown eight times

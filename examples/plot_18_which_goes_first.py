@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
     Canonical,
     Demonstration,
@@ -22,7 +23,6 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.plotting import BLUE, GREEN, ORANGE, STYLE, VERMILION
 
 # %%
 # Demonstrations

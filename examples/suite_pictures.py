@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
-from lerobot_policy_tpgmm.environments.suite.names import ROBOTS, SUITE, UPPER_BODY
-from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
+from lerobot_env_bimanual.suite.env import SuiteEnv
+from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.tasks import suite_task
 
 SEED, FPS = 1, 25
 #: Of the camera's picture, and the part of it that is shown: robot and things [pixels].

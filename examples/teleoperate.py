@@ -39,9 +39,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
-from lerobot_policy_tpgmm.evaluation.benchmarks import BottleBenchmark
+from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from tpgmm_datasets import save_lerobot
+from tpgmm_evaluation.benchmarks import BottleBenchmark
 from tpgmm_torch import Demonstration, Frame, Robot
 from tpgmm_torch.exceptions import DependencyError
 
@@ -184,7 +184,7 @@ class Gamepad:
                 from pygame._sdl2 import controller
         except ImportError:
             raise DependencyError(
-                "a gamepad needs pygame: pip install 'lerobot_policy_tpgmm[teleoperation]'"
+                "a gamepad needs pygame: pip install 'lerobot_env_bimanual[teleoperation]'"
             ) from None
         pygame.display.init()
         controller.init()

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_policy_tpgmm.environments.bottle.conditions import skill
-from lerobot_policy_tpgmm.environments.bottle.torque import BottleTorqueEnv
+from lerobot_env_bimanual.bottle.conditions import skill
+from lerobot_env_bimanual.bottle.torque import BottleTorqueEnv
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import Frame, Impedance, Situation, TaskParameterizedGMM, Trajectory
 from tpgmm_torch.alignment import DynamicTimeWarping

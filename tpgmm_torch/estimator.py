@@ -39,7 +39,6 @@ from tpgmm_torch.exceptions import (
     ShapeError,
     UnknownNameError,
 )
-from tpgmm_torch.hub import download, model_card, upload
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
@@ -51,7 +50,7 @@ from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
-from tpgmm_torch.persistence import CONFIG, MODEL, MODES, TENSORS, decode, encode
+from tpgmm_torch.persistence import MODEL, MODES, decode, encode
 from tpgmm_torch.plausibility.check import (
     episodes_report,
     learning_report,
@@ -1656,80 +1655,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 raise
             raise ModelFileError(f"{path} does not fit together: {error}") from error
         return model
-
-    def push_to_hub(
-        self,
-        repo_id: str,
-        *,
-        measured: Mapping[str, object] | None = None,
-        notes: str = "",
-        license: str | None = None,
-        private: bool | None = None,
-        token: str | None = None,
-    ) -> str:
-        """Upload the fitted model to the Hugging Face hub, with a card made from it.
-
-        What was shown (ranges of postures and frames) and the robot's URDF go along, the
-        demonstrations do not.
-
-        Parameters
-        ----------
-        repo_id : str
-            ``"owner/name"``; made if it does not exist.
-        measured, notes, license : mapping of str to object, str, str, optional
-            For the card, see :func:`tpgmm_torch.hub.model_card`.
-        private : bool, optional
-            Whether a repository that is made is private; by default as its owner has it.
-        token : str, optional
-            By default the one of ``hf auth login``.
-
-        Returns
-        -------
-        str
-            Address of the commit.
-
-        Raises
-        ------
-        NotFittedError, ModelFileError
-            As :meth:`save`.
-        DataError, DependencyError
-            If that is no repository's id, or huggingface_hub is not installed.
-        """
-        self._check_fitted()
-        card = model_card(self, repo_id, measured=measured, notes=notes, license=license)
-        return upload(repo_id, self.save, card, private=private, token=token)
-
-    @classmethod
-    def from_pretrained(
-        cls,
-        repo_id_or_folder: str | Path,
-        *,
-        revision: str | None = None,
-        token: str | None = None,
-        custom: Sequence[type] = (),
-        device: str | None = None,
-    ) -> Self:
-        """Load a model from the Hugging Face hub, or from a folder; nothing in it is executed.
-
-        Parameters
-        ----------
-        repo_id_or_folder : str or Path
-            ``"owner/name"``, or a folder, which is preferred if it is there.
-        revision : str, optional
-            Branch, tag or commit.
-        token : str, optional
-            By default the one of ``hf auth login``.
-        custom, device : sequence of type, str, optional
-            As for :meth:`load`.
-
-        Raises
-        ------
-        ModelFileError, DependencyError
-            As :meth:`load`; or huggingface_hub is not installed.
-        """
-        files = (CONFIG, TENSORS)
-        folder = download(repo_id_or_folder, files, revision=revision, token=token)
-        return cls.load(folder, custom, device)
 
     def motion_bounds(self, **given: Any) -> MotionBounds:
         """Bounds on speed, acceleration and jerk of the model's robot.

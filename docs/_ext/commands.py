@@ -9,7 +9,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 from typer.testing import CliRunner
 
-from tpgmm_torch.cli.application import app as tpgmm
+from tpgmm_tools.cli.application import app as tpgmm
 
 __all__ = ["HelpOf", "setup"]
 

@@ -16,24 +16,34 @@ from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+import lerobot_env_bimanual
 import lerobot_policy_tpgmm
 import tpgmm_datasets
+import tpgmm_evaluation
+import tpgmm_tools
 import tpgmm_torch
 
 __all__ = ["documented", "internal_names", "modules", "setup"]
 
-PACKAGES = (tpgmm_torch, tpgmm_datasets, lerobot_policy_tpgmm)
+PACKAGES = (
+    tpgmm_torch,
+    tpgmm_datasets,
+    tpgmm_tools,
+    lerobot_policy_tpgmm,
+    lerobot_env_bimanual,
+    tpgmm_evaluation,
+)
 PAGES = Path(__file__).parents[1] / "api"
 DIRECTIVE = re.compile(r"^\.\. auto(\w+):: ([\w.]+)\n((?:   .*\n)*)", re.MULTILINE)
 CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 #: The command line has a page of its own, of its help.
 NOT_CODE = (
-    "tpgmm_torch.cli",
-    "tpgmm_datasets.app.command",
+    "tpgmm_tools.cli",
+    "tpgmm_tools.app.command",
     "tpgmm_datasets.commands.dataset",
     "tpgmm_datasets.commands.demo",
-    "lerobot_policy_tpgmm.evaluation.command",
-    "lerobot_policy_tpgmm.evaluation.metaworld.__main__",
+    "tpgmm_evaluation.command",
+    "tpgmm_evaluation.metaworld.__main__",
 )
 
 

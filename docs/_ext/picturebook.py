@@ -14,7 +14,7 @@ from matplotlib import rc_context
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
-from tpgmm_torch.plotting import STYLE
+from tpgmm_tools.plotting import STYLE
 
 __all__ = ["draw_all", "setup"]
 

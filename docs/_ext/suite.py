@@ -12,8 +12,8 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from lerobot_policy_tpgmm.environments.suite.names import SUITE
-from lerobot_policy_tpgmm.environments.suite.tasks import suite_task
+from lerobot_env_bimanual.suite.names import SUITE
+from lerobot_env_bimanual.suite.tasks import suite_task
 
 __all__ = ["Suite", "section", "setup"]
 

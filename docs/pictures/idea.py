@@ -14,8 +14,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from tpgmm_tools.plotting import OPERATORS, plot_candidates, shade
 from tpgmm_torch import Demonstration, TaskParameterizedGMM, Trajectory
-from tpgmm_torch.plotting import OPERATORS, plot_candidates, shade
 
 __all__ = ["draw"]
 

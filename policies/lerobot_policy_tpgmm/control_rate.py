@@ -1,7 +1,7 @@
-"""How an environment tells a policy at which rate it takes actions.
+"""Check that an environment takes actions at the rate of the policy.
 
 LeRobot itself does not: a policy made for 100 Hz would run at half its speed in an environment
-of 50 Hz. Our environments add their rate to each observation, and our policy looks at it.
+of 50 Hz. The environments of ``lerobot_env_bimanual`` add their rate to each observation.
 """
 
 from __future__ import annotations
@@ -9,39 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline
-
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["CONTROL_RATE", "check_rate", "rate_processors"]
+__all__ = ["CONTROL_RATE", "check_rate"]
 
+#: Key of the rate in an observation [1/s].
 CONTROL_RATE = "observation.control_fps"
-
-
-class _TellRate(ObservationProcessorStep):  # type: ignore[misc]
-    def __init__(self, fps: float) -> None:
-        self.fps = fps
-
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        batch = next(iter(observation.values())).shape[0]
-        return {**observation, CONTROL_RATE: torch.full((batch, 1), float(self.fps))}
-
-    def transform_features(self, features: Any) -> Any:
-        return features
-
-
-def rate_processors(
-    fps: float,
-) -> tuple[PolicyProcessorPipeline[Any, Any], PolicyProcessorPipeline[Any, Any]]:
-    """What an environment's configuration returns from ``get_env_processors``.
-
-    Parameters
-    ----------
-    fps : float
-        Actions per second.
-    """
-    return PolicyProcessorPipeline(steps=[_TellRate(fps)]), PolicyProcessorPipeline(steps=[])
 
 
 def check_rate(batch: Mapping[str, Any], rate: float) -> None:

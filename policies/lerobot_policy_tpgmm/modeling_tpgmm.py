@@ -38,6 +38,7 @@ from lerobot_policy_tpgmm.observations import (
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
+from tpgmm_tools.hub import describe, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
 from tpgmm_torch.control.controller import SkillController
@@ -48,7 +49,6 @@ from tpgmm_torch.exceptions import (
     PlausibilityWarning,
     ShapeError,
 )
-from tpgmm_torch.hub import describe, model_card, upload
 from tpgmm_torch.operators.base import frame_names
 
 __all__ = ["TPGMMPolicy"]
@@ -58,7 +58,7 @@ log = logging.getLogger(__name__)
 #: What :meth:`TPGMMPolicy.push_to_hub` is told for the card, and how that says to run it.
 FOR_THE_CARD = ("measured", "notes", "license")
 USE = """```bash
-pip install 'lerobot_policy_tpgmm[evaluation]'
+pip install lerobot_policy_tpgmm 'lerobot[evaluation]'
 lerobot-rollout --policy.path={repo_id} --strategy.type=base
 ```"""
 #: When an observation was made [s], of environments and robots that tell.
@@ -532,7 +532,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ``"owner/name"``; made if it does not exist.
         **options
             ``measured``, ``notes``, ``license``, ``private`` and ``token``, as of
-            :meth:`tpgmm_torch.TaskParameterizedGMM.push_to_hub`.
+            :func:`tpgmm_tools.hub.push`.
 
         Returns
         -------

@@ -2,23 +2,15 @@
 
 import pytest
 import torch
-from lerobot.envs.factory import make_env_config
 
-from lerobot_policy_tpgmm.control_rate import CONTROL_RATE, check_rate, rate_processors
+from lerobot_env_bimanual.control_rate import rate_processors
+from lerobot_policy_tpgmm.control_rate import CONTROL_RATE, check_rate
 from tests.support.policies import act, batch, changed, fitted
 from tpgmm_torch.exceptions import DataError
 
 
 def telling(rate):
     return {CONTROL_RATE: torch.full((2, 1), float(rate))}
-
-
-def test_environments_tell_their_rate():
-    told, after = rate_processors(50)
-    assert told(batch())[CONTROL_RATE].tolist() == [[50.0], [50.0]]
-    assert not after.steps
-    before, _ = make_env_config("bottle_shaking", fps=25).get_env_processors()
-    assert before(batch())[CONTROL_RATE][0, 0] == 25
 
 
 @pytest.mark.parametrize("told", [100, 99.95, 100.05])

@@ -9,7 +9,7 @@ import torch
 from lerobot.envs.factory import make_env
 from lerobot.policies import PreTrainedPolicy
 
-from lerobot_policy_tpgmm.environments import CarryAndPutConfig
+from lerobot_env_bimanual import CarryAndPutConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.hub_server import local_hub
 from tests.support.policies import act, batch, fitted

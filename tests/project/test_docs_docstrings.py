@@ -38,7 +38,7 @@ SHOWN = {
     "tpgmm_torch.gaussians": "condition information moment_match product",
     "tpgmm_torch.metrics": "largest_acceleration largest_velocity sinusoid",
     "tpgmm_torch.operators.text": "format_operator parse_operator",
-    "tpgmm_torch.plotting": "figure",
+    "tpgmm_tools.plotting": "figure",
     "tpgmm_torch.quaternions": "exp product",
     "tpgmm_torch.data.situation_files": "read_situations",
     "tpgmm_torch.data.tables": "demonstrations_from_frame demonstrations_to_frame",

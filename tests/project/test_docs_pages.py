@@ -17,9 +17,9 @@ from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import TASK, BottleShaking
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_tools.cli.application import app
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.cli.application import app
 
 ROOT = Path(__file__).parents[2]
 PAGES = [

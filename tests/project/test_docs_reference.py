@@ -95,7 +95,7 @@ def test_names_that_pages_mention_exist():
         for page in DOCS.rglob("*.md")
         if "_build" not in page.parts
         for name in ROLE.findall(page.read_text(encoding="utf-8"))
-        if name.startswith(("tpgmm_", "lerobot_policy_tpgmm")) and not exists(name)
+        if name.startswith(("tpgmm_", "lerobot_policy_", "lerobot_env_")) and not exists(name)
     ]
     assert wrong == []
 
@@ -103,7 +103,7 @@ def test_names_that_pages_mention_exist():
 def test_every_command_has_its_help_on_the_page_of_the_command_line():
     import typer
 
-    from tpgmm_torch.cli import application
+    from tpgmm_tools.cli import application
 
     page = (DOCS / "api" / "command_line.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^```\{help-of\} (.+)$", page, re.MULTILINE))

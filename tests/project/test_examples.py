@@ -214,7 +214,7 @@ def test_no_picture_has_colours_of_matplotlib(folder):
         found = re.findall(
             r"""["'](?:tab:\w+|C\d|red|green|blue)["']""", path.read_text("utf-8")
         )
-        assert not found, f"{path.name}: {found}; take those of tpgmm_torch.plotting"
+        assert not found, f"{path.name}: {found}; take those of tpgmm_tools.plotting"
 
 
 @pytest.mark.parametrize("script", SCRIPTS)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_policy_tpgmm.environments.bottle.shaking import BottleShakingEnv
+from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from tests.support.command_line import UPPER_BODY, output
 from tests.support.worlds import upper_body
 from tpgmm_datasets import load_lerobot, save_lerobot

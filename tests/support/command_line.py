@@ -2,7 +2,7 @@
 
 from typer.testing import CliRunner
 
-from tpgmm_torch.cli.application import app
+from tpgmm_tools.cli.application import app
 
 #: The robot of the generated skill, and its hands.
 UPPER_BODY = ("--robot", "upper_body", "--link", "l_hand", "--link", "r_hand")

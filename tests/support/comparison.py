@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_policy_tpgmm.evaluation.cells import Cell
+from tpgmm_evaluation.cells import Cell
 
 LATENCIES = ("step_median_ms", "step_p99_ms", "chunk_median_ms", "chunk_p99_ms")
 

@@ -8,11 +8,11 @@ import torch
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.evaluation.policies.aligned import Aligned
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.bottle.carrying import CarryAndPut
 from tpgmm_datasets.bottle.skill import BottleShaking, BottleSkill
+from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_torch import Demonstration, Frame
 
 RATE = 25

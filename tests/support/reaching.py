@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_policy_tpgmm.environments.metaworld.demonstrations import Recorded
+from lerobot_env_bimanual.metaworld.demonstrations import Recorded
 
 
 def reaching(seed, n_steps=60):

@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import torch
 
-from lerobot_policy_tpgmm.environments.suite.env import SuiteEnv
-from lerobot_policy_tpgmm.environments.suite.names import ROBOTS
+from lerobot_env_bimanual.suite.env import SuiteEnv
+from lerobot_env_bimanual.suite.names import ROBOTS
 
 #: Robots that can be tried: by the version, not by what is installed, as gym-aloha cannot be
 #: installed on Python 3.13; on Python 3.12 a missing package fails.

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from tpgmm_tools.plotting import BLUE, figure, legend, plot_candidates, plot_local, save, shade
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, Trajectory
-from tpgmm_torch.plotting import BLUE, figure, legend, plot_candidates, plot_local, save, shade
 
 __all__ = ["draw_figures"]
 

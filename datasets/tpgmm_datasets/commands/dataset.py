@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tpgmm_datasets.commands.recordings import Recordings
-from tpgmm_torch.cli import options
+from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo
@@ -127,7 +127,7 @@ def plot(
     """Draw the joints and the positions of the frames over time, a line per episode."""
     import numpy as np
 
-    from tpgmm_torch.plotting import figure, save
+    from tpgmm_tools.plotting import figure, save
 
     recordings = Recordings(path, None, frame, event, episodes, units, joints, joint_name, rate)
     demonstrations = recordings.demonstrations()

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from tpgmm_torch.cli import plugins
+from tpgmm_tools.cli import plugins
 
 if TYPE_CHECKING:
     from tpgmm_datasets.episode_batches import EpisodeBatches

@@ -4,13 +4,13 @@ from typing import get_args
 
 import pytest
 
+from tpgmm_tools.cli.options import AlignmentMethod
 from tpgmm_torch.alignment import (
     DynamicTimeWarping,
     EventAlignment,
     LinearTimeNormalization,
 )
 from tpgmm_torch.alignment.text import METHODS, parse_alignment
-from tpgmm_torch.cli.options import AlignmentMethod
 from tpgmm_torch.exceptions import DataError
 
 

@@ -11,12 +11,12 @@ import torch
 
 from tests.support.mujoco_oracle import largest_difference
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_tools.viewing.visuals import link_shapes
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf, root_element
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import read_urdf
-from tpgmm_torch.viewing.visuals import link_shapes
 
 ARM = """<mujocoinclude>
   <body name="shoulder" pos="0.1 -0.2 0.3" euler="10 20 30" childclass="arm">

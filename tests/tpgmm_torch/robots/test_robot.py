@@ -30,6 +30,7 @@ from tests.support.robot_zoo import (
     zoo,
 )
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
+from tpgmm_tools.viewing.visuals import link_shapes
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
@@ -39,7 +40,6 @@ from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.robots.urdf import read_urdf
-from tpgmm_torch.viewing.visuals import link_shapes
 
 
 class TestOracles:

@@ -1,0 +1,305 @@
+"""Simulated tasks for robots with two arms, registered with gymnasium and LeRobot.
+
+LeRobot's commands import this module by themselves. The environments load late: importing this
+package needs neither MuJoCo nor gym-aloha.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_env_bimanual.aloha.robot import JOINTS, OBJECTS
+from lerobot_env_bimanual.control_rate import rate_processors
+from lerobot_env_bimanual.disturbances import NOMINAL
+from lerobot_env_bimanual.metaworld.tasks import check_task
+from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = [
+    "AlohaStateConfig",
+    "BimanualConfig",
+    "BottleShakingConfig",
+    "BottleTorqueConfig",
+    "CarryAndPutConfig",
+    "MetaworldStateConfig",
+]
+
+_PACKAGE = "lerobot_env_bimanual"
+
+gym.register(
+    id=f"{_PACKAGE}/BottleShaking-v0",
+    entry_point=f"{_PACKAGE}.bottle.shaking:BottleShakingEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/BottleTorque-v0",
+    entry_point=f"{_PACKAGE}.bottle.torque:BottleTorqueEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/CarryAndPut-v0",
+    entry_point=f"{_PACKAGE}.bottle.carrying:CarryAndPutEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/Bimanual-v0",
+    entry_point=f"{_PACKAGE}.suite.env:SuiteEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/AlohaState-v0",
+    entry_point=f"{_PACKAGE}.aloha.state:AlohaStateEnv",
+)
+gym.register(
+    id=f"{_PACKAGE}/MetaworldState-v0",
+    entry_point=f"{_PACKAGE}.metaworld.state:MetaworldStateEnv",
+)
+
+
+def _features(n_joints: int, n_objects: int = 1) -> dict[str, PolicyFeature]:
+    return {
+        ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(n_joints,)),
+        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(n_joints,)),
+        "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(7 * n_objects,)),
+    }
+
+
+@dataclass
+class _StateEnvConfig(EnvConfig):
+    """An environment with joints and objects as observation, which can be drawn."""
+
+    render_mode: str = "rgb_array"
+    render_width: int = 320
+    render_height: int = 240
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
+
+    @property
+    def package_name(self) -> str:
+        """Where gymnasium's name is registered."""
+        return _PACKAGE
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        general = {setting.name for setting in fields(EnvConfig)} - {"fps"}
+        options = {
+            setting.name: getattr(self, setting.name)
+            for setting in fields(self)
+            if setting.name not in general
+        }
+        return {name: value for name, value in options.items() if value is not None}
+
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """Tell the policy the rate of actions."""
+        return rate_processors(self.fps)
+
+
+class _TaskEnvConfig(_StateEnvConfig):
+    """One environment of gymnasium's that has several tasks."""
+
+    environment: ClassVar[str]
+
+    @property
+    def gym_id(self) -> str:
+        """The environment, whatever the task."""
+        return f"{_PACKAGE}/{self.environment}"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The environment's options, without those that are left to it."""
+        return {"task": self.task, **super().gym_kwargs}
+
+
+@EnvConfig.register_subclass("bottle_shaking")
+@dataclass
+class BottleShakingConfig(_StateEnvConfig):
+    """``--env.type=bottle_shaking``.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, mode, episode_length, pushes, noise, track, condition, frequency, amplitude
+        Options of
+        :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "BottleShaking-v0"
+    fps: int = 100
+    mode: str = "dynamic"
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    track: bool = False
+    condition: str = NOMINAL
+    frequency: float | None = None
+    amplitude: float | None = None
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))
+
+
+@EnvConfig.register_subclass("bottle_torque")
+@dataclass
+class BottleTorqueConfig(BottleShakingConfig):
+    """``--env.type=bottle_torque``: torque motors, gravity, and something in the way.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker, fps, mode, \
+    episode_length, pushes, noise, track, condition, frequency, amplitude, render_mode, \
+    render_width, render_height
+        As of :class:`BottleShakingConfig`.
+    control, obstacle
+        Options of
+        :class:`~lerobot_env_bimanual.bottle.torque.BottleTorqueEnv`; here, actions
+        are references by default, as those of most policies.
+    """
+
+    task: str | None = "BottleTorque-v0"
+    control: str = "reference"
+    obstacle: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.control == "impedance":
+            self.features[ACTION] = PolicyFeature(type=FeatureType.ACTION, shape=(51,))
+
+
+@EnvConfig.register_subclass("carry_and_put")
+@dataclass
+class CarryAndPutConfig(_StateEnvConfig):
+    """``--env.type=carry_and_put``.
+
+    Parameters
+    ----------
+    task, features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, mode, episode_length, pushes, noise, condition
+        Options of
+        :class:`~lerobot_env_bimanual.bottle.carrying.CarryAndPutEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    task: str | None = "CarryAndPut-v0"
+    fps: int = 100
+    mode: str = "dynamic"
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    condition: str = NOMINAL
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17, 2))
+
+
+@EnvConfig.register_subclass("bimanual")
+@dataclass
+class BimanualConfig(_TaskEnvConfig):
+    """``--env.type=bimanual``: the tasks of the suite.
+
+    Parameters
+    ----------
+    task : str, default="handover"
+        One of :data:`~lerobot_env_bimanual.suite.names.SUITE`.
+    robot : str, default="upper_body"
+        One of :data:`~lerobot_env_bimanual.suite.names.ROBOTS`.
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot; the features follow from task and robot.
+    fps, episode_length, pushes, noise, condition
+        Options of :class:`~lerobot_env_bimanual.suite.env.SuiteEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    environment: ClassVar[str] = "Bimanual-v0"
+
+    task: str | None = "handover"
+    robot: str = UPPER_BODY
+    fps: int = 100
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    condition: str = NOMINAL
+
+    def __post_init__(self) -> None:
+        if self.task is None or self.task not in SUITE:
+            raise UnknownNameError("task", str(self.task), "bimanual", SUITE)
+        if self.robot not in ROBOTS:
+            raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
+        if not self.features:
+            self.features = _features(ROBOTS[self.robot], len(SUITE[self.task]))
+
+
+@EnvConfig.register_subclass("aloha_state")
+@dataclass
+class AlohaStateConfig(_TaskEnvConfig):
+    """``--env.type=aloha_state``.
+
+    Parameters
+    ----------
+    task : {"transfer_cube", "insertion"}, default="transfer_cube"
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot; the features follow from the task.
+    fps, episode_length, yaw_range, track, stop_at_success
+        Options of
+        :class:`~lerobot_env_bimanual.aloha.state.AlohaStateEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    environment: ClassVar[str] = "AlohaState-v0"
+
+    task: str | None = "transfer_cube"
+    fps: int = 50
+    episode_length: int | None = None
+    yaw_range: float | None = None
+    track: bool = False
+    stop_at_success: bool = True
+
+    def __post_init__(self) -> None:
+        if self.task not in OBJECTS:
+            raise UnknownNameError("task", str(self.task), "aloha_state", OBJECTS)
+        if not self.features:
+            self.features = _features(len(JOINTS), len(OBJECTS[self.task]))
+
+
+@EnvConfig.register_subclass("metaworld_state")
+@dataclass
+class MetaworldStateConfig(_TaskEnvConfig):
+    """``--env.type=metaworld_state``: Meta-World's tasks, with states as observations.
+
+    Parameters
+    ----------
+    task : str, default="reach-v3"
+        One of :data:`~lerobot_env_bimanual.metaworld.tasks.TASKS`.
+    features, features_map, max_parallel_tasks, disable_env_checker
+        As in every configuration of LeRobot.
+    fps, episode_length, control, stop_at_success
+        Options of
+        :class:`~lerobot_env_bimanual.metaworld.state.MetaworldStateEnv`; its own
+        defaults where None.
+    render_mode, render_width, render_height
+        Of the videos.
+    """
+
+    environment: ClassVar[str] = "MetaworldState-v0"
+
+    task: str | None = "reach-v3"
+    fps: int = 80
+    episode_length: int | None = None
+    control: str = "reference"
+    stop_at_success: bool = True
+    features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(4, 3))
+
+    def __post_init__(self) -> None:
+        check_task(str(self.task))

@@ -1,0 +1,157 @@
+"""What the tasks with the bottle share: an upper body whose hands close around it."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.bottle.conditions import Conditions, skill
+from lerobot_env_bimanual.bottle.measures import Closing
+from lerobot_env_bimanual.bottle.scene import BottleScene, Snapshot
+from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.disturbances import Course, displaced
+from lerobot_env_bimanual.robot_scene import CAMERA
+from tpgmm_torch import Demonstration, Frame
+
+__all__ = ["BottleEnv"]
+
+#: The grip gives way at this force [N], without dynamics at this displacement [m].
+GRIP_FORCE, GRIP_SLIP = 100.0, 0.03
+
+
+class BottleEnv(ControlledEnv):
+    """A 17-joint upper body under position control, and a bottle that its hands can hold.
+
+    Parameters
+    ----------
+    scene, duration, course
+        As for :class:`~lerobot_env_bimanual.controlled.ControlledEnv`.
+    **options
+        Its options.
+    """
+
+    _scene: BottleScene
+    _start: Conditions
+
+    def __init__(
+        self, scene: BottleScene, duration: float, course: Course, **options: Any
+    ) -> None:
+        super().__init__(skill().robot, scene, CAMERA, duration, course, **options)
+
+    @abstractmethod
+    def _draw(self, options: Mapping[str, Any]) -> Conditions:
+        """Draw an episode, and set the scene."""
+
+    @abstractmethod
+    def _nominal(self) -> Demonstration:
+        """The generator's path for this start posture and the objects where they are.
+
+        Its event ``"grasp"`` says from when on the hands hold the bottle.
+        """
+
+    @abstractmethod
+    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+        """Whether the task is meant for a bottle there."""
+
+    def _begin(self, options: Mapping[str, Any]) -> Conditions:
+        start = self._draw(options)
+        self._closing = Closing()
+        self._nearest, self._contact = math.inf, (start.joints, start.bottle)
+        # when the hands closed, in steps that count; joints and height at each of these
+        self._grasp_step: int | None = None
+        self._counted = 0
+        self._motion = np.empty((self.episode_length, len(start.joints) + 1))
+        self._instants = np.empty(self.episode_length)
+        return start
+
+    def grasp(self) -> tuple[float, float]:
+        """How far the worse hand was from its grasp pose when the hands closed [mm, deg].
+
+        If they never did, when they were nearest to the bottle.
+        """
+        joints, bottle = (torch.from_numpy(part) for part in self._contact)
+        distance, angle = skill().grasp_error(joints, Frame(bottle[:3], bottle[3:]))
+        return 1e3 * float(distance), math.degrees(float(angle))
+
+    def _act(self, stopped: bool) -> None:
+        self._use_hands(stopped)
+        if not stopped:  # a robot that is stopped is not judged
+            self._motion[self._counted] = *self._joints, self._scene.bottle[2]
+            self._instants[self._counted] = self._free
+            self._counted += 1
+
+    def _use_hands(self, stopped: bool) -> None:
+        """Close the hands, or lose the bottle."""
+        scene = self._scene
+        if self._grasp_step is None:
+            if not stopped:
+                gap = scene.gap()
+                closes = self._closing.update(self._free, gap)
+                if closes or gap < self._nearest:
+                    self._nearest, self._contact = gap, (scene.joints, scene.bottle)
+                if closes:
+                    self._close(at_once=False)
+        elif scene.held:
+            kinematic = self.mode == "kinematic"
+            if scene.slip() > GRIP_SLIP if kinematic else scene.pull() > GRIP_FORCE:
+                scene.let_go()
+
+    def _close(self, at_once: bool) -> None:
+        """Take hold of the bottle, without what happens meanwhile if ``at_once``."""
+        self._grasp_step = self._counted
+        self._contact = self._scene.joints, self._scene.bottle
+        self._scene.hold()
+
+    def _since_grasp(self) -> NDArray[np.float64]:
+        """Joints [rad] and the bottle's height [m], (T, 18), at the rate of the control."""
+        first = self._counted if self._grasp_step is None else self._grasp_step
+        times, motion = (part[first : self._counted] for part in (self._instants, self._motion))
+        if len(times) < 2 or np.ptp(np.diff(times)) < 1e-6:
+            return motion
+        grid = np.arange(times[0], times[-1], 1 / self.fps)
+        return np.stack([np.interp(grid, times, column) for column in motion.T], axis=1)
+
+    def _usual(self, step: NDArray[np.float64]) -> bool:
+        return self._stands_usually(displaced(self._start.bottle, step))
+
+    def _displace(self, step: NDArray[np.float64]) -> None:
+        if self._grasp_step is None:
+            self._scene.put_bottle(displaced(self._start.bottle, step))
+
+    def _restore(self, before: Snapshot) -> None:
+        super()._restore(before)
+        if not before.held:
+            self._grasp_step, self._nearest, self._closing = None, math.inf, Closing()
+
+    def _put_on_path(self, instant: float) -> None:
+        """Continue the task at an instant of its nominal path, at rest."""
+        path = self._nominal()
+        held_for = instant - path.events["grasp"]
+        if held_for > 0 and self._grasp_step is None:
+            self._scene.place(_at(path, path.events["grasp"]), 0.0)
+            self._close(at_once=True)
+        self._scene.place(_at(path, instant), max(0.0, held_for))
+        self._hold_still()
+
+    def _standing(self) -> NDArray[np.float64]:
+        """The bottle's pose, or what it was when it was last free; shape (7,)."""
+        return self._scene.bottle if self._grasp_step is None else self._contact[1]
+
+    def _instant(self) -> float:
+        """Where on the nominal path the robot is, not further off than a path can be [s]."""
+        path = self._nominal()
+        distance = (path.joints - torch.from_numpy(self._scene.joints)).square().sum(-1)
+        distance[(path.time - self._free).abs() > 2.5] = math.inf
+        return float(path.time[distance.argmin()])
+
+
+def _at(path: Demonstration, instant: float) -> NDArray[np.float64]:
+    """The posture at an instant, between time steps."""
+    time, joints = path.time.numpy(), path.joints.numpy()
+    return np.array([np.interp(instant, time, column) for column in joints.T])

@@ -1,0 +1,194 @@
+"""The paper's skill as a gymnasium environment: take a bottle, lift it, shake it."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.bottle.conditions import Conditions, skill
+from lerobot_env_bimanual.bottle.handling import BottleEnv
+from lerobot_env_bimanual.bottle.measures import find_shaking, successful
+from lerobot_env_bimanual.bottle.scene import TABLE_LOW, BottleScene
+from lerobot_env_bimanual.disturbances import NOMINAL, Course, Disturbance
+from tpgmm_datasets.bottle.skill import FOOT, PHASES, SHOULDERS, TASK, BottleShaking
+from tpgmm_torch import Demonstration, Frame, Situation
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["AMPLITUDE", "FREQUENCY", "BottleShakingEnv"]
+
+#: Of the demonstrations with a steady rhythm [Hz, rad].
+FREQUENCY = BottleShaking.cycles / PHASES["shake"]
+AMPLITUDE = BottleShaking.amplitude
+#: How long an episode takes [s]; the slowest demonstration takes 15.3.
+DURATION = 16.0
+#: Shaking begins at 8 s; half a second later there are two whole periods left to judge.
+COURSE = Course(grasp=4.0, latest=8.5, end=12.0)
+
+#: Time steps per second of the path on which a robot is put [1/s].
+PATH_RATE = 25.0
+
+
+class BottleShakingEnv(BottleEnv):
+    """A 17-joint upper body that should take a bottle with both hands, lift and shake it.
+
+    ``observation.timestamp`` is the time since the beginning [s].
+
+    An action is a reference for each joint [rad]. References are limited to the joints' ranges
+    and speeds (``info["clipped_rad"]`` is by how much, at most), interpolated to 1 kHz, and
+    reach the joints' position control some milliseconds later.
+
+    The bottle stands on a lifting table, and moves if it is pushed. Both hands close when both
+    palms have arrived at it
+    (:class:`~lerobot_env_bimanual.bottle.measures.Closing` is the rule), once per
+    episode. The bottle is then attached to them just as it lies in them, and the table sinks.
+    Both hands lose it when one is pulled from it by more than 100 N, or without dynamics by
+    more than 30 mm.
+
+    An episode takes its full length, and is then judged. At its end ``info`` holds
+
+    - ``grasp_mm``, ``grasp_deg``: how far the worse hand was from its grasp pose when the hands
+      closed; if they never did, when they were nearest to the bottle;
+    - ``lift_mm``: height of the bottle above the table, the least from the shaking to the end;
+      0 if it is not held at the end;
+    - ``frequency_hz``, ``amplitude_rad``: of the shoulders' pitch after the grasp, in the two
+      periods that are most like a sinusoid; the amplitude that is farther off of both;
+    - ``frequency_error``, ``amplitude_error``: relative to what is asked for; 1 if there was no
+      grasp, or no time left for two periods;
+    - ``peak_speed``, ``peak_acceleration``: the largest of any joint from tick to tick, as
+      measured, while the robot was not stopped [rad/s, rad/s^2];
+
+    and ``is_success``: errors of at most 10 mm, 5 deg, 10 % and 20 %, and at least 50 mm.
+
+    The seed draws the bottle's pose and the start posture (like the generator of the
+    demonstrations), the bottle's mass (0.5 to 1.5 kg), the control's delay (1 to 8 ms) and what
+    the options below need; the same at every ``fps`` and in every mode.
+
+    Parameters
+    ----------
+    fps : int, default=100
+        Actions per second; a divisor of 1000, at least 10.
+    mode : {"dynamic", "kinematic"}, default="dynamic"
+        ``"kinematic"`` puts the joints where the references are: no masses, no delay.
+    episode_length : int, optional
+        In actions; as many as 16 s take by default.
+    pushes : bool, default=False
+        Whether a torque of 40 to 50 N m pushes a shoulder or an elbow for 0.1 to 0.3 s at a
+        random moment: enough to move a free hand by 1 to 3 cm.
+    noise : float, default=0
+        Of the sensors, in multiples of standard deviations of 2 mrad for joints, and of 1 mm
+        and 0.5 deg about each axis for the bottle (once per episode, unless it is tracked).
+    track : bool, default=False
+        Observe the bottle's present pose instead of its initial one.
+    condition : str or sequence of Disturbance, default="nominal"
+        What goes wrong, as
+        :func:`~lerobot_env_bimanual.disturbances.parse_condition` takes it:
+        ``"stopped-3"``, ``"moved+pose-noise"``. Its moments are drawn from the seed; an episode
+        becomes longer by the delay that it means.
+    frequency, amplitude : float
+        What the shaking should have [Hz, rad]; by default what demonstrations with a steady
+        rhythm have.
+    render_mode : {"rgb_array"}, optional
+    render_width, render_height : int
+        Of the picture.
+
+    Attributes
+    ----------
+    joint_names : tuple of str
+        The order of actions and of ``agent_pos``.
+
+    Raises
+    ------
+    DataError
+        If an option is not one of the above.
+    """
+
+    task = TASK
+    task_description = "take the bottle with both hands, lift it and shake it"
+
+    def __init__(
+        self,
+        *,
+        fps: int = 100,
+        mode: str = "dynamic",
+        episode_length: int | None = None,
+        pushes: bool = False,
+        noise: float = 0.0,
+        track: bool = False,
+        condition: str | Sequence[Disturbance] = NOMINAL,
+        frequency: float = FREQUENCY,
+        amplitude: float = AMPLITUDE,
+        render_mode: str | None = None,
+        render_width: int = 320,
+        render_height: int = 240,
+    ) -> None:
+        self.frequency, self.amplitude = frequency, amplitude
+        super().__init__(
+            BottleScene(),
+            DURATION,
+            COURSE,
+            fps=fps,
+            mode=mode,
+            episode_length=episode_length,
+            pushes=pushes,
+            noise=noise,
+            track=track,
+            condition=condition,
+            render_mode=render_mode,
+            render_width=render_width,
+            render_height=render_height,
+        )
+        self._pitches = [self.joint_names.index(name) for name in SHOULDERS]
+
+    def _check_options(self) -> None:
+        super()._check_options()
+        for name in ("frequency", "amplitude"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise DataError(f"{name} is finite and above 0, got {getattr(self, name)!r}")
+
+    def figures(self) -> dict[str, float]:
+        """How well the episode goes, so far; the class says what each figure is."""
+        distance, angle = self.grasp()
+        motion = self._since_grasp()
+        shaking = find_shaking(motion[:, self._pitches], self.fps, self.frequency)
+        worse = np.abs(shaking.amplitudes / self.amplitude - 1).argmax()
+        amplitude = float(shaking.amplitudes[worse])
+        lift = 0.0
+        if self._scene.held:
+            lift = float(motion[shaking.start :, -1].min()) - FOOT - TABLE_LOW
+        return {
+            "grasp_mm": distance,
+            "grasp_deg": angle,
+            "lift_mm": 1e3 * lift,
+            "frequency_hz": shaking.frequency,
+            "amplitude_rad": amplitude,
+            "frequency_error": abs(shaking.frequency / self.frequency - 1),
+            "amplitude_error": abs(amplitude / self.amplitude - 1),
+        }
+
+    def _successful(self, figures: Mapping[str, float]) -> bool:
+        return successful(figures)
+
+    def _draw(self, options: Mapping[str, Any]) -> Conditions:
+        start = Conditions.draw(self.np_random).with_start(options)
+        self._scene.reset(start.bottle, start.joints, start.mass)
+        return start
+
+    def _nominal(self) -> Demonstration:
+        return _path(tuple(self._start.joints), tuple(self._standing()))
+
+    def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
+        return skill().usual(Frame(bottle[:3], bottle[3:]))
+
+
+@functools.lru_cache(maxsize=128)  # the conditions of a comparison begin alike
+def _path(joints: tuple[float, ...], bottle: tuple[float, ...]) -> Demonstration:
+    frames = {"bottle": Frame(bottle[:3], bottle[3:])}
+    [path] = replace(skill(), rate=PATH_RATE).nominal([Situation(torch.tensor(joints), frames)])
+    return path

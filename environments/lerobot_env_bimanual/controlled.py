@@ -1,0 +1,378 @@
+"""A robot that follows joint references, tick by tick, and what can go wrong meanwhile."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from lerobot_env_bimanual.base import Observation, StateEnv
+from lerobot_env_bimanual.disturbances import (
+    Course,
+    Disturbance,
+    displaced,
+    generators,
+    parse_condition,
+)
+from lerobot_env_bimanual.start import Start
+from tpgmm_torch import Robot
+from tpgmm_torch.exceptions import DataError, ShapeError
+
+__all__ = ["ControlledEnv", "Scene"]
+
+#: Standard deviations of the sensors at ``noise=1``: joints [rad], the objects' positions [m]
+#: and orientations [rad].
+NOISE_JOINTS = 2e-3
+NOISE_POSE = np.array([1e-3] * 3 + [math.radians(0.5)] * 3)
+#: The range in which an object is observed: position [m] and quaternion.
+RANGE = np.array([5.0] * 3 + [1.0] * 4)
+
+
+class Scene(Protocol):
+    """The state of a simulated world with a robot under joint position control."""
+
+    model: Any
+    data: Any
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """Joint positions [rad]."""
+
+    @property
+    def objects(self) -> Sequence[NDArray[np.float64]]:
+        """The poses of what is observed, shape (7,) each."""
+
+    def follow(
+        self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
+    ) -> None:
+        """Simulate position control; one reference for now, and for each millisecond."""
+
+    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+        """Put the joints somewhere without dynamics, while time passes."""
+
+    def rest(self) -> None:
+        """Stand still, as it is."""
+
+    def snapshot(self) -> Any:
+        """The state without velocities."""
+
+    def restore(self, snapshot: Any) -> None:
+        """Bring everything to where it was."""
+
+
+class ControlledEnv(StateEnv):
+    """A robot under position control among objects.
+
+    Actions, what is observed and what can go wrong are the same in all tasks; a task adds how
+    an episode begins, what the hands do, what its path is and how it is judged.
+
+    Parameters
+    ----------
+    robot : Robot
+        Its joints are those of the scene, in that order.
+    scene : Scene
+    camera : str
+        Of the scene's model.
+    duration : float
+        Of an episode that nothing delays [s].
+    course : Course
+        When what happens in the task.
+    fps, mode, episode_length, pushes, noise, track, condition, render_mode, render_width, \
+    render_height
+        As for :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`.
+    """
+
+    _start: Start
+    _joints: NDArray[np.float64]
+    _velocity: NDArray[np.float64]
+    _reference: NDArray[np.float64]
+    _queue: NDArray[np.float64]  # references that have not reached the motors yet
+
+    def __init__(
+        self,
+        robot: Robot,
+        scene: Scene,
+        camera: str,
+        duration: float,
+        course: Course,
+        *,
+        fps: int,
+        mode: str,
+        episode_length: int | None,
+        pushes: bool,
+        noise: float,
+        track: bool,
+        condition: str | Sequence[Disturbance],
+        render_mode: str | None,
+        render_width: int,
+        render_height: int,
+    ) -> None:
+        self.disturbances = parse_condition(condition)
+        delay = sum(disturbance.delay for disturbance in self.disturbances)
+        steps = round((duration + delay) * fps) if episode_length is None else episode_length
+        super().__init__(fps, steps, camera, render_mode, (render_width, render_height))
+        self.mode, self.pushes, self.noise, self.track = mode, pushes, noise, track
+        self.condition, self._course, self._scene = condition, course, scene
+        self._check_options()
+        self.joint_names = robot.joint_names
+        self._lower, self._upper = robot.lower.numpy(), robot.upper.numpy()
+        self._stride = robot.velocity.numpy() / fps
+        self.action_space = spaces.Box(
+            self._lower.astype(np.float32), self._upper.astype(np.float32), dtype=np.float32
+        )
+        # pushes and noise can lead a little beyond the joints' ranges
+        joints = spaces.Box(self._lower - 0.5, self._upper + 0.5, dtype=np.float64)
+        reach = np.tile(RANGE, len(scene.objects))
+        self.observation_space = spaces.Dict(
+            agent_pos=joints,
+            environment_state=spaces.Box(-reach, reach, dtype=np.float64),
+            timestamp=spaces.Box(0.0, 3 * steps / fps, (1,), dtype=np.float64),
+        )
+        self._live = track or any(part.live for part in self.disturbances)
+        self._steps = steps  # no episode is going on
+
+    def _check_options(self) -> None:
+        if self.fps not in range(10, 1001) or 1000 % self.fps:
+            raise DataError(f"fps has to divide 1000 and be at least 10, got {self.fps!r}")
+        if self.mode not in ("dynamic", "kinematic"):
+            raise DataError(f"mode is 'dynamic' or 'kinematic', got {self.mode!r}")
+        if self.mode == "kinematic" and self.pushes:
+            raise DataError("pushes are torques: they need mode='dynamic'")
+        if self.episode_length < 1:
+            raise DataError(f"episode_length is at least 1, got {self.episode_length!r}")
+        if not 0 <= self.noise < math.inf:
+            raise DataError(f"noise is finite and not below 0, got {self.noise!r}")
+
+    @abstractmethod
+    def figures(self) -> dict[str, float]:
+        """How well the episode goes, so far; the class says what each figure is."""
+
+    @abstractmethod
+    def _successful(self, figures: Mapping[str, float]) -> bool:
+        """Whether the figures at the end are those of a success."""
+
+    @abstractmethod
+    def _begin(self, options: Mapping[str, Any]) -> Start:
+        """Draw an episode, and set the scene."""
+
+    @abstractmethod
+    def _act(self, stopped: bool) -> None:
+        """Whatever hands do by themselves, and the judge notes, after a tick."""
+
+    @abstractmethod
+    def _usual(self, step: NDArray[np.float64]) -> bool:
+        """Whether the task is meant for a first object that is displaced so at the start."""
+
+    @abstractmethod
+    def _displace(self, step: NDArray[np.float64]) -> None:
+        """Put the first object where it stood at the start, displaced, unless it is held."""
+
+    @abstractmethod
+    def _put_on_path(self, instant: float) -> None:
+        """Continue the task at an instant of its nominal path, at rest."""
+
+    @abstractmethod
+    def _instant(self) -> float:
+        """Where on the nominal path the robot is [s]."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode.
+
+        Parameters
+        ----------
+        options : dict, optional
+            Initial poses of objects, shape (7,), by their names; ``"joints"``: the start
+            posture, shape (n_joints,). Other keys are for others, and ignored.
+
+        Raises
+        ------
+        DataError
+            If an option has another shape, is not finite, or is out of the joints' ranges.
+        """
+        super().reset(seed=seed)
+        self._start = start = self._begin(options or {})
+        self._picture, self._steps = None, 0
+        self._time = self._free = 0.0  # [s], and without stops
+        self._peaks: NDArray[np.float64] = np.zeros(2)
+        self._rngs = generators(self.disturbances, self.np_random)
+        self._drawn = tuple(
+            part.drawn(rng, self._course, self._usual)
+            for part, rng in zip(self.disturbances, self._rngs, strict=True)
+        )
+        self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
+        self._past: list[tuple[float, Any]] = []
+        errors = start.misperception.reshape(-1, 6)
+        poses = zip(self._scene.objects, errors, strict=True)
+        self._seen = np.concatenate([self._perceived(*pair) for pair in poses])
+        self._shown = self._seen
+        for part in self._drawn:
+            if part.start():
+                self._put_on_path(part.start())
+        self._hold_still()
+        return self._observation(), {"is_success": False}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move for one period of the control.
+
+        Parameters
+        ----------
+        action : array-like of shape (n_joints,)
+            References of the joints in the order of ``joint_names`` [rad].
+
+        Returns
+        -------
+        observation : dict
+        reward : float
+            1 at the end of a successful episode, else 0.
+        terminated, truncated : bool
+            False, and whether the episode has its full length.
+        info : dict
+
+        Raises
+        ------
+        ShapeError
+            If the action has another shape.
+        DataError
+            If it is not finite, no episode is going on, or the simulation diverges.
+        """
+        wanted = self._checked(action)
+        stopped = any(part.stops(self._time) for part in self._drawn)
+        goal = self._reference if stopped else self._limited(wanted)
+        clipped = float(np.abs(wanted - goal).max())
+        seconds = self._move(goal)
+        # in whole milliseconds, so that no sum is rounded
+        began, self._time = self._time, round(self._time + seconds, 3)
+        self._free = round(self._free + (0.0 if stopped else seconds), 3)
+        self._record(seconds, stopped)
+        self._act(stopped)
+        self._steps += 1
+        self._interfere(began)
+        info: dict[str, Any] = {"is_success": False, "clipped_rad": clipped}
+        over = self._steps == self.episode_length
+        if over:
+            speed, acceleration = self._peaks.tolist()
+            info |= self.figures()
+            info |= {"peak_speed": speed, "peak_acceleration": acceleration}
+            info["is_success"] = self._successful(info)
+        return self._observation(), float(info["is_success"]), False, over, info
+
+    def _checked(self, action: ArrayLike) -> NDArray[np.float64]:
+        if self._steps >= self.episode_length:
+            raise DataError("no episode is going on: call reset first")
+        wanted = np.asarray(action, dtype=np.float64)
+        if wanted.shape != self._reference.shape:
+            raise ShapeError(
+                f"the action has shape {wanted.shape}; this robot has "
+                f"{len(self.joint_names)} joints: {list(self.joint_names)}"
+            )
+        finite = np.isfinite(wanted)
+        if not finite.all():
+            names = [self.joint_names[i] for i in np.flatnonzero(~finite)]
+            raise DataError(f"the action is not finite for {names} at step {self._steps}")
+        return wanted
+
+    def _limited(self, wanted: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A reference within the joints' ranges, and in reach at their speed."""
+        last = self._reference
+        allowed = np.minimum(np.maximum(wanted, self._lower), self._upper)
+        return last + np.minimum(np.maximum(allowed - last, -self._stride), self._stride)
+
+    def _move(self, goal: NDArray[np.float64]) -> float:
+        """Go towards a reference until the next tick; return how long that takes [s]."""
+        last, usual, share = self._reference, 1000 // self.fps, 1.0
+        for part, rng in zip(self._drawn, self._rngs, strict=True):
+            share *= part.period(rng)
+        n = max(1, round(usual * share))
+        way = last + (goal - last) * np.minimum(np.arange(1, n + 1) / usual, 1.0)[:, None]
+        self._reference = way[-1]
+        if self.mode == "kinematic":
+            self._scene.place(self._reference, n / 1000)
+            return n / 1000
+        self._queue = np.concatenate((self._queue, way))
+        torques = self._start.torques(round(1000 * self._time), n) if self.pushes else None
+        self._scene.follow(self._queue[: n + 1], torques)
+        self._queue = self._queue[n:]
+        return n / 1000
+
+    def _record(self, seconds: float, stopped: bool) -> None:
+        """How hard the robot moves; while it is stopped it is not judged."""
+        joints = self._scene.joints
+        velocity = (joints - self._joints) / seconds
+        if not stopped:
+            change = (velocity - self._velocity) / seconds
+            peaks = np.abs(velocity).max(), np.abs(change).max()
+            self._peaks = np.maximum(self._peaks, peaks)  # [rad/s, rad/s^2]
+        self._joints, self._velocity = joints, velocity
+
+    def _interfere(self, began: float) -> None:
+        """Let others move the first object, and shove the robot."""
+        for part in self._drawn:
+            step = part.displacement(self._time)
+            if step is not None:
+                self._displace(step)
+            seconds = part.shove(began, self._time)
+            if seconds < 0:
+                self._put_back(self._time + seconds)
+            elif seconds > 0:
+                self._put_on_path(self._instant() + seconds)
+        if self._returns:
+            self._past.append((self._time, self._remembered()))
+
+    def _remembered(self) -> Any:
+        """What :meth:`_restore` needs to know of the present."""
+        return self._scene.snapshot()
+
+    def _put_back(self, time: float) -> None:
+        """Restore what the world was, at rest."""
+        _, before = min(self._past, key=lambda entry: abs(entry[0] - time))
+        self._restore(before)
+        self._hold_still()
+
+    def _restore(self, before: Any) -> None:
+        """Let the world be what it was."""
+        self._scene.restore(before)
+
+    def _hold_still(self) -> None:
+        """Be at rest, with references where the joints are."""
+        self._scene.rest()
+        joints = self._scene.joints
+        self._joints = joints
+        self._velocity = np.zeros_like(joints)
+        self._reference = joints
+        self._queue = np.tile(joints, (self._start.delay + 1, 1))
+
+    def _observation(self) -> Observation:
+        joints, draw = self._scene.joints, self.np_random.standard_normal
+        if self.noise:
+            joints += self.noise * NOISE_JOINTS * draw(len(joints))
+        if self._live:
+            errors = [draw(6) if self.noise else np.zeros(6) for _ in self._scene.objects]
+            poses = zip(self._scene.objects, errors, strict=True)
+            self._seen = np.concatenate([self._perceived(*pair) for pair in poses])
+        shown = self._seen
+        for part, rng in zip(self._drawn, self._rngs, strict=True):
+            shown = part.seen(shown, self._shown, self._time, rng)
+        self._shown = shown
+        return {
+            "agent_pos": joints,
+            "environment_state": shown.copy(),
+            "timestamp": np.array([self._time]),
+        }
+
+    def _perceived(
+        self, pose: NDArray[np.float64], errors: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """A pose with errors given in standard deviations."""
+        if not self.noise:
+            return pose
+        return np.clip(displaced(pose, self.noise * NOISE_POSE * errors), -RANGE, RANGE)
+
+    def _simulation(self) -> tuple[Any, Any]:
+        return self._scene.model, self._scene.data

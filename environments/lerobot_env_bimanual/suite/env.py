@@ -1,0 +1,213 @@
+"""The tasks of the suite as gymnasium environments."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.base import finite_vector
+from lerobot_env_bimanual.bottle.measures import Closing, successful
+from lerobot_env_bimanual.controlled import ControlledEnv
+from lerobot_env_bimanual.disturbances import (
+    CONDITIONS,
+    NOMINAL,
+    Course,
+    Displaced,
+    Disturbance,
+    StartedMidway,
+    displaced,
+    parse_condition,
+)
+from lerobot_env_bimanual.robot_scene import CAMERA
+from lerobot_env_bimanual.start import Start, check_start
+from lerobot_env_bimanual.suite.names import UPPER_BODY
+from lerobot_env_bimanual.suite.scene import SuiteScene, table_spec
+from lerobot_env_bimanual.suite.tasks import suite_task
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["SUITE_CONDITIONS", "SuiteEnv"]
+
+#: A grip gives way at this force [N].
+GRIP_FORCE = 100.0
+#: A palm that is so near to what it shall hold, and comes no nearer, takes hold of it [m].
+REACH = 0.015
+
+
+def _skips(part: Disturbance) -> bool:
+    """Whether a part of the task would not be done."""
+    return isinstance(part, StartedMidway) or (isinstance(part, Displaced) and part.seconds > 0)
+
+
+#: What a comparison runs through.
+SUITE_CONDITIONS = tuple(
+    name for name in CONDITIONS if not any(map(_skips, parse_condition(name)))
+)
+
+
+@dataclass(frozen=True)
+class SuiteStart(Start):
+    """What an episode of the suite draws from its seed.
+
+    Parameters
+    ----------
+    joints, delay, pushed, push_start, push_length, push_torque, misperception
+        As of :class:`Start`.
+    poses : mapping of str to ndarray of shape (7,)
+        The objects' positions [m] and orientations, unit quaternions.
+    """
+
+    poses: Mapping[str, NDArray[np.float64]]
+
+
+class SuiteEnv(ControlledEnv):
+    """A robot at a table, and a task for both hands.
+
+    Control and actions are those of
+    :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`.
+    ``observation.environment_state`` has the present poses of the objects of the task, held or
+    not. A hand takes hold of what it may hold when its palm is within 15 mm of it and comes no
+    nearer for 0.2 s, as it then lies in it; whoever arrives early or late is waited for. The
+    task says when hands open; a grip gives way at 100 N. At the end of an episode ``info``
+    holds the figures of the task, ``peak_speed``, ``peak_acceleration`` and ``is_success``.
+
+    Parameters
+    ----------
+    task : str
+        ``handover``, ``lid``, ``peg_in_hole``, ``pour`` or ``wipe``.
+    robot : str, default="upper_body"
+        The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
+        waist and arms of a Unitree G1, 17 joints.
+    fps, episode_length, pushes, noise, condition, render_mode, render_width, render_height
+        As for :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`; an
+        episode takes as long as the slowest demonstration and a second by default. Nobody puts
+        the robot ahead in its task.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If an option is not one of the above.
+    DependencyError
+        Without gym-aloha, where its arms are asked for, or example-robot-data for ``g1``.
+    """
+
+    _scene: SuiteScene
+    _start: SuiteStart
+
+    def __init__(
+        self,
+        task: str,
+        robot: str = UPPER_BODY,
+        *,
+        fps: int = 100,
+        episode_length: int | None = None,
+        pushes: bool = False,
+        noise: float = 0.0,
+        condition: str | Sequence[Disturbance] = NOMINAL,
+        render_mode: str | None = None,
+        render_width: int = 320,
+        render_height: int = 240,
+    ) -> None:
+        self._task = suite_task(task, robot)
+        if any(map(_skips, parse_condition(condition))):
+            raise DataError(
+                f"condition {condition!r} skips a part of the task, which {task} does not "
+                "offer: what its hands and its judge would have done meanwhile is not known"
+            )
+        spec = table_spec(self._task.embodiment.spec())
+        self._task.furnish(spec)
+        ends = self._task.ends()
+        whole = list(ends.values())
+        super().__init__(
+            self._task.robot,
+            SuiteScene(spec, self._task.objects, self._task.holds),
+            CAMERA,
+            self._task.duration,
+            Course(grasp=ends[self._task.grasp], latest=whole[-2], end=whole[-2]),
+            fps=fps,
+            mode="dynamic",
+            episode_length=episode_length,
+            pushes=pushes,
+            noise=noise,
+            track=True,
+            condition=condition,
+            render_mode=render_mode,
+            render_width=render_width,
+            render_height=render_height,
+        )
+        self.robot, self.task, self.task_description = robot, task, self._task.description
+
+    def figures(self) -> dict[str, float]:
+        """How well the episode goes, so far; the task says what each figure is."""
+        return self._judge.figures(self._scene)
+
+    def _successful(self, figures: Mapping[str, float]) -> bool:
+        return successful(figures, self._task.limits)
+
+    def _begin(self, options: Mapping[str, Any]) -> SuiteStart:
+        task, rng = self._task, self.np_random
+        drawn = task.draw(rng)
+        joints = task.start_posture(rng)
+        for name in options.keys() & {*drawn, "joints"}:
+            given = finite_vector(name, options[name], len(joints) if name == "joints" else 7)
+            check_start(name, given, task.robot)
+            if name == "joints":
+                joints = given
+            else:
+                drawn[name] = given
+        start = SuiteStart(
+            joints=joints, poses=drawn, **Start.drawn(rng, task.robot, len(task.objects))
+        )
+        self._scene.reset(drawn, joints, float(drawn[task.objects[0]][2]) - task.foot)
+        self._judge, self._noted = task.judge(), 0.0
+        self._watch_hands()
+        return start
+
+    def _watch_hands(self) -> None:
+        self._closing = {hold: Closing(reach=REACH) for hold in self._task.holds}
+
+    def _act(self, stopped: bool) -> None:
+        scene = self._scene
+        if not stopped:
+            for hold, closing in self._closing.items():
+                if hold not in scene.taken and closing.update(self._free, scene.gap(hold)):
+                    scene.hold(hold)
+            self._judge.note(scene, self._free - self._noted)
+            self._noted = self._free
+            for hold in self._judge.lets_go(scene):
+                scene.let_go(hold)
+        for hold in tuple(scene.held):
+            if scene.pull(hold) > GRIP_FORCE:
+                scene.let_go(hold)
+
+    def _usual(self, step: NDArray[np.float64]) -> bool:
+        return self._task.usual(displaced(self._first, step))
+
+    def _displace(self, step: NDArray[np.float64]) -> None:
+        name = self._task.objects[0]
+        if not any(hold.thing == name for hold in self._scene.taken):
+            self._scene.put(name, displaced(self._first, step))
+
+    @property
+    def _first(self) -> NDArray[np.float64]:
+        """Where the first object was at first."""
+        return self._start.poses[self._task.objects[0]]
+
+    def _remembered(self) -> Any:
+        return self._scene.snapshot(), copy.deepcopy(self._judge)
+
+    def _restore(self, before: Any) -> None:
+        snapshot, judge = before
+        self._scene.restore(snapshot)
+        self._judge = copy.deepcopy(judge)
+        self._watch_hands()  # their patience begins anew
+
+    def _put_on_path(self, instant: float) -> None:
+        raise NotImplementedError("no disturbance of these tasks puts the robot ahead")
+
+    def _instant(self) -> float:
+        raise NotImplementedError("no disturbance of these tasks puts the robot ahead")

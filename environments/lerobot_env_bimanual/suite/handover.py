@@ -1,0 +1,223 @@
+"""Handover: the left hand brings a baton, the right hand takes it and puts it on a stand.
+
+Where the hands meet is free. What matters there is where one hand is seen from what the other
+holds; afterwards the thing moves with another hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+
+from lerobot_env_bimanual.bottle.measures import Closing
+from lerobot_env_bimanual.suite.names import SUITE
+from lerobot_env_bimanual.suite.scene import TABLE, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.task import (
+    Judge,
+    Leg,
+    Pose,
+    Style,
+    SuiteTask,
+    raised,
+    stands_in,
+    upright_pose,
+)
+from tpgmm_datasets.bottle.skill import attached
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+
+__all__ = ["Handover"]
+
+RADIUS, FOOT = 0.02, 0.08
+LEFT = Hold("l_hand", "baton", "baton")
+RIGHT = Hold("r_hand", "baton", "baton")
+#: Where batons and stands are: the box of the baton's centre, and the same on the other side.
+LOWEST, HIGHEST, YAW = (0.24, 0.06, 0.10), (0.32, 0.13, 0.15), 20.0
+#: Where the palms touch the baton, and where they wait, in its frame [m].
+GRIP = {"l_hand": (0.0, RADIUS + 0.01, -0.035), "r_hand": (0.0, -RADIUS - 0.01, 0.035)}
+WAIT = {"l_hand": (-0.05, 0.1, -0.035), "r_hand": (-0.05, -0.1, 0.035)}
+#: Where it changes hands [m], and by how much that differs.
+MEETING, MEETING_SPREAD = (0.27, 0.0, 0.17), (0.02, 0.03, 0.015)
+#: How high it is lifted before it is carried and lowered, and how near to its place the hand
+#: opens [m].
+LIFT, PUT = 0.05, 0.01
+LIFTED = 0.02
+
+
+class Handover(SuiteTask):
+    """Pass a baton from one hand to the other, and put it on a stand."""
+
+    name = "handover"
+    description = "take the baton with the left hand, pass it to the right, put it on the stand"
+    objects = SUITE["handover"]
+    foot = FOOT
+    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {
+            "reach": 2.0,
+            "close": 1.0,
+            "hold": 0.6,
+            "raise": 0.8,
+            "bring": 2.0,
+            "meet": 1.2,
+            "pass": 0.8,
+            "leave": 1.0,
+            "carry": 2.0,
+            "lower": 1.2,
+            "open": 0.8,
+            "away": 1.0,
+            "rest": 0.4,
+        }
+    )
+    grasp = "close"
+    holds = (LEFT, RIGHT)
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
+        {
+            "place_mm": (0.0, 8.0),
+            "lean_deg": (0.0, 5.0),
+            "passed": (1.0, 1.0),
+            "put": (1.0, 1.0),
+        }
+    )
+    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
+        {
+            "place_mm": ("on the stand [mm]", 1),
+            "lean_deg": ("lean [deg]", 1),
+            "passed": ("passed", 0),
+            "put": ("put down", 0),
+        }
+    )
+
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """A baton, and a flat stand that nothing collides with."""
+        baton = add_thing(spec, "baton")
+        baton.add_geom(
+            name="baton",
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=(RADIUS, FOOT, 0),
+            mass=0.3,
+            contype=0,
+            conaffinity=TABLE,
+            rgba=(0.85, 0.3, 0.3, 1),
+        )
+        stand = add_thing(spec, "stand", free=False)
+        stand.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+            size=(0.05, 0.001, 0),
+            contype=0,
+            conaffinity=0,
+            rgba=(0.2, 0.6, 0.3, 1),
+        )
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
+        """The baton on the left, the stand on the right of the table."""
+        baton = upright_pose(rng, LOWEST, HIGHEST, YAW)
+        (x, y, _), (far, wide, _) = LOWEST, HIGHEST
+        height = baton[2] - FOOT
+        stand = upright_pose(rng, (x, -wide, height), (far, -y, height), YAW)
+        return {"baton": baton, "stand": stand}
+
+    def usual(self, pose: Pose) -> bool:
+        """Whether it stands in its box."""
+        return stands_in(pose, LOWEST, HIGHEST, YAW)
+
+    def legs(
+        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
+    ) -> Mapping[str, Sequence[Leg]]:
+        """Left to the baton, to the meeting, and back; right to the meeting and the stand."""
+        baton, stand = poses["baton"], poses["stand"]
+        aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
+        spread = style.free * torch.tensor(MEETING_SPREAD, dtype=torch.float64)
+        meeting = Frame(torch.tensor(MEETING, dtype=torch.float64) + spread)
+        place = Frame(
+            stand.transform(torch.tensor((0.0, 0.0, FOOT), dtype=torch.float64)),
+            stand.orientation,
+        )
+
+        def at(pose: Frame, hand: str, points: Mapping[str, tuple[float, ...]]) -> Frame:
+            return attached(pose, points[hand])
+
+        def near(pose: Frame, hand: str) -> Frame:
+            waiting = at(pose, hand, WAIT)
+            return Frame(waiting.position + aside[hand], waiting.orientation)
+
+        left = [
+            Leg("reach", near(baton, "l_hand"), free=True),
+            Leg("close", at(baton, "l_hand", GRIP)),
+            Leg("raise", at(raised(baton, LIFT), "l_hand", GRIP)),
+            Leg("bring", at(meeting, "l_hand", GRIP), free=True),
+            Leg("leave", near(meeting, "l_hand")),
+            Leg("carry", starts["l_hand"], free=True),
+        ]
+        right = [
+            Leg("bring", near(meeting, "r_hand"), free=True),
+            Leg("meet", at(meeting, "r_hand", GRIP)),
+            Leg("carry", at(raised(place, LIFT), "r_hand", GRIP), free=True),
+            Leg("lower", at(place, "r_hand", GRIP)),
+            Leg("away", near(place, "r_hand")),
+        ]
+        return {"l_hand": left, "r_hand": right}
+
+    def judge(self) -> Judge:
+        """Opens the left hand when the right one holds, and that when the baton is down."""
+        return _Judge()
+
+    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
+        """The left hand seen from where the baton was, the hands from each other, the joints.
+
+        With what is held, the baton from the stand; otherwise the right hand.
+        """
+        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+
+        def seen(what: str, frame: str) -> Stack:
+            return Stack(*(kind(what, frame) for kind in kinds))
+
+        last = seen("baton" if held else "r_hand", "stand")
+        return [seen("l_hand", "baton"), seen("r_hand", "l_hand"), last, Canonical()]
+
+
+class _Judge(Judge):
+    def __init__(self) -> None:
+        self.time = 0.0
+        self.lifted = self.put = False
+        self.opening = Closing(reach=PUT)
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        self.time += seconds
+        self.lifted |= RIGHT in scene.held and self._height(scene) > LIFTED
+
+    def lets_go(self, scene: SuiteScene) -> Sequence[Hold]:
+        if LEFT in scene.held and RIGHT in scene.held:
+            return (LEFT,)
+        if self.lifted and RIGHT in scene.held:
+            height = max(self._height(scene), 0.0)
+            if self.opening.update(self.time, height):
+                self.put = True
+                return (RIGHT,)
+        return ()
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        baton, stand = scene.pose("baton"), scene.pose("stand")
+        away = baton[:3] - stand[:3] - (0.0, 0.0, FOOT)
+        lean = 2 * math.asin(min(1.0, math.hypot(*baton[4:6])))
+        return {
+            "place_mm": 1e3 * float(np.linalg.norm(away)),
+            "lean_deg": math.degrees(lean),
+            "passed": float(LEFT in scene.taken and RIGHT in scene.taken),
+            "put": float(self.put),
+        }
+
+    def _height(self, scene: SuiteScene) -> float:
+        """Of the baton's foot above the table [m]."""
+        return float(scene.pose("baton")[2] - FOOT - scene.table)

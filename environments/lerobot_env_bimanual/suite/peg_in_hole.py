@@ -1,0 +1,299 @@
+"""Peg in hole: the right hand takes a peg, the left one a block, and they fit in the air.
+
+Where the hands meet is free, and so is how the round peg is turned about its axis. What matters
+is where the peg is seen from the hole, which the other hand carries: to a millimetre, and along
+a line. Key poses say where the peg is in the end, not that its way in is straight. Beside the
+hole it jams: both arms give way, as stiff as their position control, and the force is judged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_env_bimanual.suite.names import SUITE
+from lerobot_env_bimanual.suite.scene import (
+    OBJECT,
+    TABLE,
+    Hold,
+    SuiteScene,
+    add_thing,
+)
+from lerobot_env_bimanual.suite.task import (
+    Judge,
+    Leg,
+    Pose,
+    Style,
+    SuiteTask,
+    raised,
+    stands_in,
+    upright_pose,
+)
+from tpgmm_datasets.bottle.skill import attached
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+    quaternions,
+)
+
+__all__ = ["PegInHole"]
+
+#: The peg's radius, half its length, and its head's radius and half length [m].
+RADIUS, LENGTH, HEAD = 0.012, 0.045, (0.022, 0.015)
+#: The block, half as wide, and half as high [m].
+WIDTH, HEIGHT = 0.04, 0.03
+#: Between peg and hole all round, how much wider the hole's mouth is, and the hole's depth [m].
+CLEARANCE, CHAMFER, DEPTH = 0.001, 0.002, 0.05
+#: Wood on wood, smoothed; and how stiff a contact is: its time constant [s], its damping.
+FRICTION, STIFF = 0.3, (0.004, 1.0)
+PEG = Hold("r_hand", "peg", "peg")
+BLOCK = Hold("l_hand", "block", "block")
+#: Where pegs are: the box of the peg's centre; blocks are on the other side of the table.
+LOWEST, HIGHEST, YAW = (0.24, -0.13, 0.075), (0.32, -0.07, 0.1), 20.0
+#: Where the palms touch peg and block, and where they wait, in their frames [m].
+GRIP = {"r_hand": (0.0, -HEAD[0] - 0.01, 0.03), "l_hand": (0.0, WIDTH + 0.01, 0.015)}
+WAIT = {"r_hand": (-0.05, -0.09, 0.03), "l_hand": (-0.05, 0.11, 0.015)}
+#: How far both are lifted off the table [m].
+LIFT = 0.03
+#: Where the block is brought [m], and by how much that differs.
+MEETING, MEETING_SPREAD = (0.26, -0.01, 0.1), (0.02, 0.02, 0.008)
+#: Where the peg waits, from the hole's mouth; how far above it the way in begins; how deep it
+#: leads [m].
+BESIDE, ABOVE, IN = (0.0, -0.07, 0.0), 0.012, 0.04
+#: What counts as inserted [m].
+DEEP = 0.03
+
+
+class PegInHole(SuiteTask):
+    """Take a peg and a block with a hole, and put one into the other in the air."""
+
+    name = "peg_in_hole"
+    description = "take the peg and the block with a hole, and insert the peg in the air"
+    objects = SUITE["peg_in_hole"]
+    foot = LENGTH
+    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {
+            "reach": 2.0,
+            "close": 1.0,
+            "hold": 0.6,
+            "lift": 0.8,
+            "bring": 2.0,
+            "align": 1.2,
+            "insert": 2.0,
+            "keep": 1.2,
+        }
+    )
+    grasp = "close"
+    holds = (PEG, BLOCK)
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
+        {
+            "depth_mm": (1e3 * DEEP, math.inf),
+            "inserted_s": (0.5, math.inf),
+            "force_n": (0.0, 30.0),
+            "held": (1.0, 1.0),
+        }
+    )
+    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
+        {
+            "depth_mm": ("depth [mm]", 1),
+            "inserted_s": ("inserted for [s]", 1),
+            "force_n": ("pressed by [N]", 1),
+            "held": ("both held", 0),
+        }
+    )
+
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """A round peg with a head, and a block of boxes around a square hole with a chamfer."""
+        peg = add_thing(spec, "peg")
+        radius, tall = HEAD
+        for name, size, height in (
+            ("peg", (radius, tall, 0), LENGTH - tall),
+            ("pin", (RADIUS, LENGTH - tall, 0), -tall),
+        ):
+            _add_solid(
+                peg,
+                mujoco.mjtGeom.mjGEOM_CYLINDER,
+                size,
+                name=name,
+                pos=(0.0, 0.0, height),
+                mass=0.05,
+                rgba=(0.85, 0.3, 0.3, 1),
+            )
+        block = add_thing(spec, "block")
+        # the hand closes on the whole, and it has the mass of it
+        block.add_geom(
+            name="block",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=(WIDTH, WIDTH, HEIGHT),
+            mass=0.25,
+            contype=0,
+            conaffinity=0,
+            group=3,
+        )
+        for position, half, orientation in _block():
+            _add_solid(
+                block,
+                mujoco.mjtGeom.mjGEOM_BOX,
+                half,
+                pos=position,
+                quat=orientation,
+                mass=0,
+                rgba=(0.3, 0.45, 0.7, 1),
+            )
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
+        """The peg on the right, the block on the left of the table."""
+        peg = upright_pose(rng, LOWEST, HIGHEST, YAW)
+        (x, y, _), (far, wide, _) = LOWEST, HIGHEST
+        height = peg[2] - LENGTH + HEIGHT
+        block = upright_pose(rng, (x, -wide, height), (far, -y, height), YAW)
+        return {"peg": peg, "block": block}
+
+    def usual(self, pose: Pose) -> bool:
+        """Whether it stands in its box."""
+        return stands_in(pose, LOWEST, HIGHEST, YAW)
+
+    def legs(
+        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
+    ) -> Mapping[str, Sequence[Leg]]:
+        """Left to the block and the meeting; right to the peg, beside, above, and in."""
+        peg, block = poses["peg"], poses["block"]
+        aside = {"l_hand": style.aim[:, 0], "r_hand": style.aim[:, 1]}
+        spread = style.free * torch.tensor(MEETING_SPREAD, dtype=torch.float64)
+        # nobody turns them on the way
+        meeting = Frame(torch.tensor(MEETING, dtype=torch.float64) + spread, block.orientation)
+
+        def over(height: float | Tensor) -> Frame:
+            """The peg so high above where the hole begins."""
+            up = torch.tensor((0.0, 0.0, HEIGHT + LENGTH + height), dtype=torch.float64)
+            return Frame(meeting.position + up, _straighter(peg))
+
+        def waiting(pose: Frame, hand: str) -> Frame:
+            near = attached(pose, WAIT[hand])
+            return Frame(near.position + aside[hand], near.orientation)
+
+        begun = over(ABOVE)
+        offset = torch.tensor(BESIDE, dtype=torch.float64) + aside["r_hand"] * torch.tensor(
+            (1, 1, 0)
+        )
+        beside = Frame(begun.position + offset, begun.orientation)
+        left = [
+            Leg("reach", waiting(block, "l_hand"), free=True),
+            Leg("close", attached(block, GRIP["l_hand"])),
+            Leg("lift", attached(raised(block, LIFT), GRIP["l_hand"])),
+            Leg("bring", attached(meeting, GRIP["l_hand"]), free=True),
+        ]
+        right = [
+            Leg("reach", waiting(peg, "r_hand"), free=True),
+            Leg("close", attached(peg, GRIP["r_hand"])),
+            Leg("lift", attached(raised(peg, LIFT), GRIP["r_hand"])),
+            Leg("bring", attached(beside, GRIP["r_hand"]), free=True),
+            Leg("align", attached(begun, GRIP["r_hand"])),
+            Leg("insert", attached(over(-IN), GRIP["r_hand"])),
+        ]
+        return {"l_hand": left, "r_hand": right}
+
+    def judge(self) -> Judge:
+        """Measures how deep the peg is, for how long, and how hard they press on each other."""
+        return _Judge()
+
+    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
+        """Hands seen from where peg and block were, the peg from the block; the joints.
+
+        Without what is held, one hand from the other in place of the peg from the block.
+        """
+        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+        grasps = [
+            Stack(*(kind(*pair) for kind in kinds))
+            for pair in (("r_hand", "peg"), ("l_hand", "block"))
+        ]
+        if held:
+            together = Stack(*(kind("peg", "block", held=True) for kind in kinds))
+        else:
+            together = Stack(*(kind("r_hand", "l_hand") for kind in kinds))
+        return [*grasps, together, Canonical()]
+
+
+class _Judge(Judge):
+    def __init__(self) -> None:
+        self.force = self.inserted = 0.0
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        pressed = np.linalg.norm(scene.force("block", "peg"))
+        self.force = max(self.force, float(pressed))
+        deep = _depth(scene) >= DEEP and {PEG, BLOCK} <= scene.held
+        self.inserted = self.inserted + seconds if deep else 0.0
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        return {
+            "depth_mm": 1e3 * _depth(scene),
+            "inserted_s": self.inserted,
+            "force_n": self.force,
+            "held": float({PEG, BLOCK} <= scene.held),
+        }
+
+
+def _depth(scene: SuiteScene) -> float:
+    """How far the middle of the peg's end is below the hole's mouth, 0 beside it [m]."""
+    peg, block = (scene.data.body(name) for name in ("peg", "block"))
+    tip = peg.xpos - LENGTH * peg.xmat.reshape(3, 3)[:, 2]
+    x, y, z = block.xmat.reshape(3, 3).T @ (tip - block.xpos)
+    inside = max(abs(x), abs(y)) < RADIUS + CLEARANCE
+    return max(0.0, HEIGHT - float(z)) if inside else 0.0
+
+
+def _straighter(pose: Frame) -> Tensor:
+    """Half as far turned: how arms turn by themselves what they bring before the chest."""
+    straight = torch.zeros_like(pose.orientation)
+    straight[..., 0] = 1.0
+    half = torch.full(pose.batch_shape, 0.5, dtype=torch.float64)
+    return quaternions.slerp(straight, pose.orientation, half)
+
+
+def _add_solid(body: Any, kind: Any, size: Sequence[float], **more: Any) -> None:
+    """A geom that stands on the table and collides with other objects."""
+    body.add_geom(
+        type=kind,
+        size=size,
+        contype=OBJECT,
+        conaffinity=TABLE | OBJECT,
+        friction=(FRICTION, 0.005, 0.0001),
+        solref=STIFF,
+        **more,
+    )
+
+
+def _block() -> list[tuple[Sequence[float], Sequence[float], Sequence[float]]]:
+    """Positions, half sizes and orientations of the boxes of which the block is made."""
+    hole = RADIUS + CLEARANCE
+    top, bottom = HEIGHT - CHAMFER, HEIGHT - DEPTH
+    none = (1.0, 0.0, 0.0, 0.0)
+    floor = ((0.0, 0.0, (bottom - HEIGHT) / 2), (WIDTH, WIDTH, (bottom + HEIGHT) / 2), none)
+    boxes: list[tuple[Sequence[float], Sequence[float], Sequence[float]]] = [floor]
+    for inner, low, high in ((hole, bottom, top), (hole + CHAMFER, top, HEIGHT)):
+        middle, thick = (inner + WIDTH) / 2, (WIDTH - inner) / 2
+        z, tall = (low + high) / 2, (high - low) / 2
+        for sign in (-1, 1):
+            boxes.append(((sign * middle, 0.0, z), (thick, WIDTH, tall), none))
+            boxes.append(((0.0, sign * middle, z), (inner, thick, tall), none))
+    # a chamfer is the side of a box that is turned by 45 degrees about an edge of the mouth
+    face, back, long = CHAMFER / math.sqrt(2), 0.002, hole + CHAMFER
+    out = hole + CHAMFER / 2 + back / math.sqrt(2)
+    z = HEIGHT - CHAMFER / 2 - back / math.sqrt(2)
+    w = math.cos(math.pi / 8)
+    for sign in (-1, 1):
+        turn = sign * math.sin(math.pi / 8)
+        boxes.append(((sign * out, 0.0, z), (back, long, face), (w, 0.0, turn, 0.0)))
+        boxes.append(((0.0, sign * out, z), (long, back, face), (w, -turn, 0.0, 0.0)))
+    return boxes

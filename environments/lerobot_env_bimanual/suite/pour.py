@@ -1,0 +1,305 @@
+"""Pour: the left hand tilts a jug over a cup that the right hand holds, and moves meanwhile.
+
+Nothing in the room says where it is poured: what matters is where the jug's mouth is seen from
+the cup, at each instant, and how far the jug is tilted there, since with the tilt grows the
+stream. Where the cup is held, how it sways, and from which side the jug comes about the
+vertical is free: the mouth's place and the jug's turn only go together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from types import MappingProxyType
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lerobot_env_bimanual.suite.names import SUITE
+from lerobot_env_bimanual.suite.scene import TABLE, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.task import (
+    Judge,
+    Leg,
+    Pose,
+    Style,
+    SuiteTask,
+    raised,
+    stands_in,
+    upright_pose,
+)
+from tpgmm_datasets.bottle.skill import attached, between
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+    quaternions,
+)
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+
+__all__ = ["Pour"]
+
+#: Of the cup and the jug, whose frames are in their middle: radius, and half the height [m].
+CUP, CUP_HALF = 0.03, 0.03
+JUG, JUG_HALF = 0.025, 0.06
+LEFT = Hold("l_hand", "jug", "jug")
+RIGHT = Hold("r_hand", "cup", "cup")
+#: Where cups and jugs stand: the box of the cup's centre, and the jug's on the other side.
+LOWEST, HIGHEST, YAW = (0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0
+#: Where the palms touch them, and where they wait, in their frames [m].
+GRIP = {"l_hand": (0.0, JUG + 0.01, 0.01), "r_hand": (0.0, -CUP - 0.01, 0.0)}
+WAIT = {"l_hand": (-0.05, 0.1, 0.01), "r_hand": (-0.05, -0.1, 0.0)}
+#: How high the jug is lifted before it is carried [m].
+LIFT = 0.05
+#: Where the cup is held [m], and by how much it sways from there while it is poured into.
+MEETING, SWAY = (0.27, -0.02, 0.16), (0.02, 0.02, 0.0)
+#: From which side the jug comes, about the vertical, and by how much that differs [rad].
+SIDE, SIDE_SPREAD = math.radians(-35.0), math.radians(15.0)
+#: How far the jug is tilted [rad]; where its mouth is above the cup's rim, and how far beside
+#: the cup while it is upright [m].
+TILT, ABOVE, BESIDE = math.radians(98.0), 0.03, 0.06
+#: From this tilt on it flows; before, the mouth should be above the cup [deg].
+BRIM, OVER = 60.0, 55.0
+#: What flows in a second for each degree beyond, as a share of what is in the jug.
+FLOW = 1 / 45
+#: A cup that leans more takes nothing [deg].
+UPRIGHT = 15.0
+#: Where the jug is in the end [m].
+ASIDE = (0.26, 0.1, 0.16)
+GRAVITY = 9.81
+
+
+class Pour(SuiteTask):
+    """Pour from a jug into a cup, one in each hand."""
+
+    name = "pour"
+    description = "take the cup with the right hand, the jug with the left, pour into the cup"
+    objects = SUITE["pour"]
+    foot = CUP_HALF
+    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {
+            "reach": 2.0,
+            "close": 1.0,
+            "hold": 0.6,
+            "lift": 1.6,
+            "grip": 0.6,
+            "raise": 0.8,
+            "bring": 2.0,
+            "tilt": 1.6,
+            "pour": 1.6,
+            "back": 1.6,
+            "leave": 1.6,
+            "rest": 0.4,
+        }
+    )
+    grasp = "close"
+    holds = (LEFT, RIGHT)
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
+        {
+            "poured": (0.9, math.inf),
+            "spilled": (0.0, 0.1),
+            "cup_deg": (0.0, 10.0),
+            "jug_deg": (0.0, 10.0),
+            "held": (1.0, 1.0),
+        }
+    )
+    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
+        {
+            "poured": ("poured", 2),
+            "spilled": ("spilled", 2),
+            "cup_deg": ("cup's lean [deg]", 1),
+            "jug_deg": ("jug's lean in the end [deg]", 1),
+            "held": ("both held", 0),
+        }
+    )
+
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """A cup and a jug, which collide with the table alone."""
+        shapes = {
+            "cup": (CUP, CUP_HALF, 0.15, (0.3, 0.5, 0.85, 1)),
+            "jug": (JUG, JUG_HALF, 0.3, (0.9, 0.75, 0.3, 1)),
+        }
+        for name, (radius, half, mass, colour) in shapes.items():
+            add_thing(spec, name).add_geom(
+                name=name,
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+                size=(radius, half, 0),
+                mass=mass,
+                contype=0,
+                conaffinity=TABLE,
+                rgba=colour,
+            )
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
+        """The cup on the right, the jug on the left of the table."""
+        cup = upright_pose(rng, LOWEST, HIGHEST, YAW)
+        (x, y, _), (far, near, _) = LOWEST, HIGHEST
+        height = cup[2] - CUP_HALF + JUG_HALF
+        jug = upright_pose(rng, (x, -near, height), (far, -y, height), YAW)
+        return {"cup": cup, "jug": jug}
+
+    def usual(self, pose: Pose) -> bool:
+        """Whether it stands in its box."""
+        return stands_in(pose, LOWEST, HIGHEST, YAW)
+
+    def legs(
+        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
+    ) -> Mapping[str, Sequence[Leg]]:
+        """Right to the cup, and lifts it; left to the jug, over the cup, and back."""
+        cup, jug = poses["cup"], poses["jug"]
+        aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
+        sway = style.free * torch.tensor(SWAY, dtype=torch.float64)
+        meeting = torch.tensor(MEETING, dtype=torch.float64) + aside["r_hand"]
+        # where the cup is at the ends of the phases in which it is poured into
+        turns = [Frame(meeting + share * sway) for share in (0.0, 1.0, -1.0, 0.0)]
+        cups = dict(zip(("tilt", "pour", "back"), pairwise(turns), strict=True))
+        side = _turn(SIDE + SIDE_SPREAD * style.free[:, 2], (0.0, 0.0, 1.0))
+
+        def near(pose: Frame, hand: str) -> Frame:
+            waiting = attached(pose, WAIT[hand])
+            return Frame(waiting.position + aside[hand], waiting.orientation)
+
+        def pouring(phase: str, tilted: Callable[[Tensor], Tensor]) -> Leg:
+            def way(done: Tensor) -> Frame:
+                below = between(*cups[phase], done)
+                return attached(_over(below, side, TILT * tilted(done)), GRIP["l_hand"])
+
+            return Leg(phase, way)
+
+        ready = _over(turns[0], side, torch.zeros_like(side[:, 0]))
+        away = Frame(torch.tensor(ASIDE, dtype=torch.float64) + aside["l_hand"])
+        left = [
+            Leg("reach", near(jug, "l_hand"), free=True),
+            Leg("lift", attached(jug, GRIP["l_hand"])),
+            Leg("raise", attached(raised(jug, LIFT), GRIP["l_hand"])),
+            Leg("bring", attached(ready, GRIP["l_hand"]), free=True),
+            pouring("tilt", minimum_jerk),
+            pouring("pour", torch.ones_like),
+            pouring("back", lambda done: 1 - minimum_jerk(done)),
+            Leg("leave", attached(away, GRIP["l_hand"]), free=True),
+        ]
+        right = [
+            Leg("reach", near(cup, "r_hand"), free=True),
+            Leg("close", attached(cup, GRIP["r_hand"])),
+            Leg("lift", attached(turns[0], GRIP["r_hand"]), free=True),
+            *(Leg(phase, attached(end, GRIP["r_hand"])) for phase, (_, end) in cups.items()),
+        ]
+        return {"l_hand": left, "r_hand": right}
+
+    def judge(self) -> Judge:
+        """Follows what flows; hands do not open."""
+        return _Judge()
+
+    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
+        """Each hand seen from what it takes, the jug seen from the cup; the joints."""
+        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+
+        def seen(what: str, frame: str, thing: bool = False) -> Stack:
+            return Stack(*(kind(what, frame, held=thing) for kind in kinds))
+
+        return [
+            seen("r_hand", "cup"),
+            seen("l_hand", "jug"),
+            seen("jug", "cup", thing=True) if held else seen("l_hand", "r_hand"),
+            Canonical(),
+        ]
+
+
+def _turn(angle: Tensor, axis: tuple[float, ...]) -> Tensor:
+    """Unit quaternions (n, 4) about an axis, for angles (n,) [rad]."""
+    return quaternions.exp(angle[:, None] * angle.new_tensor(axis))
+
+
+def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:
+    """The jug (n,), tilted so far, its mouth where it should then be for a cup.
+
+    While it is upright that is beside the cup, and it goes above it as it is tilted.
+    """
+    orientation = quaternions.product(side, _turn(tilt, (1.0, 0.0, 0.0)))
+    beside = torch.zeros(*tilt.shape, 3, dtype=torch.float64)
+    beside[..., 1] = BESIDE * (1 - minimum_jerk((tilt / math.radians(OVER)).clamp(max=1)))
+    beside[..., 2] = CUP_HALF + ABOVE
+    mouth = cup.position + quaternions.rotate(side, beside)
+    lip = torch.tensor((0.0, -JUG, JUG_HALF), dtype=torch.float64)
+    return Frame(mouth - quaternions.rotate(orientation, lip), orientation)
+
+
+class _Judge(Judge):
+    """What flows leaves where the jug's rim is lowest, as fast as that moves, and falls."""
+
+    def __init__(self) -> None:
+        self.full = 1.0
+        self.poured = self.spilled = self.lean = 0.0
+        self.mouth: NDArray[np.float64] | None = None
+        # what falls: how much of it, where, how fast
+        self.amounts: NDArray[np.float64] = np.zeros(0)
+        self.places: NDArray[np.float64] = np.zeros((0, 3))
+        self.speeds: NDArray[np.float64] = np.zeros((0, 3))
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        before = _seen(scene, self.places)
+        self.places = self.places + self.speeds * seconds
+        self.places[:, 2] -= GRAVITY * seconds**2 / 2
+        self.speeds[:, 2] -= GRAVITY * seconds
+        if self.amounts.size:
+            self.lean = max(self.lean, _lean(scene, "cup"))
+        self._arrive(before, _seen(scene, self.places), _lean(scene, "cup") <= UPRIGHT)
+        self._flow(scene, seconds)
+
+    def _arrive(
+        self, before: NDArray[np.float64], after: NDArray[np.float64], upright: bool
+    ) -> None:
+        """Count what came down to the cup's rim between two instants, seen from the cup."""
+        down = after[:, 2] <= CUP_HALF
+        before, after = before[down], after[down]
+        fallen = before[:, 2] - after[:, 2]
+        share = (before[:, 2] - CUP_HALF) / np.where(fallen > 0, fallen, 1.0)
+        through = before + np.clip(share, 0.0, 1.0)[:, None] * (after - before)
+        inside = (np.linalg.norm(through[:, :2], axis=1) <= CUP) & upright
+        self.poured += float(self.amounts[down][inside].sum())
+        self.spilled += float(self.amounts[down][~inside].sum())
+        self.amounts, self.places = self.amounts[~down], self.places[~down]
+        self.speeds = self.speeds[~down]
+
+    def _flow(self, scene: SuiteScene, seconds: float) -> None:
+        """Let more leave the jug, where its rim is lowest."""
+        axis = scene.data.body("jug").xmat.reshape(3, 3)[:, 2]
+        down = axis[2] * axis - (0.0, 0.0, 1.0)
+        lowest = JUG * down / max(float(np.linalg.norm(down)), 1e-9)
+        mouth = scene.pose("jug")[:3] + JUG_HALF * axis + lowest
+        amount = min(FLOW * (_lean(scene, "jug") - BRIM) * seconds, self.full)
+        if amount > 0 and self.mouth is not None:
+            speed = (mouth - self.mouth) / seconds
+            self.full -= amount
+            self.amounts = np.append(self.amounts, amount)
+            self.places = np.concatenate((self.places, mouth[None]))
+            self.speeds = np.concatenate((self.speeds, speed[None]))
+        self.mouth = mouth
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        return {
+            "poured": self.poured,
+            "spilled": self.spilled,
+            "cup_deg": self.lean,
+            "jug_deg": _lean(scene, "jug"),
+            "held": float(scene.held == {LEFT, RIGHT}),
+        }
+
+
+def _seen(scene: SuiteScene, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Places (n, 3) as seen from the cup [m]."""
+    cup = scene.data.body("cup")
+    return np.asarray((places - cup.xpos) @ cup.xmat.reshape(3, 3))
+
+
+def _lean(scene: SuiteScene, name: str) -> float:
+    """Of an object's axis from the vertical [deg]."""
+    cosine = float(scene.data.body(name).xmat[8])
+    return math.degrees(math.acos(min(1.0, max(-1.0, cosine))))

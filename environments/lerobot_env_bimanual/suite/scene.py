@@ -1,0 +1,273 @@
+"""A simulated robot at a table with things that its hands can hold, in MuJoCo."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.robot_scene import RobotScene
+
+__all__ = ["OBJECT", "TABLE", "Hold", "Snapshot", "SuiteScene", "add_thing", "table_spec"]
+
+#: What collides with what, as bits: the table, and objects among each other. Palms do not.
+TABLE, OBJECT = 1, 8
+#: How a grip yields: time constant [s] and damping ratio. The lighter a thing is, the softer it
+#: is held; with MuJoCo's own 0.02 s a baton would hang from the hand by some degrees.
+GRIP = (0.004, 1.0)
+#: A weld's rows of constraints: a force, then a moment.
+_ROWS = 3
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A hand that may take hold of an object.
+
+    Parameters
+    ----------
+    hand : str
+        The link.
+    thing : str
+        The object's body.
+    grip : str
+        The geom that the palm has to touch.
+    """
+
+    hand: str
+    thing: str
+    grip: str
+
+
+def table_spec(spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Put a robot at a table, a body ``table`` whose top is where that is.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        That of an embodiment.
+    """
+    table = spec.worldbody.add_body(name="table")
+    table.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=TABLE, conaffinity=0, group=3
+    )
+    table.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=(0.2, 0.35, 0.01),
+        pos=(0.34, 0, -0.01),
+        contype=0,
+        conaffinity=0,
+        rgba=(0.6, 0.5, 0.4, 1),
+    )
+    return spec
+
+
+def add_thing(spec: mujoco.MjSpec, name: str, *, free: bool = True) -> mujoco.MjsBody:
+    """Add an object's body, without geoms.
+
+    Parameters
+    ----------
+    free : bool, default=True
+        Whether it can be moved; what is not free stands where it is put.
+    """
+    body = spec.worldbody.add_body(name=name)
+    if free:
+        body.add_freejoint(name=name)
+    return body
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Where everything is at an instant.
+
+    Parameters
+    ----------
+    positions : ndarray
+        Of all joints of the model.
+    held : frozenset of Hold
+        Who holds what, and has held it.
+    taken : frozenset of Hold
+    welds : ndarray
+        How what is held lies in the hands.
+    places : ndarray of shape (n_bodies, 7)
+        Where bodies are that cannot move by themselves.
+    """
+
+    positions: NDArray[np.float64]
+    held: frozenset[Hold]
+    taken: frozenset[Hold]
+    welds: NDArray[np.float64]
+    places: NDArray[np.float64]
+
+
+class SuiteScene(RobotScene):
+    """The state of the simulated world, and what hands can do in it.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        That of :func:`table_spec` with the objects in it.
+    names : sequence of str
+        The objects that are observed.
+    holds : sequence of Hold
+        Which hand may take hold of what.
+
+    Attributes
+    ----------
+    names : tuple of str
+    held : set of Hold
+        Which hands hold something.
+    taken : set of Hold
+        Which do, or have done.
+    """
+
+    def __init__(
+        self, spec: mujoco.MjSpec, names: Sequence[str], holds: Sequence[Hold]
+    ) -> None:
+        for hold in holds:
+            weld = spec.add_equality(
+                type=mujoco.mjtEq.mjEQ_WELD, name1=hold.hand, name2=hold.thing
+            )
+            weld.name, weld.active = f"{hold.hand} {hold.thing}", False
+            weld.objtype = mujoco.mjtObj.mjOBJ_BODY
+            weld.solref = GRIP
+        super().__init__(spec)
+        model = self.model
+        self.names = tuple(names)
+        self.held: set[Hold] = set()
+        self.taken: set[Hold] = set()
+        self._welds = {hold: model.equality(f"{hold.hand} {hold.thing}").id for hold in holds}
+
+    @property
+    def objects(self) -> list[NDArray[np.float64]]:
+        """The poses of what is observed, shape (7,) each."""
+        return [self.pose(name) for name in self.names]
+
+    @property
+    def table(self) -> float:
+        """Height of the table [m]."""
+        return float(self.model.body_pos[self.model.body("table").id, 2])
+
+    def pose(self, name: str) -> NDArray[np.float64]:
+        """A body's position [m] and orientation, a unit quaternion; shape (7,)."""
+        body = self.data.body(name)
+        return np.concatenate((body.xpos, body.xquat))
+
+    def put(self, name: str, pose: NDArray[np.float64]) -> None:
+        """Put an object somewhere, at rest; shape (7,)."""
+        model, data, body = self.model, self.data, self.model.body(name).id
+        if model.body_jntnum[body] and model.jnt_type[model.body_jntadr[body]] == 0:  # free
+            joint = data.joint(int(model.body_jntadr[body]))
+            joint.qpos[:], joint.qvel[:] = pose, 0
+        else:
+            model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
+        mujoco.mj_kinematics(model, data)
+
+    def reset(
+        self,
+        poses: Mapping[str, NDArray[np.float64]],
+        joints: NDArray[np.float64],
+        table: float,
+    ) -> None:
+        """Stand still, the objects where they are put.
+
+        Parameters
+        ----------
+        poses : mapping of str to ndarray of shape (7,)
+        joints : ndarray of shape (n_joints,)
+            [rad]
+        table : float
+            Its height [m].
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.eq_active[:] = False
+        self.held, self.taken = set(), set()
+        self.data.ctrl[:] = self.data.qpos[: self._n] = joints
+        self.model.body_pos[self.model.body("table").id, 2] = table
+        for name, pose in poses.items():
+            self.put(name, pose)
+        mujoco.mj_forward(self.model, self.data)
+
+    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+        """Put the joints somewhere without dynamics; objects stay where they are."""
+        self.data.qpos[: self._n] = joints
+        mujoco.mj_kinematics(self.model, self.data)
+        self.data.time += seconds
+
+    def gap(self, hold: Hold) -> float:
+        """Distance of a palm from where it would hold, negative inside it [m]."""
+        model, points = self.model, np.empty(6)
+        palm, grip = (model.geom(name).id for name in (f"{hold.hand[0]}_palm", hold.grip))
+        return float(mujoco.mj_geomDistance(model, self.data, palm, grip, 1.0, points))
+
+    def hold(self, hold: Hold) -> None:
+        """Attach an object to a hand as it lies in it."""
+        data, weld = self.data, self._welds[hold]
+        hand, thing = data.body(hold.hand), data.body(hold.thing)
+        inverse, turn = np.empty(4), np.empty(4)
+        mujoco.mju_negQuat(inverse, hand.xquat)
+        mujoco.mju_mulQuat(turn, inverse, thing.xquat)
+        point = thing.xmat.reshape(3, 3).T @ (hand.xpos - thing.xpos)
+        # a point of the thing, where it is in the hand, and how the thing is turned there
+        self.model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
+        data.eq_active[weld] = True
+        self.held.add(hold)
+        self.taken.add(hold)
+
+    def let_go(self, hold: Hold) -> None:
+        """Open a hand."""
+        self.data.eq_active[self._welds[hold]] = False
+        self.held.discard(hold)
+
+    def pull(self, hold: Hold) -> float:
+        """The force between a hand and what it holds [N]; 0 if it holds nothing."""
+        data = self.data
+        rows = np.flatnonzero(
+            (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+            & (data.efc_id == self._welds[hold])
+        )[:_ROWS]
+        return math.sqrt(float(np.square(data.efc_force[rows]).sum()))
+
+    def touch(self, first: str, second: str) -> float:
+        """The normal force between two geoms, pressing [N]."""
+        model, data, total, part = self.model, self.data, 0.0, np.empty(6)
+        pair = {model.geom(first).id, model.geom(second).id}
+        for index in range(data.ncon):
+            if set(data.contact.geom[index].tolist()) == pair:
+                mujoco.mj_contactForce(model, data, index, part)
+                total += part[0]
+        return total
+
+    def force(self, first: str, second: str) -> NDArray[np.float64]:
+        """What one body does to another where they touch, friction too; shape (3,) [N]."""
+        model, data, part = self.model, self.data, np.empty(6)
+        total = np.zeros(3)
+        bodies = model.body(first).id, model.body(second).id
+        for index in range(data.ncon):
+            contact = data.contact[index]
+            pair = tuple(model.geom_bodyid[contact.geom])
+            if set(pair) == set(bodies):
+                mujoco.mj_contactForce(model, data, index, part)
+                # it is what the first geom does to the second, in the contact's frame
+                sign = 1 if pair == bodies else -1
+                total += sign * part[:3] @ contact.frame.reshape(3, 3)
+        return total
+
+    def snapshot(self) -> Snapshot:
+        """The state without velocities."""
+        model, held, taken = self.model, frozenset(self.held), frozenset(self.taken)
+        places = np.concatenate((model.body_pos, model.body_quat), axis=1)
+        return Snapshot(self.data.qpos.copy(), held, taken, model.eq_data.copy(), places)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Bring everything to where it was."""
+        self.data.qpos[:] = snapshot.positions
+        self.model.eq_data[:] = snapshot.welds
+        self.model.body_pos[:], self.model.body_quat[:] = np.split(snapshot.places, [3], axis=1)
+        self.held, self.taken = set(snapshot.held), set(snapshot.taken)
+        for hold, weld in self._welds.items():
+            self.data.eq_active[weld] = hold in self.held
+        mujoco.mj_kinematics(self.model, self.data)

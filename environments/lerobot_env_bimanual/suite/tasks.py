@@ -1,0 +1,37 @@
+"""The tasks of the suite by their names."""
+
+from __future__ import annotations
+
+import functools
+
+from lerobot_env_bimanual.suite.handover import Handover
+from lerobot_env_bimanual.suite.lid import Lid
+from lerobot_env_bimanual.suite.names import UPPER_BODY
+from lerobot_env_bimanual.suite.peg_in_hole import PegInHole
+from lerobot_env_bimanual.suite.pour import Pour
+from lerobot_env_bimanual.suite.robots.embodiments import embodiment
+from lerobot_env_bimanual.suite.task import SuiteTask
+from lerobot_env_bimanual.suite.wipe import Wipe
+from tpgmm_torch.exceptions import UnknownNameError
+
+__all__ = ["TASKS", "suite_task"]
+
+TASKS: dict[str, type[SuiteTask]] = {
+    task.name: task for task in (Handover, Lid, PegInHole, Pour, Wipe)
+}
+
+
+@functools.cache
+def suite_task(name: str, robot: str = UPPER_BODY) -> SuiteTask:
+    """A task by its name, and that of the robot that does it.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none.
+    DependencyError
+        If the robot's description is in a package that is not installed.
+    """
+    if name not in TASKS:
+        raise UnknownNameError("task", name, "the suite", TASKS)
+    return TASKS[name](embodiment(robot))

@@ -1,0 +1,281 @@
+"""Wipe: the right palm wipes a tilted board in a zigzag, the left hand steadies its edge.
+
+The way is one in the board's plane, at an even pace, and pressing is part of it: the reference
+of the palm is a little below the board, and a soft sponge makes a force of that. Poses at a few
+instants say neither; nor is the force anywhere in the observation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_env_bimanual.robot_scene import PALM
+from lerobot_env_bimanual.suite.names import SUITE
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.task import (
+    Judge,
+    Leg,
+    Pose,
+    Style,
+    SuiteTask,
+)
+from tpgmm_datasets.bottle.skill import attached
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+    quaternions,
+)
+
+__all__ = ["Wipe"]
+
+#: How high the middle of the board is above the table, and half its sides and thickness [m].
+#: Its frame is in the middle of its upper side.
+FOOT = 0.06
+BOARD = (0.075, 0.085, 0.01)
+#: Where boards are: the box of that middle [m], and how far they are turned about the vertical
+#: and tilted to either side [deg].
+LOWEST, HIGHEST = (0.27, -0.04, 0.08), (0.32, 0.0, 0.11)
+YAW, TILT = 20.0, 15.0
+#: Half the sides of the sponge on the right palm, in the hand's frame, and its stiffness at
+#: each corner [1/s^2] and damping [1/s], as MuJoCo takes them.
+SPONGE = (0.025, 0.01, 0.025)
+STIFFNESS, DAMPING = 450.0, 40.0
+#: What is wiped: half its sides, and those of a cell of it [m].
+FIELD, CELL = (0.05, 0.06), 0.01
+#: The zigzag: half its sides [m], how many strokes, and how deep the reference presses [m].
+WAY, STROKES, PRESS = (0.034, 0.044), 4, 0.005
+#: Where the right palm waits: above where it begins and ends; before, behind the board, in
+#: whose frame that is [m].
+HOVER, BEHIND = 0.05, (-0.13, -0.13, 0.06)
+#: How the right hand is turned on the board, about its normal [rad]: the wrist asks for that.
+TURN = math.radians(35.0)
+#: Where the left palm touches the edge, and where it waits, in the board's frame [m].
+EDGE, WAIT = (-0.02, BOARD[1] + 0.01, -0.01), (-0.07, BOARD[1] + 0.07, -0.01)
+#: How far the left hand is pitched there, its palm along the edge [rad]; its wrist asks for it.
+PITCH = math.radians(12.0)
+#: Which forces wipe [N].
+FORCES = (2.0, 40.0)
+STEADY = Hold("l_hand", "board", "edge")
+
+
+class Wipe(SuiteTask):
+    """Wipe a board with one hand, and steady it with the other."""
+
+    name = "wipe"
+    description = "steady the board with the left hand, wipe it with the right"
+    objects = SUITE["wipe"]
+    foot = FOOT
+    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
+        {
+            "reach": 2.0,
+            "close": 1.5,
+            "press": 1.2,
+            "wipe": 6.0,
+            "lift": 1.0,
+            "away": 1.5,
+            "rest": 0.4,
+        }
+    )
+    grasp = "close"
+    #: Nobody carries a board that stands fast.
+    holds = ()
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
+        {
+            "coverage": (0.9, math.inf),
+            "force": (4.0, 20.0),
+            "off_s": (0.0, 0.3),
+            "edge_mm": (0.0, 10.0),
+        }
+    )
+    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
+        {
+            "coverage": ("wiped", 2),
+            "force": ("mean force [N]", 1),
+            "off_s": ("without contact [s]", 2),
+            "edge_mm": ("left palm from the edge [mm]", 1),
+        }
+    )
+
+    def furnish(self, spec: mujoco.MjSpec) -> None:
+        """A board on a foot, its edge, and a sponge on the right palm."""
+        board = add_thing(spec, "board", free=False)
+        long, wide, thick = BOARD
+        shapes = {
+            "board": ((long, wide, thick), (0.0, 0.0, -thick), PALM, (0.9, 0.9, 0.85, 1)),
+            "edge": ((long, 1e-3, thick), (0.0, wide - 1e-3, -thick), 0, (0.3, 0.3, 0.3, 1)),
+        }
+        for name, (size, place, collides, colour) in shapes.items():
+            board.add_geom(
+                name=name,
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=size,
+                pos=place,
+                contype=0,
+                conaffinity=collides,
+                rgba=colour,
+            )
+        spec.body("r_hand").add_geom(
+            name="sponge",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=SPONGE,
+            pos=(0.0, 0.01 + SPONGE[1], 0.0),
+            mass=0.02,
+            contype=PALM,
+            conaffinity=0,
+            priority=1,
+            # it slides: with a pyramid of friction, normal forces grow with the speed
+            condim=1,
+            solref=(-STIFFNESS, -DAMPING),
+            solimp=(0.5, 0.5, 0.001, 0.5, 2.0),
+            rgba=(0.95, 0.85, 0.3, 1),
+        )
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
+        """A board before the robot, turned and tilted."""
+        position = rng.uniform(LOWEST, HIGHEST)
+        largest = np.radians((TILT, TILT, YAW))
+        roll, pitch, yaw = rng.uniform(-largest, largest)
+        turn, tilt = (
+            quaternions.exp(torch.tensor(vector, dtype=torch.float64))
+            for vector in ((0.0, 0.0, yaw), (roll, pitch, 0.0))
+        )
+        return {"board": np.concatenate((position, quaternions.product(turn, tilt).numpy()))}
+
+    def usual(self, pose: Pose) -> bool:
+        """Whether it may have been drawn, but for rounding."""
+        inside = np.all(
+            (np.subtract(LOWEST, 1e-9) <= pose[:3]) & (pose[:3] <= np.add(HIGHEST, 1e-9))
+        )
+        orientation = torch.from_numpy(np.asarray(pose[3:], dtype=np.float64))
+        yaw = 2 * math.atan2(float(orientation[3]), float(orientation[0]))
+        turn = quaternions.exp(torch.tensor((0.0, 0.0, yaw), dtype=torch.float64))
+        tilt = quaternions.log(quaternions.product(quaternions.conjugate(turn), orientation))
+        turned = abs((math.degrees(yaw) + 180) % 360 - 180) <= YAW + 1e-6
+        return bool(inside) and turned and math.degrees(float(tilt.abs().max())) <= TILT + 1e-6
+
+    def legs(
+        self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
+    ) -> Mapping[str, Sequence[Leg]]:
+        """Left to the edge and back; right to the board, over it in a zigzag, and back."""
+        board = poses["board"]
+        aside = {hand: style.aim[:, i] for i, hand in enumerate(("l_hand", "r_hand"))}
+        n = len(board.position)
+
+        def near(pose: Frame, hand: str) -> Frame:
+            return Frame(pose.position + aside[hand], pose.orientation)
+
+        def zigzag(done: Tensor) -> Frame:
+            return _on(board, _zigzag(done), -PRESS)
+
+        first, last = (torch.full((n,), share, dtype=torch.float64) for share in (0.0, 1.0))
+        place = torch.tensor(BEHIND[:2], dtype=torch.float64).expand(n, 2)
+        behind = near(_on(board, place, BEHIND[2]), "r_hand")
+        return {
+            "l_hand": [
+                Leg("reach", near(_beside(board, WAIT), "l_hand"), free=True),
+                Leg("close", _beside(board, EDGE)),
+                Leg("away", near(_beside(board, WAIT), "l_hand"), free=True),
+            ],
+            "r_hand": [
+                Leg("reach", behind, free=True),
+                Leg("close", near(_on(board, _zigzag(first), HOVER), "r_hand"), free=True),
+                Leg("press", zigzag(first)),
+                Leg("wipe", zigzag),
+                Leg("lift", near(_on(board, _zigzag(last), HOVER), "r_hand")),
+                Leg("away", behind, free=True),
+            ],
+        }
+
+    def judge(self) -> Judge:
+        """Looks where the sponge presses on the board, and at the left palm meanwhile."""
+        return _Judge()
+
+    def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
+        """Both hands seen from the board; the joints. Nothing is carried."""
+        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+        return [
+            Stack(*(kind(hand, "board") for kind in kinds)) for hand in ("l_hand", "r_hand")
+        ] + [Canonical()]
+
+
+def _zigzag(done: Tensor) -> Tensor:
+    """Places (n, 2) in the board's plane, when so much is done [m]."""
+    long, wide = WAY
+    # at rest at the beginning and the end, and at each turn along the board
+    along = done - torch.sin(2 * math.pi * STROKES * done) / (2 * math.pi * STROKES)
+    across = torch.cos(math.pi * STROKES * done)
+    return torch.stack((long * (1 - 2 * along), -wide * across), dim=-1)
+
+
+def _beside(board: Frame, point: tuple[float, ...]) -> Frame:
+    """The left hand (n,) with its palm to the edge, at a point of the board's frame."""
+    return _turned(board, torch.tensor(point, dtype=torch.float64), (0.0, PITCH, 0.0))
+
+
+def _on(board: Frame, place: Tensor, height: float) -> Frame:
+    """The right hand (n,) with its palm to the board, the sponge so high above it."""
+    above = torch.full_like(place[:, :1], height + 0.01 + 2 * SPONGE[1])
+    point = torch.cat((place, above), dim=1)
+    return _turned(board, point, (0.0, 0.0, TURN), (-math.pi / 2, 0.0, 0.0))
+
+
+def _turned(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
+    """A hand that is turned in the board's frame by rotation vectors, one after the other."""
+    orientation = board.orientation
+    for turn in turns:
+        vector = torch.tensor(turn, dtype=torch.float64)
+        orientation = quaternions.product(orientation, quaternions.exp(vector))
+    return attached(Frame(board.transform(point), orientation), (0.0, 0.0, 0.0))
+
+
+class _Judge(Judge):
+    def __init__(self) -> None:
+        shape = [round(2 * half / CELL) for half in FIELD]
+        self.wiped = np.zeros(shape, dtype=bool)
+        self.pressed = self.impulse = self.edge = self.off = self.pause = 0.0
+
+    def note(self, scene: SuiteScene, seconds: float) -> None:
+        force = scene.touch("sponge", "board")
+        low, high = FORCES
+        if force < low:
+            # what comes after the last contact is no pause
+            self.pause += seconds if self.pressed else 0.0
+            return
+        self.off, self.pause = self.off + self.pause, 0.0
+        self.pressed += seconds
+        self.impulse += force * seconds
+        self.edge = max(self.edge, scene.gap(STEADY))
+        if force <= high:
+            self._wipe(scene)
+
+    def _wipe(self, scene: SuiteScene) -> None:
+        """Mark the cells that are in the sponge, which gives way to the board."""
+        rows, columns = (
+            (np.arange(n) + 0.5) * CELL - half
+            for n, half in zip(self.wiped.shape, FIELD, strict=True)
+        )
+        grid = np.stack(np.broadcast_arrays(rows[:, None], columns, 0.0), axis=-1)
+        board, sponge = scene.data.body("board"), scene.data.geom("sponge")
+        cells = board.xpos + grid @ board.xmat.reshape(3, 3).T
+        inside = np.abs((cells - sponge.xpos) @ sponge.xmat.reshape(3, 3)) <= SPONGE
+        self.wiped |= inside.all(-1)
+
+    def figures(self, scene: SuiteScene) -> dict[str, float]:
+        return {
+            "coverage": float(self.wiped.mean()),
+            "force": self.impulse / self.pressed if self.pressed else 0.0,
+            "off_s": self.off,
+            "edge_mm": 1e3 * self.edge,
+        }

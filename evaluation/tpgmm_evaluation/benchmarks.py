@@ -1,0 +1,428 @@
+"""The environments of the comparison: where demonstrations come from, what TP-GMM is told."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+import lerobot_env_bimanual  # noqa: F401  registers what gym.make finds
+from lerobot_env_bimanual.aloha.demonstrations import record_aloha
+from lerobot_env_bimanual.aloha.robot import aloha_operators, aloha_robot
+from lerobot_env_bimanual.bottle.measures import LIMITS, PUT_LIMITS
+from lerobot_env_bimanual.disturbances import CONDITIONS, NOMINAL
+from lerobot_env_bimanual.suite.env import SUITE_CONDITIONS
+from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
+from lerobot_env_bimanual.suite.tasks import suite_task
+from tpgmm_datasets import save_lerobot
+from tpgmm_datasets.bottle.carrying import TASK as CARRY
+from tpgmm_datasets.bottle.carrying import CarryAndPut, slid
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import HANDS, TASK, BottleShaking
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    Kinematics,
+    Operator,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+__all__ = ["BENCHMARKS", "OTHER_ROBOTS", "Benchmark", "benchmark"]
+
+
+#: How hard the robot moved, as the report shows it.
+PEAKS = {
+    "peak_speed": ("peak speed [rad/s]", 1),
+    "peak_acceleration": ("peak acceleration [rad/s²]", 0),
+}
+
+
+class Benchmark(ABC):
+    """What has to be known of an environment.
+
+    Parameters
+    ----------
+    rate : int, optional
+        Of the recorded episodes [Hz].
+    options : mapping, optional
+        Fields of the environment's configuration, in recording and evaluation.
+    """
+
+    #: What ``--env.type`` takes, and fields that belong to the benchmark.
+    env: ClassVar[str]
+    fixed: ClassVar[dict[str, Any]] = {}
+    default_rate: ClassVar[int]
+    #: Whether all demonstrations run on one clock from the beginning.
+    synchronous: ClassVar[bool] = False
+    #: The entries of ``info`` that the report shows, with heading and digits.
+    figures: Mapping[str, tuple[str, int]]
+    #: Between which bounds they have to lie in a success.
+    criteria: Mapping[str, tuple[float, float]] = {}
+    #: K of TP-GMM.
+    n_components: ClassVar[int]
+    #: Disturbances of the evaluation and the options that make them.
+    disturbances: ClassVar[dict[str, dict[str, Any]]] = {}
+    #: What its option ``condition`` is tried with; empty without that option.
+    conditions: ClassVar[tuple[str, ...]] = ()
+    robot: Kinematics
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        self.rate = rate or self.default_rate
+        self.options = {**self.fixed, **(options or {})}
+
+    @property
+    def all_conditions(self) -> tuple[str, ...]:
+        """What ``--conditions all`` means."""
+        return tuple(dict.fromkeys((NOMINAL, *self.conditions, *self.disturbances)))
+
+    @abstractmethod
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """The subspaces in which TP-GMM learns.
+
+        Parameters
+        ----------
+        orientation : bool
+            False leaves the orientation of the hands out.
+        held : bool, default=True
+            False leaves out what is carried as a thing of its own.
+        """
+
+    @abstractmethod
+    def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
+        """Write episodes as the LeRobot sets ``training`` and ``validation``.
+
+        ``observation.state`` is what was measured in the environment, ``action`` the
+        reference. The first episodes for training are the same, however many there are. What
+        does not succeed by the rules of the environment is not kept, as people do not keep it.
+
+        Parameters
+        ----------
+        training, validation : int
+            How many episodes.
+        seed : int
+            Of the draw. Those of two seeds have no episode in common.
+
+        Returns
+        -------
+        list of bool
+            Which attempts at episodes for training succeed: these are the episodes.
+
+        Raises
+        ------
+        DataError
+            If so many cannot be recorded.
+        """
+
+
+class _HandlingBenchmark(Benchmark):
+    """A task with the bottle, demonstrated by a generator that the environment follows."""
+
+    default_rate = 100
+    n_components = 30
+    disturbances: ClassVar = {"pushes": {"pushes": True}, "noise": {"noise": 1.0}}
+    conditions: ClassVar = CONDITIONS
+    #: The environment's name, what its data sets call the task, and what is observed.
+    gym_id: ClassVar[str]
+    task: str
+    objects: tuple[str, ...]
+    #: What its data sets call the robot.
+    robot_type: str = UPPER_BODY
+    #: Options of the environment in recording alone.
+    recording: ClassVar[Mapping[str, Any]] = {}
+    #: Demonstrations are drawn together; the first may train, the last ones validate.
+    POOL, RESERVED = 100, 10
+
+    @abstractmethod
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
+        """Those of the pool's demonstrations that have these numbers."""
+
+    def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
+        """Let the environment follow generated demonstrations, and keep what succeeds."""
+        if training > self.POOL or validation > self.RESERVED:
+            raise DataError(
+                f"{self.env} offers {self.POOL} demonstrations for training and "
+                f"{self.RESERVED} for validation, {training} and {validation} are asked for"
+            )
+        env = gym.make(
+            f"lerobot_env_bimanual/{self.gym_id}",
+            fps=self.rate,
+            **{**self.options, **self.recording},
+        )
+        tried = self._keep(env, folder / "training", range(self.POOL), training, seed)
+        left = range(self.POOL - 1, len(tried) - 1, -1)  # in place of reserved ones that fail
+        reserved = [*range(self.POOL, self.POOL + self.RESERVED), *left]
+        self._keep(env, folder / "validation", reserved, validation, seed)
+        env.close()
+        return tried
+
+    def _keep(
+        self, env: Any, folder: Path, numbers: Iterable[int], n: int, seed: int
+    ) -> list[bool]:
+        """Save the first ``n`` demonstrations that succeed; return which of the tried ones."""
+        tried: list[bool] = []
+        kept: list[tuple[Demonstration, torch.Tensor]] = []
+        waiting = iter(numbers)
+        while len(kept) < n:
+            chosen = list(islice(waiting, n - len(kept)))
+            if not chosen:
+                raise DataError(
+                    f"of {len(tried)} demonstrations of {self.env} {len(kept)} succeed, "
+                    f"{n} are asked for"
+                )
+            for number, motion in zip(chosen, self.motions(chosen, seed), strict=True):
+                measured, success = self._follow(env, number, motion)
+                tried.append(success)
+                if success:
+                    kept.append((measured, _references(motion)))
+        save_lerobot(
+            [measured for measured, _ in kept],
+            folder,
+            fps=self.rate,
+            task=self.task,
+            actions=[actions for _, actions in kept],
+            robot_type=self.robot_type,
+        )
+        return tried
+
+    def _start(self, motion: Demonstration) -> dict[str, Any]:
+        """The options with which an episode begins as a demonstration does."""
+        poses = {name: motion.frame(name) for name in self.objects}
+        firsts = {name: pose[0] if pose.batch_shape else pose for name, pose in poses.items()}
+        return {
+            "joints": motion.joints[0].numpy(),
+            **{
+                name: torch.cat((f.position, f.orientation)).numpy()
+                for name, f in firsts.items()
+            },
+        }
+
+    def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
+        """What is measured while the environment follows a motion; whether it succeeds."""
+        observation, info = env.reset(seed=seed, options=self._start(motion))
+        measured, seen, done = [], [], False
+        references = _references(motion).numpy()
+        for reference in references:
+            if done:
+                raise DataError(f"an episode of {self.env} ends before a demonstration does")
+            measured.append(observation["agent_pos"])
+            seen.append(observation["environment_state"])
+            observation, _, terminated, truncated, info = env.step(reference)
+            done = terminated or truncated
+        while not done:
+            *_, terminated, truncated, info = env.step(references[-1])
+            done = terminated or truncated
+        joints, poses = (torch.from_numpy(np.array(values)) for values in (measured, seen))
+        names = env.unwrapped.joint_names
+        frames = {
+            name: Frame(pose[:, :3], pose[:, 3:])
+            for name, pose in zip(self.objects, poses.split(7, dim=1), strict=True)
+        }
+        return Demonstration(motion.time, joints, frames, names), bool(info["is_success"])
+
+
+class BottleBenchmark(_HandlingBenchmark):
+    """Reach a bottle with both hands, grasp it, bring it, shake it."""
+
+    env = "bottle_shaking"
+    gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
+    figures: Mapping[str, tuple[str, int]] = {
+        "grasp_mm": ("grasp [mm]", 1),
+        "grasp_deg": ("grasp [deg]", 1),
+        "lift_mm": ("lift [mm]", 0),
+        "frequency_error": ("frequency error", 2),
+        "amplitude_error": ("amplitude error", 2),
+        **PEAKS,
+    }
+    criteria = LIMITS
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(rate, options)
+        self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
+        self.robot = self.skill.robot
+
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
+        """Of the skill's generator."""
+        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
+        return [pool[number] for number in numbers]
+
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """Both hands seen from the bottle, and the joints."""
+        return bottle_operators(orientation)
+
+
+class CarryBenchmark(_HandlingBenchmark):
+    """Reach a bottle with both hands, grasp it, put it on a tray."""
+
+    env = "carry_and_put"
+    gym_id, task, objects = "CarryAndPut-v0", CARRY, ("bottle", "tray")
+    figures: Mapping[str, tuple[str, int]] = {
+        "put_mm": ("at the tray [mm]", 2),
+        "put_deg": ("at the tray [deg]", 2),
+        "standing": ("put down", 0),
+        "grasp_mm": ("grasp [mm]", 1),
+        **PEAKS,
+    }
+    criteria = PUT_LIMITS
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(rate, options)
+        self.skill = CarryAndPut(rate=self.rate)
+        self.robot = self.skill.robot
+
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
+        """Of the skill's generator."""
+        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
+        return [pool[number] for number in numbers]
+
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """Both hands seen from the bottle and the tray, and the joints.
+
+        With what is held, the bottle from the tray, and one hand from the other.
+        """
+        grasp, put = (_poses(HANDS, name, orientation) for name in self.objects)
+        if not held:
+            return [grasp, put, Canonical()]
+        left, right = HANDS
+        together = _poses((right,), left, orientation)
+        return [grasp, _poses(("bottle",), "tray", orientation), together, Canonical()]
+
+    def _start(self, motion: Demonstration) -> dict[str, Any]:
+        return {**super()._start(motion), "slide": slid(motion)}
+
+
+class SuiteBenchmark(_HandlingBenchmark):
+    """A task of the suite, demonstrated as people would, by sensors that are not perfect.
+
+    Parameters
+    ----------
+    name, robot : str
+        Of the task, and of who does it.
+    rate, options
+        As for :class:`Benchmark`.
+    """
+
+    env = "bimanual"
+    gym_id = "Bimanual-v0"
+    recording: ClassVar[Mapping[str, Any]] = {"noise": 0.5}
+    conditions: ClassVar = SUITE_CONDITIONS
+
+    def __init__(
+        self,
+        name: str,
+        robot: str,
+        rate: int | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.skill, self.robot_type = suite_task(name, robot), robot
+        super().__init__(rate, {"task": name, "robot": robot, **(options or {})})
+        self.robot, self.objects = self.skill.robot, self.skill.objects
+        self.task, self.criteria = self.skill.description, self.skill.limits
+        self.figures = {**self.skill.headings, **PEAKS}
+
+    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
+        """Of the task's expert."""
+        return self.skill.demonstrations(self.POOL + self.RESERVED, seed, self.rate, numbers)
+
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """As the task says."""
+        return self.skill.operators(orientation, held)
+
+
+def _poses(links: Sequence[str], frame: str, orientation: bool) -> Stack:
+    """Where links, or objects, are seen from a frame."""
+    kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+    return Stack(*(kind(link, frame) for link in links for kind in kinds))
+
+
+def _references(motion: Demonstration) -> torch.Tensor:
+    """The joints one step ahead."""
+    return torch.cat((motion.joints[1:], motion.joints[-1:]))
+
+
+class AlohaBenchmark(Benchmark):
+    """gym-aloha's cube transfer, demonstrated by a scripted expert."""
+
+    env = "aloha_state"
+    fixed: ClassVar = {"task": "transfer_cube"}
+    default_rate = 50
+    synchronous = True
+    n_components = 24
+    figures: Mapping[str, tuple[str, int]] = {
+        "max_reward": ("stage, 0 to 4", 0),
+        "lift_mm": ("lift [mm]", 0),
+    }
+    #: Between the first episodes of two seeds, which have none in common.
+    SPACING = 1_000
+    #: Added to the seed of the first validation episode; evaluation begins further on.
+    VALIDATION = 50_000
+
+    def __init__(
+        self, rate: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(rate, options)
+        self.robot = aloha_robot()
+
+    def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
+        """Both grippers seen from the objects, and the joints."""
+        return aloha_operators(self.options["task"], orientation)
+
+    def record(self, folder: Path, training: int, validation: int, seed: int) -> list[bool]:
+        """Let the expert solve the task, which it does or raises."""
+        for name, first, n in (
+            ("training", self.SPACING * seed, training),
+            ("validation", self.SPACING * seed + self.VALIDATION, validation),
+        ):
+            record_aloha(folder / name, n, seed=first, fps=self.rate, **self.options)
+        return [True] * training
+
+
+class AlohaInsertionBenchmark(AlohaBenchmark):
+    """gym-aloha's insertion of a peg into a socket."""
+
+    fixed: ClassVar = {"task": "insertion"}
+
+
+#: The tasks of the suite on other robots than the upper body: their benchmarks' names.
+OTHER_ROBOTS = {
+    robot: {f"{task}-{robot}": task for task in SUITE}
+    for robot in ROBOTS
+    if robot != UPPER_BODY
+}
+BENCHMARKS: dict[str, Callable[[int | None, Mapping[str, Any] | None], Benchmark]] = {
+    "bottle_shaking": BottleBenchmark,
+    "carry_and_put": CarryBenchmark,
+    **{name: partial(SuiteBenchmark, name, UPPER_BODY) for name in SUITE},
+    "aloha_state": AlohaBenchmark,
+    "aloha_insertion": AlohaInsertionBenchmark,
+    **{
+        name: partial(SuiteBenchmark, task, robot)
+        for robot, tasks in OTHER_ROBOTS.items()
+        for name, task in tasks.items()
+    },
+}
+
+
+def benchmark(
+    name: str, rate: int | None = None, options: Mapping[str, Any] | None = None
+) -> Benchmark:
+    """A benchmark by its name; ``rate`` and ``options`` as for :class:`Benchmark`."""
+    if name not in BENCHMARKS:
+        raise UnknownNameError("environment", name, "the comparison", BENCHMARKS)
+    return BENCHMARKS[name](rate, options)

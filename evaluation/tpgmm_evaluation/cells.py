@@ -1,0 +1,137 @@
+"""The grid of a comparison, and the files that remember what is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_env_bimanual.disturbances import NOMINAL
+from tpgmm_evaluation.variants import Variant
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["Cell", "Results", "write_json"]
+
+
+@dataclass(frozen=True, order=True)
+class Cell:
+    """One entry of the grid: a policy that is trained once and evaluated in one condition.
+
+    Parameters
+    ----------
+    env : str
+        Name of the benchmark.
+    policy : str
+        What is trained, and with which settings it is used, as :class:`Variant` reads it.
+    demonstrations : int
+        How many of the episodes it sees, the first ones.
+    seed : int
+        Of the training.
+    condition : str, default="nominal"
+        Disturbances of the evaluation, joined by ``+``.
+    """
+
+    env: str
+    policy: str
+    demonstrations: int
+    seed: int
+    condition: str = NOMINAL
+
+    @property
+    def training(self) -> str:
+        """Name of the trained policy, which cells of all conditions and settings share."""
+        return self._named(self.variant.base)
+
+    @property
+    def variant(self) -> Variant:
+        """The trained policy and its settings."""
+        return Variant.parse(self.policy)
+
+    @property
+    def key(self) -> str:
+        """Name of the cell."""
+        policy = re.sub(r"[^\w.+=:-]+", "_", self.policy.replace(" --policy.", "+"))
+        return f"{self._named(policy)}-{self.condition}"
+
+    def _named(self, policy: str) -> str:
+        return f"{self.env}-{policy}-n{self.demonstrations}-s{self.seed}"
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file in one step: it is there as a whole, or as it was."""
+    with replacing(path) as file:
+        file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+class Results:
+    """The finished cells in a folder, one file each."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, cell: Cell) -> Path:
+        """Where the result of a cell is."""
+        return self.folder / f"{cell.key}.json"
+
+    def write(self, cell: Cell, result: Mapping[str, Any]) -> None:
+        """Keep the result of a cell.
+
+        Parameters
+        ----------
+        result : mapping
+            What JSON can hold.
+        """
+        content = {"cell": asdict(cell), **result}
+        write_json(self.path(cell), {**content, "checksum": _checksum(content)})
+
+    def read(self, cell: Cell) -> dict[str, Any] | None:
+        """The result of a cell; None if there is none."""
+        path = self.path(cell)
+        if not path.exists():
+            return None
+        content = _read(path)
+        if content["cell"] != asdict(cell):
+            raise DataError(f"{path} holds another cell, {content['cell']}")
+        return content
+
+    def read_all(self, say: Callable[[str], None]) -> list[dict[str, Any]]:
+        """All results in the folder, in the order of their names.
+
+        Parameters
+        ----------
+        say : callable
+            Told of damaged files, which are left out.
+        """
+        results = []
+        for path in sorted(self.folder.glob("*.json"), key=_natural):
+            try:
+                results.append(_read(path))
+            except DataError as error:
+                say(f"{error}; it is left out")
+        return results
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        checksum = content.pop("checksum")
+        Cell(**content["cell"])
+    except (OSError, ValueError, AttributeError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not the result of a cell: {error!r}") from error
+    if checksum != _checksum(content):
+        raise DataError(f"{path} was changed after it was written, or damaged")
+    return dict(content)
+
+
+def _checksum(content: Mapping[str, Any]) -> str:
+    text = json.dumps(content, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _natural(path: Path) -> list[Any]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]

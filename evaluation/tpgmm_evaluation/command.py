@@ -1,0 +1,191 @@
+"""``tpgmm compare``: what a number of demonstrations buys with each policy."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False)
+
+EXAMPLES = """Examples:
+
+tpgmm compare --env suite --demonstrations 3,10 --policies quick --episodes 10 --workers 2
+--out out/compare (a quick look, as 'make compare')
+
+tpgmm compare --env all --demonstrations 3,10 --seeds 0,1,2 --episodes 100 --conditions all
+--budget 30 --workers 8 --out out/evidence (everything)
+
+tpgmm compare --demonstrations 10 --policies tpgmm --conditions all --out out/conditions
+(every condition, beside the open loop of 0.1.0, as 'make conditions')
+
+tpgmm compare --policies "tpgmm,tpgmm --policy.feedback=observation"
+--conditions pushes,stopped-3,moved+pose-noise --out out/disturbed
+
+tpgmm compare --env aloha_state,carry_and_put --demonstrations 25 --out out/two
+
+tpgmm compare --report-only --out out/two
+"""
+
+
+@app.command(epilog=EXAMPLES)
+def compare(
+    env: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), "
+            "aloha_insertion, ... (a wrong name lists them); suite: all of the upper body; "
+            "suite-viperx: its tasks on gym-aloha's arms (lid-viperx, ...), suite-g1: on a "
+            "Unitree G1; all.",
+        ),
+    ] = "bottle_shaking",
+    policies: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, "
+            "as in 0.1.0), tpgmm-even-clock, tpgmm-places (objects are where they were at "
+            "first), tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, "
+            "key-poses-posture, dmp, promp; act, act-large (LeRobot's sizes), diffusion, mlp, "
+            "knn, each also told the time, -phase; nearest, mean; all, of tpgmm with all parts "
+            "and without orientation, of act the small one; or "
+            "quick: of these, all that no gradient trains. A "
+            "tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the "
+            "open loop is always there.",
+        ),
+    ] = "all",
+    demonstrations: Annotated[
+        str, typer.Option(metavar="N,...", help="Numbers of demonstrations to learn from.")
+    ] = "5,10",
+    seeds: Annotated[
+        str,
+        typer.Option(
+            metavar="N,...", help="Of the training and of the demonstrations it learns from."
+        ),
+    ] = "0",
+    demonstration_seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="The same demonstrations for all seeds, as in 0.1.0 (there: 0); the intervals "
+            "then do not tell how much others would change.",
+        ),
+    ] = None,
+    conditions: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Of the evaluation: nominal, or disturbances of the environment joined by +: "
+            "pushes, noise, and what --env.condition takes (stopped-3, pushed-back, moved, "
+            "pose-lost, ...); or all.",
+        ),
+    ] = "nominal",
+    episodes: Annotated[
+        int, typer.Option(min=1, help="Evaluation episodes, the same for all.")
+    ] = 50,
+    budget: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            help="Minutes of one processor after which the training of a baseline ends even "
+            "if its validation error still falls.",
+        ),
+    ] = 6.0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes, of one thread each.")] = 1,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where everything goes, and is found again.")
+    ] = Path("out/compare"),
+    report_only: Annotated[
+        bool,
+        typer.Option(
+            "--report-only", help="Write the report again from what is in --out; run nothing."
+        ),
+    ] = False,
+) -> None:
+    """Compare TP-GMM with ACT, Diffusion Policy and a naive floor in simulation.
+
+    Every policy learns from the same episodes and is rolled out on the same seeds through
+    LeRobot's own rollout. ACT and Diffusion are LeRobot's, plain and informed of the time
+    ('-phase'), and trained until their error on held-out episodes has stopped falling.
+
+    The folder gets report.md, which begins with where TP-GMM loses, figures, results.parquet
+    with a row for each episode, and for each environment a folder with its episodes (LeRobot
+    data sets), trained policies (for lerobot-eval --policy.path), and a page of its own. What
+    is finished there is not run again, so a run that was stopped goes on, and a grid can grow.
+    """
+    from lerobot_env_bimanual.disturbances import NOMINAL
+    from tpgmm_evaluation import compare as module
+    from tpgmm_evaluation.settings import Settings
+    from tpgmm_evaluation.variants import OPEN_LOOP
+
+    if report_only:
+        typer.echo(module.rewrite_report(out, typer.echo))
+        return
+    settings = [
+        Settings(
+            name, episodes=episodes, budget=60 * budget, demonstration_seed=demonstration_seed
+        )
+        for name in _environments(env)
+    ]
+    chosen = _policies(policies)
+    tried = conditions.split(",")
+    if "tpgmm" in chosen and OPEN_LOOP not in chosen and tried != [NOMINAL]:
+        chosen.insert(chosen.index("tpgmm") + 1, OPEN_LOOP)
+    result = module.compare(
+        settings,
+        out,
+        chosen,
+        _numbers(demonstrations, "--demonstrations"),
+        _numbers(seeds, "--seeds"),
+        tried,
+        workers,
+        typer.echo,
+        shlex.join(["tpgmm", *sys.argv[1:]]),
+    )
+    if result.failures:
+        typer.echo(f"{len(result.failures)} cells failed", err=True)
+        raise typer.Exit(1)
+
+
+def _environments(text: str) -> list[str]:
+    """The names that are meant, each once."""
+    from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
+
+    groups = {f"suite-{robot}": list(tasks) for robot, tasks in OTHER_ROBOTS.items()}
+    others = {"aloha_state", "aloha_insertion"}.union(*groups.values())
+    groups["suite"] = [name for name in BENCHMARKS if name not in others]
+    groups["all"] = list(BENCHMARKS)
+    return _named(text, groups)
+
+
+def _policies(text: str) -> list[str]:
+    """The policies that are meant, each once."""
+    from tpgmm_evaluation.baselines import RECIPES
+    from tpgmm_evaluation.jobs import POLICIES
+    from tpgmm_evaluation.trainings import ABLATIONS
+
+    rare = {*ABLATIONS, "act-large", "act-large-phase"} - {"tpgmm-position-only"}
+    usual = [name for name in POLICIES if name not in rare]
+    groups = {"all": usual, "quick": [name for name in usual if name not in RECIPES]}
+    return _named(text, groups)
+
+
+def _named(text: str, groups: Mapping[str, Sequence[str]]) -> list[str]:
+    parts = (groups.get(part, [part]) for part in text.split(","))
+    return list(dict.fromkeys(name for names in parts for name in names))
+
+
+def _numbers(text: str, option: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise DataError(f"{option} takes numbers like 5,10,25, got {text!r}") from None

@@ -1,0 +1,110 @@
+"""ACT and Diffusion Policy of LeRobot on Meta-World, told what the perceptron is told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from numpy.typing import NDArray
+
+from lerobot_env_bimanual.metaworld.demonstrations import Recorded
+from lerobot_env_bimanual.metaworld.hand import FPS, JOINTS
+from tpgmm_evaluation.baselines import RECIPES, Recipe, Training, train
+from tpgmm_evaluation.metaworld.perceptron import features
+from tpgmm_evaluation.policies.episodes import Episodes, policy_stride
+
+__all__ = ["NETWORKS", "Network"]
+
+Rows = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Network:
+    """A policy of LeRobot that gradient descent trains until it stops improving.
+
+    Parameters
+    ----------
+    name : str
+        On the command line.
+    recipe : Recipe
+        How it is built and trained.
+    control : {"reference", "displacement"}
+        Its actions: where the hand's target shall be, or Meta-World's own.
+    budget : float
+        Seconds of the processor after which training ends in any case.
+    """
+
+    name: str
+    recipe: Recipe
+    control: str = "displacement"
+    budget: float = 600.0
+
+    def fit(
+        self, episodes: Sequence[Recorded], seed: int, validation: Sequence[Recorded]
+    ) -> NetworkActor:
+        """Learn from episodes; ``seed`` is that of weights, batches and noise.
+
+        Parameters
+        ----------
+        validation : sequence of Recorded
+            Episodes that nothing is learned from: training ends when the error on them stops
+            falling, and the weights with the least are kept.
+        """
+        training, held_out = (self._rows(some) for some in (episodes, validation))
+        result = train(self.recipe, training, held_out, seed=seed, budget=self.budget)
+        return NetworkActor(self, result)
+
+    def observation(self, observed: Rows) -> tuple[torch.Tensor, torch.Tensor]:
+        """State (T, 4) and environment state (T, n) of observations (T, 25)."""
+        rows = torch.from_numpy(features(observed, relative=True)).float()
+        return rows[:, : len(JOINTS)], rows[:, len(JOINTS) :]
+
+    def _rows(self, episodes: Sequence[Recorded]) -> Episodes:
+        parts = []
+        for one in episodes:
+            actions = one.references if self.control == "reference" else one.actions
+            parts.append((*self.observation(one.observed), torch.from_numpy(actions)))
+        return Episodes.join(FPS, parts)
+
+
+class NetworkActor:
+    """A trained :class:`Network`; an action holds until the policy's next step."""
+
+    def __init__(self, settings: Network, training: Training) -> None:
+        self.settings, self.training = settings, training
+        self.control, self.outcome = settings.control, training.outcome
+        self._stride = policy_stride(FPS, training.fps)
+        self._action: Rows = np.empty(0)
+
+    def begin(self, first: Rows) -> None:
+        """Nothing: it looks at the present."""
+
+    @torch.inference_mode()
+    def act(self, episode: int, step: int, observed: Rows) -> Rows:
+        """The next action."""
+        policy, (before, after) = self.training.policy, self.training.processors
+        if step == 0:
+            policy.reset()
+        if step % self._stride == 0:
+            state, environment = self.settings.observation(observed[None])
+            seen = before({OBS_STATE: state, OBS_ENV_STATE: environment})
+            self._action = after(policy.select_action(seen))[0].numpy()
+        return self._action
+
+
+def _recipe(kind: str, check_every: int, **options: Any) -> Recipe:
+    """That of the other benchmarks, at Meta-World's rate and smaller."""
+    recipe = RECIPES[kind]
+    options = {**recipe.options, **options}
+    return replace(recipe, options=options, rate=FPS, check_every=check_every)
+
+
+#: Chosen on tasks of the half that is for tuning.
+NETWORKS = (
+    Network("act", _recipe("act", 100, dim_model=64, dim_feedforward=256)),
+    Network("diffusion", _recipe("diffusion", 200, down_dims=(32, 64))),
+)

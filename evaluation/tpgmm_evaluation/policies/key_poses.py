@@ -1,0 +1,391 @@
+"""Key poses: where hands are at the instants of a skill that matter, seen from what matters.
+
+A skill is cut where the robot comes to rest or turns back. At the end of each of these moves,
+and where the demonstrations go another way than the interpolation, each link
+has a key pose: the mean of the demonstrations, in the frame in which it differs least.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.interpolate import make_interp_spline
+from torch import Tensor
+
+from tpgmm_evaluation.policies.aligned import Aligned
+from tpgmm_torch import Demonstration, Frame, Hold, find_holds, quaternions
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.events.boundaries import LEVER, find_gripper_changes, find_stops
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
+
+__all__ = ["KeyPose", "Move", "find_moves", "minimum_jerk_path"]
+
+#: A move has begun, or ended, up to this share of its path; minimum-jerk motions are there
+#: after this share of their time.
+STILL, EDGE = 0.01, 0.1057
+#: Shorter moves than this are none [s].
+SHORTEST = 0.1
+#: A link is rigid with what is held if it moves in it by no more than this [m].
+RIGID = 0.01
+#: The most key poses on the way of one move.
+MOST = 12
+#: Frames that are none of the objects: the robot's base; where an object was at first.
+BASE, FIRST = "base", "@start"
+
+
+@dataclass(frozen=True)
+class KeyPose:
+    """Where a link should be at one instant.
+
+    Parameters
+    ----------
+    link : str
+    frame : str
+        ``"base"``, an object, or ``"OBJECT@start"``: where it was at first.
+    pose : tuple of float
+        x y z and w x y z, in the frame.
+    held : str, optional
+        The object that is meant to have the pose, with the link rigidly at it.
+    """
+
+    link: str
+    frame: str
+    pose: tuple[float, ...]
+    held: str | None = None
+
+    def target(self, frames: Mapping[str, Frame], link: Frame) -> Frame:
+        """The link's pose in the base frame, now.
+
+        Parameters
+        ----------
+        frames : mapping of str to Frame
+            Where the frames are seen.
+        link : Frame
+            Where the link is.
+        """
+        values = torch.tensor(self.pose, dtype=torch.float64)
+        wanted = frames[self.frame].compose(Frame(values[:3], values[3:]))
+        if self.held is None:
+            return wanted
+        return wanted.compose(link.seen_from(frames[self.held]))
+
+
+@dataclass(frozen=True)
+class Move:
+    """A part of the skill from one rest to the next.
+
+    Parameters
+    ----------
+    look, begin, arrive, end : int
+        The steps at which objects are looked at, at which the motion begins, at which it is
+        over, and at which the next one begins.
+    steps : tuple of int
+        After ``begin``, those of the key poses; the last is ``arrive``.
+    poses : tuple of tuple of KeyPose
+        At each of these, of each link.
+    """
+
+    look: int
+    begin: int
+    arrive: int
+    end: int
+    steps: tuple[int, ...]
+    poses: tuple[tuple[KeyPose, ...], ...]
+
+    def config(self) -> dict[str, Any]:
+        """Ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Move:
+        """The move that gave this :meth:`config`."""
+        poses = tuple(
+            tuple(KeyPose(**{**pose, "pose": tuple(pose["pose"])}) for pose in at)
+            for at in config["poses"]
+        )
+        return cls(**{**config, "steps": tuple(config["steps"]), "poses": poses})
+
+    def targets(
+        self,
+        links: Mapping[str, Frame],
+        frames: Mapping[str, Frame],
+        first: Mapping[str, Frame],
+    ) -> dict[str, list[Frame]]:
+        """Of each link, its poses in the base frame at ``steps``.
+
+        Parameters
+        ----------
+        links : mapping of str to Frame
+            Where the links are as the objects are seen.
+        frames, first : mapping of str to Frame
+            Where the objects are, and were at first.
+        """
+        known = {BASE: Frame(torch.zeros(3, dtype=torch.float64)), **frames}
+        known |= {f"{name}{FIRST}": pose for name, pose in first.items()}
+        every: dict[str, list[Frame]] = {link: [] for link in links}
+        for at in self.poses:
+            for key in at:
+                every[key.link].append(key.target(known, links[key.link]))
+        return every
+
+
+def minimum_jerk_path(
+    start: Frame, poses: Sequence[Frame], steps: Sequence[int], at: Array
+) -> Frame:
+    """The smoothest path through poses, at rest at both ends.
+
+    Parameters
+    ----------
+    start : Frame
+        At step 0.
+    poses : sequence of Frame
+        The others.
+    steps : sequence of int
+        When they are reached, increasing.
+    at : ndarray of shape (n,)
+        The steps at which the path is wanted.
+
+    Returns
+    -------
+    Frame
+        Of shape (n,). Positions are the quintic spline that minimises the integral of the
+        squared jerk; so are rotation vectors from the first orientation.
+    """
+    knots = np.array([0, *steps], dtype=np.float64)
+    positions = as_array(torch.stack([start.position, *(pose.position for pose in poses)]))
+    back = quaternions.conjugate(start.orientation)
+    turns = torch.stack([quaternions.product(pose.orientation, back) for pose in poses])
+    vectors = np.vstack((np.zeros(3), as_array(_unwound(quaternions.log(turns)))))
+    still = [(1, np.zeros(6)), (2, np.zeros(6))]
+    columns = np.hstack((positions, vectors))
+    spline = make_interp_spline(knots, columns, k=5, bc_type=(still, still))
+    values = torch.from_numpy(spline(np.clip(at, 0, knots[-1])))
+    turned = quaternions.product(quaternions.exp(values[:, 3:]), start.orientation)
+    return Frame(values[:, :3], turned)
+
+
+def _unwound(vectors: Tensor) -> Tensor:
+    """Rotation vectors, each by the whole turns that bring it nearest to the one before."""
+    every = [vectors[0]]
+    for vector in vectors[1:]:
+        angle = float(vector.norm())
+        if angle > 1e-9:
+            axis = vector / angle
+            turns = torch.round((every[-1] @ axis - angle) / (2 * torch.pi))
+            vector = vector + 2 * torch.pi * turns * axis
+        every.append(vector)
+    return torch.stack(every)
+
+
+def find_moves(aligned: Aligned, tolerance: float | None = 0.005) -> list[Move]:
+    """The moves of a skill, with the key poses of all links.
+
+    Parameters
+    ----------
+    aligned : Aligned
+        Demonstrations, of a :class:`~tpgmm_torch.Robot`. With one alone, the nearest frame
+        counts, and the robot's base only where there are no objects.
+    tolerance : float, optional
+        How far links may be from their path, in the mean of the demonstrations, before there
+        is one more key pose on the way [m]; a radian counts as 0.2 m. None sets none.
+
+    Raises
+    ------
+    DataError
+        If the kinematics are no Robot with links, which inverse kinematics needs, or nothing
+        moves.
+    """
+    if not isinstance(aligned.robot, Robot) or not aligned.robot.links:
+        raise DataError(
+            "key poses need the links of a tpgmm_torch.Robot, made from a URDF or an MJCF, "
+            f"got {aligned.robot!r}"
+        )
+    moves = list(_Shown(aligned).moves(tolerance))
+    if not moves:
+        raise DataError("the mean of the demonstrations does not move: it has no key poses")
+    return moves
+
+
+class _Shown:
+    """Links and frames in all demonstrations, at all steps."""
+
+    def __init__(self, aligned: Aligned) -> None:
+        self.fps, self.n = aligned.fps, len(aligned.demonstrations)
+        self.mean = _mean(aligned)
+        self.robot: Kinematics = aligned.robot
+        demonstrations = aligned.demonstrations
+        length = len(self.mean)
+        states = [self.robot.state(d.joints) for d in demonstrations]
+        self.links = {
+            link: _stacked([Frame(s.position(link), s.orientation(link)) for s in states])
+            for link in self.robot.links
+        }
+        objects = {
+            name: _stacked([_at_all(d.frame(name), length) for d in demonstrations])
+            for name in demonstrations[0].frames
+        }
+        self.objects = tuple(objects)
+        base = Frame(torch.zeros(3, dtype=torch.float64)).expand((self.n, length))
+        self.frames = {BASE: base, **objects}
+        for name, pose in objects.items():
+            self.frames[f"{name}{FIRST}"] = pose[:, :1].expand((self.n, length))
+        self.holds: tuple[Hold, ...] = find_holds(demonstrations, self.robot)
+
+    def moves(self, tolerance: float | None) -> Iterator[Move]:
+        spans = list(self._spans())
+        ends = [begin for begin, _ in spans[1:]] + [len(self.mean)]
+        for number, ((begin, arrive), end) in enumerate(zip(spans, ends, strict=True)):
+            steps = self._steps(begin, arrive, tolerance)
+            poses = tuple(self._poses(begin, step) for step in steps)
+            yield Move(begin if number else 0, begin, arrive, end, steps, poses)
+
+    def _spans(self) -> Iterator[tuple[int, int]]:
+        """From when to when the mean motion moves, between rests."""
+        rests = [0.0, *(stop.time for stop in find_stops(self.mean, self.robot, dwell=0.0))]
+        rests.append(float(self.mean.time[-1]))
+        path = self._path()
+        time = as_array(self.mean.time)
+        for before, after in pairwise(rests):
+            low, high = np.searchsorted(time, (before, after))
+            part, seconds = path[low : high + 1], time[low : high + 1]
+            if len(part) < 3 or part[-1] == part[0]:
+                continue
+            shares = (part - part[0]) / (part[-1] - part[0])
+            first, last = np.interp((STILL, 1 - STILL), shares, seconds)
+            margin = EDGE / (1 - 2 * EDGE) * (last - first)
+            begin, arrive = max(before, first - margin), min(after, last + margin)
+            if arrive - begin >= SHORTEST:
+                yield round(begin * self.fps), round(arrive * self.fps)
+
+    def _path(self) -> Array:
+        """The way of all links of the mean motion together up to each step [m]."""
+        state = self.robot.state(self.mean.joints)
+        columns = []
+        for link in self.robot.links:
+            turn = quaternions.continuous(state.orientation(link))
+            columns += [as_array(state.position(link)), 2 * LEVER * as_array(turn)]
+        moved = np.linalg.norm(np.diff(np.concatenate(columns, axis=1), axis=0), axis=1)
+        # noise must not walk
+        return np.concatenate(([0.0], np.cumsum(moved + 1e-12)))
+
+    def _steps(self, begin: int, arrive: int, tolerance: float | None) -> tuple[int, ...]:
+        """Where key poses are: at the end, at events, and where the way is another."""
+        events = [at for name, at in self.mean.events.items()]
+        events += [change.time for change in find_gripper_changes(self.mean)]
+        margin = round(SHORTEST * self.fps)
+        steps = {round(at * self.fps) for at in events}
+        steps = {s for s in steps if begin + margin < s < arrive - margin} | {arrive}
+        while tolerance is not None and len(steps) <= MOST:
+            ways = self._deviation(begin, sorted(steps))
+            allowed = np.ones(len(ways), dtype=bool)
+            for step in (begin, *steps):
+                low = max(0, step - begin - margin)
+                allowed[low : max(0, step - begin + margin + 1)] = False
+            worst = int(np.where(allowed, ways, 0.0).argmax())
+            if not allowed[worst] or ways[worst] <= tolerance:
+                break
+            steps.add(begin + worst)
+        return tuple(sorted(steps))
+
+    def _deviation(self, begin: int, steps: Sequence[int]) -> Array:
+        """How far demonstrations are from paths through their own poses, in the mean.
+
+        Of the links, the one that is farthest.
+        """
+        rows = np.arange(steps[-1] - begin + 1, dtype=np.float64)
+        ways = []
+        for shown in self.links.values():
+            apart: Array = np.zeros(len(rows))
+            for i in range(self.n):
+                poses = [shown[i, step] for step in steps]
+                path = minimum_jerk_path(
+                    shown[i, begin], poses, [step - begin for step in steps], rows
+                )
+                apart += as_array(_apart(path, shown[i, begin : steps[-1] + 1])) / self.n
+            ways.append(apart)
+        return np.max(ways, axis=0)
+
+    def _poses(self, begin: int, step: int) -> tuple[KeyPose, ...]:
+        """Of each link, in the frame in which it differs least."""
+        every = []
+        for link, shown in self.links.items():
+            held = self._held(shown, begin, step)
+            candidates: list[tuple[float, KeyPose]] = []
+            for name, frame in self.frames.items():
+                if name not in held:  # the hand stays with what it holds: no news
+                    candidates.append(self._candidate(link, shown, name, frame, begin, step))
+                for thing in held:
+                    if name != thing:
+                        pose = self.frames[thing]
+                        candidates.append(
+                            self._candidate(link, pose, name, frame, begin, step, thing)
+                        )
+            every.append(min(candidates, key=lambda pair: pair[0])[1])
+        return tuple(every)
+
+    def _held(self, shown: Frame, begin: int, step: int) -> list[str]:
+        """Which objects a link, and what else, carries from the beginning to a step."""
+        times = [at / self.fps for at in (begin, step)]
+        held = []
+        for hold in self.holds:
+            if hold.begin <= times[0] and times[1] <= hold.end:
+                inner = shown.seen_from(self.frames[hold.frame])[:, begin : step + 1]
+                moved = (inner.position - inner.position[:, :1]).norm(dim=-1)
+                if float(moved.max(dim=1).values.median()) < RIGID:
+                    held.append(hold.frame)
+        return held
+
+    def _candidate(
+        self,
+        link: str,
+        shown: Frame,
+        name: str,
+        frame: Frame,
+        begin: int,
+        step: int,
+        held: str | None = None,
+    ) -> tuple[float, KeyPose]:
+        """How much a pose differs in a frame that is seen at the beginning, and its mean."""
+        inner = shown[:, step].seen_from(frame[:, begin])
+        mean = Frame(inner.position.mean(0), quaternions.mean(inner.orientation))
+        spread = float(_apart(inner, mean.expand((self.n,))).square().mean())
+        if self.n == 1:  # no spread: what is near counts, the base where nothing else is
+            spread = float(inner.position.square().sum()) + (1e6 if name == BASE else 0.0)
+        values = (*mean.position.tolist(), *mean.orientation.tolist())
+        return spread, KeyPose(link, name, values, held)
+
+
+def _apart(one: Frame, other: Frame) -> Tensor:
+    """How far poses are from one another, turns included [m]."""
+    turn = quaternions.product(quaternions.conjugate(one.orientation), other.orientation)
+    angle = quaternions.log(turn).norm(dim=-1)
+    return ((one.position - other.position).square().sum(-1) + (LEVER * angle).square()).sqrt()
+
+
+def _at_all(frame: Frame, length: int) -> Frame:
+    return frame if frame.batch_shape else frame.expand((length,))
+
+
+def _stacked(frames: Sequence[Frame]) -> Frame:
+    """Of (T,) each, (N, T)."""
+    return Frame(
+        torch.stack([frame.position for frame in frames]),
+        torch.stack([frame.orientation for frame in frames]),
+    )
+
+
+def _mean(aligned: Aligned) -> Demonstration:
+    """The mean motion, with the mean of events that all have."""
+    every = aligned.demonstrations
+    shared = set(every[0].events).intersection(*(d.events for d in every))
+    events = {name: float(np.mean([d.events[name] for d in every])) for name in shared}
+    return Demonstration(
+        every[0].time, aligned.mean, joint_names=aligned.robot.joint_names, events=events
+    )

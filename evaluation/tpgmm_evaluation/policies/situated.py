@@ -1,0 +1,254 @@
+"""Key poses reached by inverse kinematics, and movement primitives led by them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from tpgmm_evaluation.policies.aligned import Aligned
+from tpgmm_evaluation.policies.key_poses import (
+    Move,
+    find_moves,
+    minimum_jerk_path,
+)
+from tpgmm_evaluation.policies.planned import SituatedConfig, SituatedPolicy
+from tpgmm_torch import Frame
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.motion.inverse_kinematics import follow_poses
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.robots.robot import Robot
+
+__all__ = [
+    "KeyPosesConfig",
+    "KeyPosesPolicy",
+    "MeanConfig",
+    "MeanPolicy",
+    "MovesConfig",
+    "MovesPolicy",
+]
+
+#: For how long the present posture fades into the mean motion [s].
+FADE = 1.0
+#: Poses per second for which inverse kinematics are solved; between them lies a cubic spline.
+SOLVED = 25
+
+
+def faded(start: Tensor, mean: Tensor, usual: Tensor, fps: int) -> Tensor:
+    """A mean motion (T, n_joints) from where the robot is, ``start`` instead of ``usual``."""
+    done = minimum_jerk(torch.arange(len(mean), dtype=torch.float64) / (FADE * fps))
+    return mean + (1 - done)[:, None] * (start - usual)
+
+
+@PreTrainedConfig.register_subclass("mean_demonstration")
+@dataclass
+class MeanConfig(SituatedConfig):
+    """Configuration of :class:`MeanPolicy`."""
+
+
+class MeanPolicy(SituatedPolicy):
+    """Replays the mean of the aligned demonstrations, from the present posture."""
+
+    config_class = MeanConfig
+    name = "mean_demonstration"
+
+    @classmethod
+    def fit(cls, aligned: Aligned, **options: Any) -> Self:
+        """Keep the mean."""
+        policy = cls(MeanConfig.of(aligned, **options))
+        policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
+        return policy.eval()
+
+    def references(
+        self,
+        joints: Tensor,
+        measured: Tensor,
+        frames: dict[str, Frame],
+        first: dict[str, Frame],
+        step: int,
+    ) -> Tensor:
+        """The mean, into which the present posture fades within a second."""
+        return faded(joints, self.mean, self.start, self.config.fps)
+
+
+@dataclass
+class MovesConfig(SituatedConfig):
+    """What policies share that go from key pose to key pose.
+
+    Parameters
+    ----------
+    moves : list of dict
+        Each a :class:`Move`.
+    tolerance : float, optional
+        With which they are found, as :func:`find_moves` takes it.
+    """
+
+    moves: list[dict[str, Any]] = field(default_factory=list)
+    tolerance: float | None = 0.005
+
+
+class MovesPolicy(SituatedPolicy):
+    """Looks at the beginning of each move for where its key poses are.
+
+    Parameters
+    ----------
+    config : MovesConfig
+    **unused
+        What else LeRobot passes.
+    """
+
+    config_class = MovesConfig
+    config: MovesConfig
+    name = "moves"
+    robot: Robot
+
+    def __init__(self, config: MovesConfig, **unused: Any) -> None:
+        super().__init__(config)
+        self.moves = [Move.from_config(move) for move in config.moves]
+
+    @classmethod
+    def fit(cls, aligned: Aligned, **options: Any) -> Self:
+        """Find the moves and learn them.
+
+        Parameters
+        ----------
+        aligned : Aligned
+            Demonstrations of a :class:`~tpgmm_torch.Robot`.
+        **options
+            Of the configuration.
+
+        Raises
+        ------
+        DataError
+            As :func:`find_moves`.
+        """
+        config = cls.config_class.of(aligned, **options)
+        moves = find_moves(aligned, config.tolerance)
+        policy = cls(replace(config, moves=[move.config() for move in moves]))
+        policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
+        policy.learn(aligned)
+        return policy.eval()
+
+    def recipe(self) -> dict[str, Any]:
+        """What was chosen, and what was found in the demonstrations."""
+        usual = {part.name for part in fields(SituatedConfig)} | {"moves"}
+        chosen = [part.name for part in fields(self.config) if part.name not in usual]
+        frames = [
+            {pose.link: f"{pose.held} in {pose.frame}" if pose.held else pose.frame}
+            for move in self.moves
+            for at in move.poses
+            for pose in at
+        ]
+        return {**{name: getattr(self.config, name) for name in chosen}, "key_poses": frames}
+
+    def learn(self, aligned: Aligned) -> None:
+        """Learn what is more than moves and the mean: nothing."""
+
+    @property
+    def looks(self) -> tuple[int, ...]:
+        """Where moves begin."""
+        return tuple(move.look for move in self.moves)
+
+    def move_at(self, look: int) -> Move:
+        """The move that is planned at a step."""
+        return next(move for move in self.moves if move.look == look)
+
+    @property
+    def free(self) -> list[int]:
+        """The coordinates that move no link, like a gripper."""
+        moved = {frame.joint for frame in self.robot.tree.frames}
+        return [i for i in range(self.robot.n_joints) if i not in moved]
+
+    def targets(
+        self,
+        move: Move,
+        measured: Tensor,
+        frames: Mapping[str, Frame],
+        first: Mapping[str, Frame],
+    ) -> dict[str, list[Frame]]:
+        """Of each link, its key poses of a move in the base frame, by what is seen now."""
+        return move.targets(self.poses(measured), frames, first)
+
+    def poses(self, joints: Tensor) -> dict[str, Frame]:
+        """Where the links are."""
+        state = self.robot.state(joints)
+        return {n: Frame(state.position(n), state.orientation(n)) for n in self.robot.links}
+
+    def posture_at(self, step: int, targets: Mapping[str, Frame]) -> Tensor:
+        """The posture nearest to the mean one at a step in which links have poses."""
+        near = self.mean[step].clamp(self.robot.lower, self.robot.upper)
+        here, rows = self.poses(near), np.arange(SOLVED + 10, dtype=np.float64)
+        paths = {
+            link: minimum_jerk_path(here[link], [pose], [SOLVED], rows)
+            for link, pose in targets.items()
+        }
+        return follow_poses(
+            self.robot, paths, near, rate=SOLVED, posture=near, tolerance=math.inf
+        )[-1]
+
+
+@PreTrainedConfig.register_subclass("key_poses")
+@dataclass
+class KeyPosesConfig(MovesConfig):
+    """Configuration of :class:`KeyPosesPolicy`.
+
+    Parameters
+    ----------
+    posture : bool, default=False
+        Whether the demonstrated posture is sought in the null space; otherwise it is the one
+        in which the move begins.
+    """
+
+    posture: bool = False
+
+
+class KeyPosesPolicy(MovesPolicy):
+    """Goes from key pose to key pose along minimum-jerk paths, by inverse kinematics of mink.
+
+    What the field would try first: the poses of the hands, seen from the objects, at the
+    instants that matter. Coordinates without kinematics, like a gripper, do as in the mean.
+    """
+
+    config_class = KeyPosesConfig
+    config: KeyPosesConfig
+    name = "key_poses"
+
+    def references(
+        self,
+        joints: Tensor,
+        measured: Tensor,
+        frames: dict[str, Frame],
+        first: dict[str, Frame],
+        step: int,
+    ) -> Tensor:
+        """The move that begins now, and what is left of it until the next."""
+        move = self.move_at(step)
+        fps, length = self.config.fps, move.arrive - move.begin
+        start = joints.clamp(self.robot.lower, self.robot.upper)
+        count = max(2, round(length * SOLVED / fps) + 1)
+        rows: Array = np.linspace(0, length, count).astype(np.float64)
+        here = self.poses(start)
+        steps = [at - move.begin for at in move.steps]
+        paths = {
+            link: minimum_jerk_path(here[link], poses, steps, rows)
+            for link, poses in self.targets(move, measured, frames, first).items()
+        }
+        wanted = faded(joints, self.mean[move.begin :], self.mean[move.begin], fps)
+        posture = wanted[np.round(rows).astype(int)] if self.config.posture else start
+        rate = (len(rows) - 1) / length * fps
+        # what it misses shows in its episodes
+        solved = follow_poses(
+            self.robot, paths, start, rate=rate, posture=posture, tolerance=math.inf
+        )
+        spline = CubicSpline(rows, as_array(solved), bc_type="clamped")
+        after = np.arange(step, move.end) - move.begin
+        references = torch.from_numpy(spline(after.clip(0, length)))
+        references[:, self.free] = wanted[after.clip(0)][:, self.free]
+        return references

@@ -1,0 +1,182 @@
+"""How each policy of the comparison is trained on the first episodes of a set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from lerobot.processor import make_default_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
+
+from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tpgmm_datasets import describe_lerobot, load_lerobot
+from tpgmm_evaluation.baselines import RECIPES, Training, train
+from tpgmm_evaluation.benchmarks import Benchmark
+from tpgmm_evaluation.cells import Cell
+from tpgmm_evaluation.policies.aligned import Aligned
+from tpgmm_evaluation.policies.elapsed_time import tell_time
+from tpgmm_evaluation.policies.episodes import Episodes
+from tpgmm_evaluation.policies.neighbours import NeighboursPolicy
+from tpgmm_evaluation.policies.planned import SituatedPolicy
+from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
+from tpgmm_evaluation.policies.replay import NearestPolicy
+from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
+from tpgmm_evaluation.settings import Settings
+from tpgmm_torch import Canonical, Demonstration, Operator, TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping
+
+__all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
+
+#: TP-GMM with one of its parts removed, or with its operators chosen by itself.
+ABLATIONS = ("tpgmm-places", "tpgmm-position-only", "tpgmm-no-joints", "tpgmm-auto")
+#: How nearest-neighbour regression is set; chosen as all recipes, on other seeds.
+NEIGHBOURS: dict[str, Any] = {
+    "n_neighbours": 3,
+    "relative": False,
+    "environment_weight": 3.0,
+    "n_action_steps": 8,
+}
+NEIGHBOURS_RATE, TIME_WEIGHT = 10, 30.0
+
+
+def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    """Align the first episodes and learn their references."""
+    benchmark = settings.benchmark()
+    demonstrations = load_lerobot(
+        episodes / "training",
+        robot=benchmark.robot,
+        joints="action",
+        episodes=range(cell.demonstrations),
+    )
+    base = cell.variant.base
+    if base == "tpgmm-places":
+        demonstrations = [_at_first(demonstration) for demonstration in demonstrations]
+    if not benchmark.synchronous:
+        warping = DynamicTimeWarping(robot=benchmark.robot)
+        demonstrations = warping.fit_transform(demonstrations)
+    model = TaskParameterizedGMM(
+        settings.n_components or benchmark.n_components,
+        operators_of(base, benchmark),
+        benchmark.robot,
+        random_state=cell.seed,
+    )
+    policy = TPGMMPolicy.from_estimator(
+        model.fit(demonstrations),
+        fps=benchmark.rate,
+        environment_names=_environment_names(episodes / "training"),
+    )
+    recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
+    processors = make_tpgmm_pre_post_processors(policy.config)
+    outcome = "learned by expectation-maximisation"
+    return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)
+
+
+def operators_of(base: str, benchmark: Benchmark) -> list[Operator] | str:
+    """What TP-GMM is told to learn in, when one of its parts is removed.
+
+    Parameters
+    ----------
+    base : str
+        ``"tpgmm"`` or an ablation.
+    benchmark : Benchmark
+    """
+    if base == "tpgmm-auto":
+        return "auto"
+    operators = benchmark.operators(
+        orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
+    )
+    if base != "tpgmm-no-joints":
+        return operators
+    # a gripper moves no link: nothing but its own coordinate can tell of it
+    robot = benchmark.robot
+    moved = robot.state(robot.lower.clamp(-1, 1)).jacobians.abs().sum((0, 1)) > 0
+    free = [name for name, moves in zip(robot.joint_names, moved, strict=True) if not moves]
+    rest: list[Operator] = [one for one in operators if not isinstance(one, Canonical)]
+    return [*rest, Canonical(joints=tuple(free))] if free else rest
+
+
+def _environment_names(path: Path) -> list[str]:
+    """Which entry of the observation is what: operators may name objects in another order."""
+    columns = {column.key: column.names for column in describe_lerobot(path).columns}
+    return list(columns[OBS_ENV_STATE] or ())
+
+
+def _at_first(demonstration: Demonstration) -> Demonstration:
+    """With all objects where they were at the beginning."""
+    frames = {
+        name: frame[0] if frame.batch_shape else frame
+        for name, frame in demonstration.frames.items()
+    }
+    return replace(demonstration, frames=frames)
+
+
+def _baseline(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    training = Episodes.read(episodes / "training").first(cell.demonstrations)
+    validation = Episodes.read(episodes / "validation")
+    recipe = RECIPES[cell.variant.base]
+    if recipe.phase and not settings.benchmark().synchronous:
+        training, validation = training.on_common_clock(validation)
+    return train(recipe, training, validation, seed=cell.seed, budget=settings.budget)
+
+
+def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
+    kept = Episodes.read(episodes / "training").first(cell.demonstrations)
+    policy = NearestPolicy.fit(kept)
+    processors = make_default_pre_post_processors(policy.config)
+    return Training(policy, processors, kept.fps, outcome="kept as they are")
+
+
+def _neighbours(episodes: Path, settings: Settings, cell: Cell, timed: bool) -> Training:
+    """Keep all states; with the time, of episodes on a common clock."""
+    kept = Episodes.read(episodes / "training").first(cell.demonstrations)
+    options, told = dict(NEIGHBOURS), 0
+    if timed:
+        if not settings.benchmark().synchronous:
+            [kept] = kept.on_common_clock()
+        before, kept = kept, kept.with_time()
+        told = kept.columns[OBS_ENV_STATE].shape[1] - before.columns[OBS_ENV_STATE].shape[1]
+        options["time_weight"] = TIME_WEIGHT
+    policy = NeighboursPolicy.fit(kept, NEIGHBOURS_RATE, told, **options)
+    processors = make_default_pre_post_processors(policy.config)
+    if timed:
+        tell_time(processors[0], NEIGHBOURS_RATE)
+    recipe = {"rate": NEIGHBOURS_RATE, "phase": timed, **options}
+    return Training(policy, processors, NEIGHBOURS_RATE, recipe, outcome="kept as they are")
+
+
+def _situated(
+    episodes: Path,
+    settings: Settings,
+    cell: Cell,
+    kind: type[SituatedPolicy],
+    **options: Any,
+) -> Training:
+    """Fit what plans in joints to the aligned references."""
+    benchmark = settings.benchmark()
+    aligned = Aligned.read(
+        episodes / "training", benchmark.robot, cell.demonstrations, benchmark.synchronous
+    )
+    policy = kind.fit(aligned, **options)
+    processors = make_default_pre_post_processors(policy.config)
+    recipe = {"policy": kind.name, **policy.recipe()}
+    return Training(policy, processors, aligned.fps, recipe, outcome="fitted at once")
+
+
+#: In the order of the report.
+TRAININGS: dict[str, Callable[[Path, Settings, Cell], Training]] = {
+    "tpgmm": _tpgmm,
+    **dict.fromkeys(ABLATIONS, _tpgmm),
+    "key-poses": partial(_situated, kind=KeyPosesPolicy),
+    "key-poses-posture": partial(_situated, kind=KeyPosesPolicy, posture=True),
+    "dmp": partial(_situated, kind=DMPPolicy),
+    "promp": partial(_situated, kind=ProMPPolicy),
+    **dict.fromkeys(RECIPES, _baseline),
+    "knn": partial(_neighbours, timed=False),
+    "knn-phase": partial(_neighbours, timed=True),
+    "nearest": _nearest,
+    "mean": partial(_situated, kind=MeanPolicy),
+}

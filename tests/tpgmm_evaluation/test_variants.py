@@ -1,0 +1,45 @@
+"""Policies with settings, as text."""
+
+import pytest
+
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from tests.support.policies import fitted
+from tpgmm_evaluation.rollouts import Runner
+from tpgmm_evaluation.variants import OPEN_LOOP, Variant
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+
+def test_a_name_alone_has_no_settings():
+    assert Variant.parse("act") == Variant("act")
+    assert Variant.parse("tpgmm").arguments == []
+
+
+def test_settings_follow_the_name():
+    variant = Variant.parse("tpgmm --policy.feedback=observation --policy.blend=0.5")
+    assert variant == Variant("tpgmm", ("feedback=observation", "blend=0.5"))
+    assert variant.arguments == ["--feedback=observation", "--blend=0.5"]
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("tpgmm feedback=observation", DataError, "look like --policy.feedback=observation"),
+        ("tpgmm --policy.blend", DataError, "got '--policy.blend'"),
+        ("act --policy.blend=1", DataError, "only tpgmm policies take settings"),
+        ("tpgmm --policy.rain=1", UnknownNameError, "field 'rain' is not in the policy"),
+    ],
+)
+def test_what_is_no_setting_is_refused(text, error, message):
+    with pytest.raises(error, match=message):
+        Variant.parse(text)
+
+
+def test_the_open_loop_plays_by_the_clock_and_looks_once(tmp_path):
+    for part in (fitted(), *make_tpgmm_pre_post_processors(fitted().config)):
+        part.save_pretrained(tmp_path)
+    config = Runner.load(tmp_path, Variant.parse(OPEN_LOOP).arguments).policy.config
+    assert (config.feedback, config.follow_frames) == ("reference", False)
+    assert config.largest_start_gap is None
+    usual = Runner.load(tmp_path).policy.config
+    assert usual.largest_start_gap == TPGMMConfig.largest_start_gap

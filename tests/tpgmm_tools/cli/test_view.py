@@ -1,0 +1,97 @@
+"""``tpgmm view``."""
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+
+from tests.support import skills
+from tests.support.command_line import output, refusal
+from tests.support.recordings import Recording
+from tpgmm_datasets import save_lerobot
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    """A folder as ``tpgmm demo`` writes it."""
+    folder = tmp_path_factory.mktemp("demo")
+    skills.small_bottle().save(folder / "model")
+    demonstrations = skills.generator().demonstrations(2)
+    save_lerobot(demonstrations, folder / "dataset", fps=20, task="shake")
+    return folder
+
+
+def test_view_shows_what_the_demo_wrote(demo):
+    text = output("view", demo, "--fps", 2, "--situation", 1)
+    page = demo.parent / f"{demo.name}.html"
+    assert re.fullmatch(r"[\d.]+ s of motion, [\d.]+ MB, in (.*)\n", text)[1] == str(page)
+    recording = Recording(page)
+    assert f"{demo.name}, situation 1" in recording.page
+    bottle = skills.generator().demonstrations(2)[1].frames["bottle"]
+    np.testing.assert_allclose(
+        recording.pose("/frames/bottle", 0)[:3], bottle.position, atol=1e-6
+    )
+
+
+def test_view_shows_situations_side_by_side_and_objects(demo, tmp_path):
+    out = tmp_path / "m.html"
+    arguments = "--situation", 0, "--situation", 1, "--object", "bottle=sphere:0.07"
+    output("view", demo, "--fps", 1, *arguments, "--out", out)
+    recording = Recording(out)
+    assert "situation 0, 1" in recording.page
+    for root in ("", "/1"):
+        assert recording.props(f"{root}/frames/bottle/shape")["radius"] == 0.07
+
+
+def test_view_takes_situations_from_a_file(demo, tmp_path):
+    joints = skills.few_bottles()[0].joints[0].tolist()
+    frames = {"bottle": {"position": [0.3, 0, 0.15]}}
+    file, out = tmp_path / "s.json", tmp_path / "m.html"
+    file.write_text(json.dumps([{"joints": joints, "frames": frames}]))
+    output("view", demo / "model", "--situations", file, "--fps", 1, "--out", out)
+    np.testing.assert_allclose(Recording(out).pose("/frames/bottle", 0)[:3], (0.3, 0, 0.15))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ((".", "--object", "bottle"), "a shape is box:X,Y,Z"),
+        ((".", "--object", "mug=sphere:0.1"), "there are shapes for ['mug']"),
+        ((".", "--format", "rerun", "--out", "m.html"), "--out ends in .rrd"),
+        ((".", "--format", "rerun", "--situation", 0, "--situation", 1), "one situation"),
+        (("model",), "give --dataset DATASET or --situations FILE.json"),
+        ((".", "--situation", 2), "there are 2 situations, counted from 0; got --situation 2"),
+        ((".", "--out", "motion.mp4"), "--out ends in .html, got 'motion.mp4'"),
+        ((".", "--meshes", "nowhere"), "--meshes"),
+        (("nothing", "--dataset", "x"), "nothing"),
+    ],
+)
+def test_view_refuses_what_it_cannot_show(demo, arguments, complaint):
+    assert complaint in refusal("view", demo / arguments[0], *arguments[1:])
+
+
+def test_live_the_command_serves_until_it_is_interrupted(demo):
+    command = [sys.executable, "-c", "from tpgmm_tools.cli import main; main()"]
+    command += ["view", str(demo), "--live", "--port", "0", "--fps", "2"]
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        # what a shell starts in the background would else ignore Ctrl-C
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        try:
+            line = process.stdout.readline()
+            url = re.fullmatch(r"open (http://127\.0\.0\.1:\d+) in a browser.*\n", line)[1]
+            with urllib.request.urlopen(url, timeout=60) as answer:
+                assert b"<title>Viser</title>" in answer.read()
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+            assert process.stdout.read() == ""
+        finally:
+            process.kill()

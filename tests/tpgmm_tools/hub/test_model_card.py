@@ -1,0 +1,94 @@
+"""A card says of a model what the model says."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.skills import small_bottle, waves
+from tests.support.two_ways import Handles, fitted
+from tpgmm_tools.hub import describe, model_card
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+
+
+def rows(text: str, title: str) -> list[list[str]]:
+    """Cells of the tables of a section."""
+    section = text.partition(f"## {title}\n")[2].partition("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+
+
+def test_the_skill_and_its_limits_are_those_of_the_model():
+    model = small_bottle()
+    card = describe(model)
+    skill = dict(row[:2] for row in rows(card, "The skill"))
+    assert skill["frames that it must be told"] == "bottle"
+    assert skill["Gaussians"] == str(model.n_components_)
+    assert skill["joints"] == ", ".join(model.kinematics_.joint_names)
+    [bottle] = [row for row in rows(card, "Where it fails") if row[0] == "bottle"]
+    shown = model.shown_.frames["bottle"]
+    assert bottle[1] == f"{shown.low[0]:.3f} to {shown.high[0]:.3f}"
+    learned = dict(row for row in rows(card, "How it was learned"))
+    assert learned["demonstrations"] == str(model.shown_.n_demonstrations)
+    assert learned["converged"] == ("yes" if model.converged_ else "no")
+
+
+def test_what_matters_changes_from_the_object_to_the_joints():
+    model = small_bottle()
+    heading, _, *spans = rows(describe(model), "What matters, and when")
+    shares = np.array([[float(cell.removesuffix(" %")) for cell in row[1:]] for row in spans])
+    assert len(heading) == 1 + len(model.operators_)
+    np.testing.assert_allclose(shares.sum(1), 100, atol=1)
+    joints = heading.index("`canonical`") - 1
+    assert shares[:, joints].argmin() < shares[:, joints].argmax()
+    # the same as the shares of a reproduction where the objects are in the middle
+    shown = model.shown_
+    middle = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
+    bottle = Frame(shown.frames["bottle"].mean, shown.frames["bottle"].orientation)
+    [trajectory] = model.predict([Situation(joints=middle, frames={"bottle": bottle})])
+    wanted = 100 * trajectory.candidates[joints].share.mean(-1)
+    first = wanted[: len(np.array_split(np.arange(len(wanted)), len(spans))[0])].mean()
+    assert shares[0, joints] == pytest.approx(float(first), abs=0.51)
+
+
+def test_nothing_is_made_up_where_nothing_is_known():
+    model = TaskParameterizedGMM(3).fit(waves())
+    model.shown_ = None
+    card = model_card(model, "lab/wave", notes="One more thing.")
+    assert "What was shown is not known." in card
+    assert "Not known: it depends on the situation" in card
+    assert "Nothing was stated." in card
+    assert "One more thing." in card
+    assert 'hub.load("lab/wave")' in card
+    assert "license:" not in card
+
+
+def test_settings_other_than_the_defaults_are_told_and_no_others():
+    card = describe(TaskParameterizedGMM(3, blend=0.25).fit(waves()))
+    learned = dict(row for row in rows(card, "How it was learned"))
+    assert learned["`blend`"] == "0.25"
+    assert not {"`tol`", "`n_components`", "`robot`"} & learned.keys()
+
+
+def test_demonstrations_that_were_left_out_are_named():
+    model = TaskParameterizedGMM(3).fit(waves())
+    model.demonstration_weights_ = torch.tensor([1.0, 0.0, 1.0, 0.0])
+    learned = dict(row for row in rows(describe(model), "How it was learned"))
+    assert learned["of these not learned from, unlike the others"] == "[1, 3]"
+
+
+def test_text_that_was_given_stays_in_its_cell():
+    model = TaskParameterizedGMM(3).fit(waves())
+    card = describe(model, measured={"error | of\na <b>hand": 3})
+    [*_, row] = rows(card, "Measured")
+    assert row == ["error \\| of a &lt;b>hand", "3"]
+
+
+def test_of_several_ways_each_is_described():
+    model = fitted(Handles)
+    card = describe(model, {"success": "50 of 50"})
+    for mode in range(2):
+        learned = dict(rows(card, f"How it was learned (way {mode})"))
+        assert learned["demonstrations"] == str((model.labels_ == mode).sum())
+    assert card.count("## Measured") == card.count("50 of 50") == 1

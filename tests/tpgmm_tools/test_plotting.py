@@ -1,0 +1,230 @@
+"""Pictures: what their artists hold, not only that they are drawn."""
+
+import subprocess
+import sys
+from itertools import combinations
+
+import numpy as np
+import pytest
+import torch
+from matplotlib import rc_context, rcParams
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Ellipse
+
+from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
+from tests.support.worlds import OnPoses
+from tpgmm_tools.plotting import (
+    OPERATORS,
+    STYLE,
+    figure,
+    legend,
+    plot_candidates,
+    plot_components,
+    plot_local,
+    plot_relevance,
+    save,
+    shade,
+)
+from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParameterizedGMM
+from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.operators.text import format_operator
+
+
+def joints_model() -> TaskParameterizedGMM:
+    return TaskParameterizedGMM(4, blend=0.0).fit(waves())
+
+
+def test_panels_share_the_time_axis():
+    drawing = figure(3, "a title")
+    axes = drawing.axes
+    assert len(axes) == 3
+    axes[0].set_xlim(1, 2)
+    assert axes[2].get_xlim() == (1, 2)
+    assert [a.get_xlabel() for a in axes] == ["", "", "time [s]"]
+    assert drawing.get_suptitle() == "a title"
+
+
+def test_figures_need_no_window_and_no_closing():
+    script = "import sys; from tpgmm_tools.plotting import figure; figure(1, ''); "
+    script += "sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+def test_without_matplotlib_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(DependencyError, match=r"tpgmm-torch\[plot\]"):
+        figure(1, "")
+
+
+def test_phases_are_bands_with_names():
+    [axes] = figure(1, "").axes
+    shade(axes, {"reach": (0.5, 1.5), "shake": (2.0, 4.0)})
+    assert [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches] == [
+        (0.5, 1.5),
+        (2.0, 4.0),
+    ]
+    assert [(t.get_text(), t.xy[0]) for t in axes.texts] == [("reach", 1.0), ("shake", 3.0)]
+
+
+def test_components_are_contours_of_one_standard_deviation():
+    model, [axes] = joints_model(), figure(1, "").axes
+    plot_components(axes, model, operator=0, column=1)
+    ellipses = [p for p in axes.patches if isinstance(p, Ellipse)]
+    assert len(ellipses) == 4
+    plane = [0, 2]
+    for ellipse, mean, covariance in zip(
+        ellipses, model.means_[0].numpy(), model.covariances_[0].numpy(), strict=True
+    ):
+        np.testing.assert_allclose(ellipse.center, mean[plane])
+        # points of the contour are one standard deviation away, all around
+        angles = np.linspace(0, 2 * np.pi, 7)
+        circle = np.stack((np.cos(angles), np.sin(angles)), axis=1) / 2
+        turn = np.radians(ellipse.angle)
+        rotate = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        rim = circle * [ellipse.width, ellipse.height] @ rotate.T
+        square = np.einsum("ni,ij,nj->n", rim, np.linalg.inv(covariance[plane][:, plane]), rim)
+        np.testing.assert_allclose(square, 1, rtol=1e-6)
+
+
+def test_local_coordinates_are_those_of_the_operator():
+    demonstrations, [axes] = handlings(2), figure(1, "").axes
+    [trajectory] = hands().predict(demonstrations[:1])
+    reproduction = trajectory, demonstrations[0].frames, {"linestyle": "--"}
+    plot_local(axes, hands(), 0, 2, demonstrations, [reproduction])
+    motion = Demonstration(trajectory.time, trajectory.joints, demonstrations[0].frames)
+    assert len(axes.lines) == 3
+    for line, source in zip(axes.lines, [*demonstrations, motion], strict=True):
+        np.testing.assert_array_equal(line.get_xdata(), source.time)
+        wanted = HANDLING[0].local(source, HANDS)[:, 2]
+        np.testing.assert_array_equal(np.abs(line.get_ydata()), wanted.abs())
+    assert axes.lines[2].get_linestyle() == "--"
+    assert axes.lines[2].get_color() != axes.lines[0].get_color()
+    assert len([p for p in axes.patches if isinstance(p, Ellipse)]) == 6
+
+
+def test_quaternions_are_drawn_on_the_side_of_the_components():
+    [demonstration], [axes] = handlings(1), figure(1, "").axes
+    flipped = Demonstration(
+        demonstration.time,
+        OnPoses().flipped_answer(demonstration.joints),
+        demonstration.frames,
+    )
+    plot_local(axes, hands(), 0, 3, [demonstration, flipped])
+    one, other = (line.get_ydata() for line in axes.lines)
+    np.testing.assert_allclose(one, other)
+    means = hands().means_[0][:, 4].numpy()
+    assert np.sign(one.mean()) == np.sign(means.mean())
+
+
+def test_candidates_are_drawn_with_their_spread():
+    model, [axes] = joints_model(), figure(1, "").axes
+    [trajectory] = model.predict([Situation([0.0, 1.0, 0.0])])
+    plot_candidates(axes, trajectory, "b", ["canonical"])
+    candidate, column = trajectory.candidates[0], JOINT_NAMES.index("b")
+    own, result = axes.lines
+    np.testing.assert_array_equal(own.get_ydata(), candidate.mean[:, column])
+    np.testing.assert_array_equal(result.get_ydata(), trajectory.joints[:, column])
+    assert [line.get_label() for line in axes.lines] == ["canonical", "TP-GMM"]
+    [band] = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    spread = candidate.covariance[:, column, column].sqrt()
+    height = torch.from_numpy(band.get_paths()[0].vertices[:, 1])
+    assert float(height.max()) == pytest.approx(float((candidate.mean[:, 1] + spread).max()))
+    assert float(height.min()) == pytest.approx(float((candidate.mean[:, 1] - spread).min()))
+    assert axes.get_ylabel() == "b [rad]"
+
+
+def test_a_legend_names_all_that_is_drawn_once():
+    demonstrations, drawing = handlings(2), figure(2, "")
+    [trajectory] = hands().predict(demonstrations[:1])
+    frames = demonstrations[0].frames
+    shown = [(trajectory, frames, {}), (trajectory, frames, {"label": "another"})]
+    for column, axes in enumerate(drawing.axes):
+        plot_local(axes, hands(), 0, column, demonstrations, shown)
+    legend(drawing)
+    [box] = drawing.legends
+    assert [text.get_text() for text in box.get_texts()] == [
+        "demonstrations",
+        "reproduction",
+        "another",
+        "Gaussians, one standard deviation",
+    ]
+
+
+def test_operators_differ_in_colour_and_in_grey_print_by_their_lines():
+    colours, lines = zip(*OPERATORS, strict=True)
+    assert len({to_rgb(colour) for colour in colours}) == len(set(lines)) == len(OPERATORS)
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_a_figure_is_written_in_vectors_with_fonts_that_publishers_take(
+    suffix, magic, tmp_path
+):
+    drawing = figure(1, "a title")
+    shade(drawing.axes[0], {"reach": (0.0, 1.0)})
+    written = save(drawing, tmp_path / f"figure.{suffix}").read_bytes()
+    assert written.startswith(magic)
+    assert b"<image" not in written and b"/Subtype /Image" not in written
+    assert b"/Subtype /Type3" not in written
+
+
+def test_a_figure_is_written(tmp_path):
+    [trajectory] = joints_model().predict([Situation([0.0, 1.0, 0.0])])
+    drawing = figure(3, "joints")
+    for axes, joint in zip(drawing.axes, JOINT_NAMES, strict=True):
+        plot_candidates(axes, trajectory, joint)
+    assert save(drawing, tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_candidates_that_matter_stand_above_the_others():
+    selection = OperatorSelection(robot=HANDS).fit(handlings())
+    [axes] = figure(1, "").axes
+    plot_relevance(axes, selection)
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    kept = {format_operator(selection.candidates_[j]) for j in selection.get_support(True)}
+    assert set(labels[: len(kept)]) == kept and len(labels) == len(selection.candidates_)
+    [image] = axes.images
+    column = [format_operator(one) for one in selection.candidates_].index(labels[0])
+    np.testing.assert_allclose(
+        image.get_array()[0], selection.relevance_[:, column].clip(min=0)
+    )
+    assert [line.get_ydata()[0] for line in axes.lines] == [len(kept) - 0.5]
+
+
+#: What is left of linear RGB to eyes with all cones, without long and without medium ones
+#: (Vienot, Brettel, Mollon, 1999).
+EYES = {
+    "all cones": np.eye(3),
+    "no long ones": [[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]],
+    "no medium ones": [[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]],
+}
+XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+def lab(color, eyes) -> np.ndarray:
+    """A colour as eyes see it, in CIE L*a*b*."""
+    srgb = np.array(to_rgb(color))
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    seen = XYZ @ np.clip(eyes @ linear, 0, 1) / XYZ.sum(axis=1)
+    x, y, z = np.where(seen > 216 / 24389, np.cbrt(seen), (24389 / 27 * seen + 16) / 116)
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
+def least_difference(colors, eyes) -> float:
+    """Of any two colours: 2.3 is what can just be noticed."""
+    seen = [lab(color, eyes) for color in colors]
+    return min(np.linalg.norm(one - other) for one, other in combinations(seen, 2))
+
+
+@pytest.mark.parametrize("eyes", EYES.values(), ids=EYES)
+def test_colours_in_turn_are_told_apart_by_all_eyes(eyes):
+    with rc_context(STYLE):
+        colors = rcParams["axes.prop_cycle"].by_key()["color"]
+    assert len(colors) == 7
+    assert least_difference(colors, np.array(eyes)) > 15
+    if eyes is not EYES["all cones"]:  # matplotlib's own are not
+        assert least_difference(("tab:blue", "tab:purple"), np.array(eyes)) < 10
+
+
+def test_operators_differ_in_grey_too():
+    assert len({line for _, line in OPERATORS}) == len(OPERATORS)

@@ -1,0 +1,1 @@
+"""Tools around a model: the command line, pictures, views in three dimensions, the hub."""

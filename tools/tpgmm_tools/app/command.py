@@ -1,0 +1,95 @@
+"""``tpgmm app``: the page in the browser."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tpgmm_tools.cli import options
+
+if TYPE_CHECKING:
+    from tpgmm_tools.app.sources import Shown
+
+__all__ = ["app"]
+
+app = typer.Typer(add_completion=False)
+
+#: Of what may be uploaded.
+LARGEST = "500mb"
+#: What the browser has; gradio's own would be fetched from elsewhere.
+FONTS = ("ui-sans-serif", "system-ui", "sans-serif")
+serving = options.in_panel("Serving")
+EXAMPLE = (
+    "Example: tpgmm app\n\n"
+    "Example: tpgmm app out/demo/dataset --robot upper_body --link l_hand --link r_hand"
+)
+
+
+@app.command(epilog=EXAMPLE)
+def page(
+    dataset: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="DATASET",
+            help="A LeRobot data set that is offered beside the generated one; others can be "
+            "uploaded.",
+        ),
+    ] = None,
+    robot: options.RobotFile = None,
+    link: options.Links = None,
+    robot_joint: options.RobotJoints = None,
+    coordinate: options.Coordinates = None,
+    frame: options.Frames = None,
+    event: options.Events = None,
+    episodes: options.Episodes = None,
+    units: options.Units = None,
+    joints: options.Joints = None,
+    joint_name: options.JointNames = None,
+    rate: options.Rate = None,
+    host: Annotated[
+        str, serving("Address to listen on; who reaches it can have anything learned.")
+    ] = "127.0.0.1",
+    port: Annotated[int, serving("Port; 0 for any that is free.", min=0, max=65535)] = 7860,
+) -> None:
+    """Learn and look in the browser: a data set in, a moving picture out.
+
+    Serves a page on which recordings are chosen or uploaded, learned, and reproduced with
+    objects elsewhere; what is implausible is said in words. Needs the extra 'app'.
+    """
+    import torch
+
+    from tpgmm_tools.app.page import page as built
+    from tpgmm_torch.exceptions import DataError
+
+    # the matrices are small: a second thread on a busy machine only spins
+    torch.set_num_threads(1)
+    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
+    if dataset is None and kinematics is not None:
+        raise DataError("--robot describes DATASET, and none is given")
+
+    def told() -> Shown:
+        given = options.recordings(
+            str(dataset), kinematics, frame, event, episodes, units, joints, joint_name, rate
+        )
+        return given.demonstrations(), kinematics
+
+    blocks = built({} if dataset is None else {dataset: told})
+    from gradio.themes import Default
+
+    _, url, _ = blocks.launch(
+        server_name=host,
+        server_port=port or None,
+        max_file_size=LARGEST,
+        quiet=True,
+        prevent_thread_lock=True,
+        ssr_mode=False,
+        theme=Default(font=FONTS, font_mono=("ui-monospace", "monospace")),
+    )
+    with suppress(KeyboardInterrupt):
+        typer.echo(f"open {url} in a browser; stop with Ctrl-C")
+        while True:
+            time.sleep(1.0)
+    blocks.close(verbose=False)

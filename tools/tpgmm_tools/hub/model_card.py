@@ -1,0 +1,221 @@
+"""A card made from a model: what it does, what matters when, and how it was learned."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from inspect import signature
+from typing import Any
+
+import numpy as np
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.arrays import as_array, as_tensor
+from tpgmm_torch.data.demonstrations import Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.operators.text import format_operator
+
+__all__ = ["describe", "model_card"]
+
+#: Rows of the table of what matters when.
+SPANS = 8
+#: Settings that a card has elsewhere, or that are of no interest to others.
+ELSEWHERE = {"n_components", "operators", "robot", "holds", "verbose", "device", "plausibility"}
+USE = """```python
+from tpgmm_tools import hub
+
+model = hub.load("{repo_id}")
+```"""
+
+
+def model_card(
+    model: Any,
+    repo_id: str,
+    *,
+    measured: Mapping[str, object] | None = None,
+    notes: str = "",
+    license: str | None = None,
+    use: str = USE,
+    library: str = "tpgmm-torch",
+) -> str:
+    """The README.md of a repository that holds a model.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+        Fitted.
+    repo_id : str
+        ``"owner/name"``, its title and in the lines that load it.
+    measured : mapping of str to object, optional
+        What was measured, and how much it was: ``{"grasp error, 50 situations": "0.2 mm"}``.
+    notes : str, optional
+        What else a reader should know, as Markdown.
+    license : str, optional
+        As the hub names them: ``"apache-2.0"``.
+    use : str, optional
+        How to load it, as Markdown; ``{repo_id}`` is replaced.
+    library : str, default="tpgmm-torch"
+        What loads it, as the hub names them.
+    """
+    head = ["---", f"library_name: {library}", "pipeline_tag: robotics"]
+    head += [f"license: {license}"] if license else []
+    head += ["tags:", "- robotics", "- learning-from-demonstration", "- tpgmm", "---"]
+    parts = ["\n".join(head), f"# {repo_id}", describe(model, measured)]
+    parts += [notes.strip()] if notes.strip() else []
+    parts += ["## Use", use.replace("{repo_id}", repo_id)]
+    return "\n\n".join(parts) + "\n"
+
+
+def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
+    """The sections of a card that follow from the model itself, as Markdown.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+        Fitted; of several ways, each is described.
+    measured : mapping of str to object, optional
+        As for :func:`model_card`.
+    """
+    figures = "Nothing was stated."
+    if measured:
+        figures = _table(("what", "how much"), measured.items())
+    ways = getattr(model, "models_", [model])
+    # what was measured is of all ways, and comes before them
+    sections = {"Measured": figures} if len(ways) > 1 else {}
+    for number, way in enumerate(ways):
+        name = f" (way {number})" if len(ways) > 1 else ""
+        sections |= {
+            f"The skill{name}": _skill(way),
+            f"What matters, and when{name}": _influence(way),
+            "Measured": figures,
+            f"Where it fails{name}": _limits(way),
+            f"How it was learned{name}": _learning(way),
+        }
+    return "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
+
+
+def _skill(model: Any) -> str:
+    robot, time = model.kinematics_, model.time_
+    seconds, steps = float(time[-1] - time[0]), len(time)
+    rows = [
+        ("duration", f"{seconds:.2f} s, {steps} steps"),
+        ("joints", ", ".join(robot.joint_names)),
+        ("links", ", ".join(robot.links) or "none"),
+        ("frames that it must be told", ", ".join(model.frame_names_) or "none"),
+        ("Gaussians", model.n_components_),
+    ]
+    rows += [("operator", f"`{format_operator(one)}`") for one in model.operators_]
+    rows += [("held", str(hold)) for hold in model.holds_]
+    return (
+        "A task-parameterised Gaussian mixture (TP-GMM). It gives joint references and their "
+        "covariance over time, from a start posture and the poses of objects.\n\n"
+        + _table(("", ""), rows)
+    )
+
+
+def _influence(model: Any) -> str:
+    """Shares of the operators over time, in the middle of what was shown."""
+    situation = _middle(model)
+    if situation is None:
+        return "Not known: it depends on the situation, and what was shown is not kept."
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)
+        [trajectory] = model.predict([situation])
+    time = as_array(trajectory.time - trajectory.time[0])
+    shares = np.stack([as_array(100 * c.share.mean(-1)) for c in trajectory.candidates], -1)
+    spans = np.array_split(np.arange(len(time)), min(SPANS, len(time)))
+    rows = [
+        (
+            f"{time[span[0]]:.1f} to {time[span[-1]]:.1f}",
+            *(f"{share:.0f} %" for share in shares[span].mean(0)),
+        )
+        for span in spans
+    ]
+    names = (f"`{format_operator(operator)}`" for operator in model.operators_)
+    return (
+        "The share of each operator in what is known about the joints, their mean, where the "
+        "start posture and the objects are in the middle of those shown.\n\n"
+        + _table(("time [s]", *names), rows)
+    )
+
+
+def _middle(model: Any) -> Situation | None:
+    """The situation amid those shown; None where they are not known."""
+    shown = model.shown_
+    if shown is None or not set(model.frame_names_) <= shown.frames.keys():
+        return None
+    joints = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
+    for start in model.kinematics_.quaternion_starts:
+        quaternion = joints[start : start + 4]
+        if np.linalg.norm(quaternion) < 0.5:  # they lie too far apart to have a middle
+            return None
+        joints[start : start + 4] = quaternions.normalize(as_tensor(quaternion, "orientation"))
+    frames = {
+        name: Frame(shown.frames[name].mean, shown.frames[name].orientation)
+        for name in model.frame_names_
+    }
+    return Situation(joints=joints, frames=frames, joint_names=shown.joint_names)
+
+
+def _limits(model: Any) -> str:
+    text = (
+        "It extrapolates beyond what was shown, where it may do anything within the robot's "
+        "limits. It does not see: it has to be told where the frames are. It knows nothing of "
+        "collisions."
+    )
+    shown = model.shown_
+    if shown is None:
+        return f"{text} What was shown is not known."
+    parts = [f"{text} `novelty` above 1 is further than any demonstration from the others."]
+    if shown.frames:
+        rows = [
+            (
+                name,
+                *(f"{a:.3f} to {b:.3f}" for a, b in zip(one.low, one.high, strict=True)),
+                f"{np.degrees(one.angle):.0f}",
+            )
+            for name, one in shown.frames.items()
+        ]
+        heading = ("frame was at", "x [m]", "y [m]", "z [m]", "turned by at most [deg]")
+        parts.append(_table(heading, rows))
+    starts = zip(shown.joint_names, shown.start_low, shown.start_high, strict=True)
+    rows = [(name, f"{low:.3f} to {high:.3f}") for name, low, high in starts]
+    parts.append(_table(("joint began at", "rad or m"), rows))
+    return "\n\n".join(parts)
+
+
+def _learning(model: Any) -> str:
+    weights, shown = model.demonstration_weights_, model.shown_
+    rows: list[tuple[str, object]] = []
+    if shown is not None:
+        rows.append(("demonstrations", shown.n_demonstrations))
+    if weights is not None and not bool(weights.all()):
+        left_out = (weights == 0).nonzero().flatten().tolist()
+        rows.append(("of these not learned from, unlike the others", left_out))
+    rows.append(("iterations of EM", model.n_iter_))
+    rows.append(("converged", "yes" if model.converged_ else "no"))
+    if np.isfinite(model.lower_bound_):
+        rows.append(("mean log-likelihood per time step", f"{model.lower_bound_:.3f}"))
+    defaults = signature(type(model)).parameters
+    rows += [
+        (f"`{name}`", value)
+        for name, value in model.get_params(deep=False).items()
+        if name not in ELSEWHERE and str(value) != str(defaults[name].default)
+    ]
+    rows += [
+        (f"via-point at {point.time:g} s", format_operator(point.operator))
+        for point in model.via_points_
+    ]
+    return _table(("", ""), [*rows, ("tpgmm-torch", version("tpgmm-torch"))])
+
+
+def _table(heading: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = [heading, ["---"] * len(heading), *rows]
+    return "\n".join(f"| {' | '.join(map(_cell, line))} |" for line in lines)
+
+
+def _cell(value: object) -> str:
+    """Text that stays in its cell."""
+    return " ".join(str(value).split()).replace("|", "\\|").replace("<", "&lt;")
