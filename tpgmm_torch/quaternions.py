@@ -11,7 +11,10 @@ matrices of eqs (19), (20): here :func:`left_matrix` and :func:`right_matrix`; t
 three rows of ``Hbar``, ``Hbar*`` of eq. (11), are :func:`vector_matrix`.
 """
 
+import itertools
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -36,6 +39,7 @@ __all__ = [
     "normalize",
     "product",
     "quaternion_blocks",
+    "relative_matrix",
     "right_matrix",
     "rotate",
     "slerp",
@@ -44,63 +48,56 @@ __all__ = [
 ]
 
 
-#: Which entries of q = (q_1, q_2, q_3, q_4) stand in the matrices of eq. (20), with their sign.
+#: Which entry of q = (q_1, q_2, q_3, q_4) stands where in H+(q) of eq. (20), with its sign.
 LEFT = ((1, -2, -3, -4), (2, 1, -4, 3), (3, 4, 1, -2), (4, -3, 2, 1))
-RIGHT = ((1, -2, -3, -4), (2, 1, 4, -3), (3, -4, 1, 2), (4, 3, -2, 1))
-#: Which entries of a rotation matrix, counted row by row, add up to 4 q q^T - I.
-OUTER = (
-    ((1, 5, 9), (8, -6), (3, -7), (4, -2)),
-    ((8, -6), (1, -5, -9), (4, 2), (3, 7)),
-    ((3, -7), (4, 2), (-1, 5, -9), (8, 6)),
-    ((4, -2), (3, 7), (8, 6), (-1, -5, 9)),
-)
-
 
 #: By how much R^T R of a rotation matrix may differ from the identity: data rounded to three
 #: digits are off by up to 2 * 3 * 0.5e-3.
 ROTATION_TOLERANCE = 3e-3
 
-#: Steps of :func:`mean` at most; a few are the rule.
-MEAN_STEPS = 100
 
-#: What :func:`_constant` has made.
-CONSTANTS: dict[tuple[torch.dtype, torch.device], dict[str, Tensor]] = {}
+def _constant(name: str, like: Tensor) -> Tensor:
+    return _constants(like.dtype, like.device)[name]
 
 
-def _constant(name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+@lru_cache
+def _constants(dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
     """Structure constants: a product with one of them stands for dozens of operations."""
-    key = dtype, device
-    if key not in CONSTANTS:
-        # what is made while inference mode is on could not serve where gradients are wanted
-        with torch.inference_mode(False):
-            CONSTANTS[key] = {n: matrix.to(device) for n, matrix in _structure(dtype).items()}
-    return CONSTANTS[key][name]
+    # what is made while inference mode is on could not serve where gradients are wanted
+    with torch.inference_mode(False):
+        left = torch.zeros(4, 4, 4, dtype=dtype)
+        for row, column in itertools.product(range(4), range(4)):
+            entry = LEFT[row][column]
+            left[abs(entry) - 1, row, column] = math.copysign(1, entry)
+        right = left.permute(2, 1, 0)
+        conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
+        relative = (conjugate[:, None, None] * right)[:, None] @ left
+        rotation = relative[..., 1:, 1:]
+        rotation = (rotation + rotation.transpose(0, 1)) / 2  # of products q_i q_j
+        constants = {
+            "one": torch.ones((), dtype=dtype),
+            "conjugate": conjugate,
+            "left": left.flatten(1),
+            "right": right.flatten(1),
+            "relative": relative.reshape(16, 16),
+            "rotation": rotation.reshape(16, 9),
+        }
+        return {key: value.contiguous().to(device) for key, value in constants.items()}
 
 
-def _structure(dtype: torch.dtype) -> dict[str, Tensor]:
-    def linear(table: object, width: int) -> Tensor:  # of a table of signed places
-        entries = [entry for row in table for entry in row]  # type: ignore[attr-defined]
-        matrix = torch.zeros(width, len(entries), dtype=dtype)
-        for column, entry in enumerate(entries):
-            for place in entry if isinstance(entry, tuple) else (entry,):
-                matrix[abs(place) - 1, column] = 1.0 if place > 0 else -1.0
-        return matrix
-
-    conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
-    left, right = linear(LEFT, 4), linear(RIGHT, 4)
-    # q v conj(q) = H+(q) Hbar(conj q) v: coefficients of the products q_i q_j
-    turned = (right * conjugate[:, None]).unflatten(1, (4, 4))
-    pairs = torch.einsum("iam,jmb->ijab", left.unflatten(1, (4, 4)), turned)
-    return {
-        "one": torch.ones((), dtype=dtype),
-        "conjugate": conjugate,
-        "left": left,
-        "right": right,
-        "vector": right[:, 4:],
-        "rotation": pairs[..., 1:, 1:].reshape(16, 9),
-        "outer": linear(OUTER, 9),
-        "eye": torch.eye(4, dtype=dtype).flatten(),
-    }
+@lru_cache
+def quaternion_blocks(
+    starts: tuple[int, ...],
+    size: int,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> Tensor:
+    """Where quaternions are among ``size`` coordinates: a row of ones and zeros for each."""
+    with torch.inference_mode(False):
+        blocks = torch.zeros(len(starts), size, dtype=dtype, device=device)
+        for block, start in zip(blocks, starts, strict=True):
+            block[start : start + 4] = 1.0
+        return blocks
 
 
 def identity(dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Tensor:
@@ -122,17 +119,17 @@ def product(a: Tensor, b: Tensor) -> Tensor:
 
 def conjugate(q: Tensor) -> Tensor:
     """The conjugate ``(w, -x, -y, -z)``: the inverse rotation of a unit quaternion ``q``."""
-    return q * _constant("conjugate", q.dtype, q.device)
+    return q * _constant("conjugate", q)
 
 
 def left_matrix(q: Tensor) -> Tensor:
     """``H+(q)`` of eq. (20), (..., 4, 4): ``product(q, b) == left_matrix(q) @ b``."""
-    return (q @ _constant("left", q.dtype, q.device)).unflatten(-1, (4, 4))
+    return (q @ _constant("left", q)).unflatten(-1, (4, 4))
 
 
 def right_matrix(q: Tensor) -> Tensor:
     """``Hbar(q)`` of eq. (20), (..., 4, 4): ``product(a, q) == right_matrix(q) @ a``."""
-    return (q @ _constant("right", q.dtype, q.device)).unflatten(-1, (4, 4))
+    return (q @ _constant("right", q)).unflatten(-1, (4, 4))
 
 
 def vector_matrix(q: Tensor) -> Tensor:
@@ -140,7 +137,24 @@ def vector_matrix(q: Tensor) -> Tensor:
 
     ``vector_matrix(q) @ a`` is the vector part of ``a * q``.
     """
-    return (q @ _constant("vector", q.dtype, q.device)).unflatten(-1, (3, 4))
+    return right_matrix(q)[..., 1:, :]
+
+
+def relative_matrix(q: Tensor, reference: Tensor) -> Tensor:
+    """``Hbar(conj q) H+(reference)`` of eq. (15), (..., 4, 4).
+
+    It maps a to ``reference a conj(q)``. Its first row is ``conj(reference) q``: q as seen
+    from the reference.
+
+    Examples
+    --------
+    >>> q, reference = exp(torch.tensor([[0.3, 0.1, 0.0], [0.0, 0.2, 0.5]]).double())
+    >>> seen = product(conjugate(reference), q)
+    >>> torch.allclose(relative_matrix(q, reference)[0], seen)
+    True
+    """
+    pairs = (q[..., :, None] * reference[..., None, :]).flatten(-2)
+    return (pairs @ _constant("relative", q)).unflatten(-1, (4, 4))
 
 
 def normalize(q: Tensor) -> Tensor:
@@ -166,42 +180,39 @@ def hemisphere_sign(inner: Tensor) -> Tensor:
         Inner products of quaternions with their references; the real parts, where the
         reference is no rotation.
     """
-    return torch.copysign(_constant("one", inner.dtype, inner.device), inner)
+    return torch.copysign(_constant("one", inner), inner)
 
 
-def quaternion_blocks(starts: Sequence[int], size: int) -> Tensor:
-    """Where quaternions begin among ``size`` coordinates, for :func:`hemisphere_signs`.
-
-    For each of the ``starts`` a row, 1 at the four coordinates of the quaternion, 0 elsewhere.
-    """
-    blocks = torch.zeros(len(starts), size, dtype=torch.float64)
-    for block, start in zip(blocks, starts, strict=True):
-        block[start : start + 4] = 1.0
-    return blocks
-
-
-def hemisphere_signs(x: Tensor, reference: Tensor, blocks: Tensor) -> Tensor:
-    """Signs (..., D) that bring all quaternions among coordinates to the side of the reference.
+def hemisphere_signs(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,)) -> Tensor:
+    """Signs (..., D) that bring quaternions among coordinates to the side of the reference.
 
     Parameters
     ----------
     x, reference : Tensor of shape (..., D)
         Coordinates, some of them quaternions; of others the sign is 1.
-    blocks : Tensor of shape (Q, D)
-        Of :func:`quaternion_blocks`.
+    starts : sequence of int, default=(0,)
+        Where the quaternions begin.
 
     Examples
     --------
     >>> x, reference = -torch.ones(6), torch.ones(6)
-    >>> hemisphere_signs(x, reference, quaternion_blocks([2], 6).to(x)).tolist()
+    >>> hemisphere_signs(x, reference, [2]).tolist()
     [1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
     """
+    blocks = quaternion_blocks(tuple(starts), x.shape[-1], x.dtype, x.device)
     return 1.0 + (hemisphere_sign((x * reference) @ blocks.mT) - 1.0) @ blocks
 
 
-def match_hemisphere(q: Tensor, reference: Tensor) -> Tensor:
-    """``q`` or ``-q``, whichever has a non-negative inner product with ``reference``."""
-    return q * hemisphere_sign((q * reference).sum(-1, keepdim=True))
+def match_hemisphere(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,)) -> Tensor:
+    """Of q and -q, which are one rotation, the one whose inner product is not negative.
+
+    Parameters
+    ----------
+    x, reference : Tensor of shape (..., D)
+    starts : sequence of int, default=(0,)
+        Where quaternions begin among the coordinates; others stay as they are.
+    """
+    return x * hemisphere_signs(x, reference, starts)
 
 
 def continuous(q: Tensor, dim: int = -2) -> Tensor:
@@ -221,9 +232,8 @@ def continuous(q: Tensor, dim: int = -2) -> Tensor:
     """
     q = q.movedim(dim, -2)
     if q.shape[-2] > 1:
-        flips = hemisphere_sign((q[..., 1:, :] * q[..., :-1, :]).sum(-1, keepdim=True))
-        signs = torch.cat((torch.ones_like(flips[..., :1, :]), flips.cumprod(dim=-2)), dim=-2)
-        q = q * signs
+        flips = hemisphere_signs(q[..., 1:, :], q[..., :-1, :]).cumprod(dim=-2)
+        q = q * torch.cat((torch.ones_like(flips[..., :1, :]), flips), dim=-2)
     return q.movedim(-2, dim)
 
 
@@ -276,10 +286,10 @@ def left_jacobian(rotation_vector: Tensor) -> Tensor:
     >>> round(float(torch.linalg.det(left_jacobian(quarter))), 3)
     0.811
     """
-    cross, square, angle, small = _cross_and_angle(rotation_vector)
+    eye, cross, square, angle, small = _cross_and_angle(rotation_vector)
     one = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / angle.square())
     two = torch.where(small, 1 / 6 - square / 120, (angle - torch.sin(angle)) / angle**3)
-    return _eye(cross) + one * cross + two * cross @ cross
+    return eye + one * cross + two * cross @ cross
 
 
 def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:
@@ -290,26 +300,20 @@ def inverse_left_jacobian(rotation_vector: Tensor) -> Tensor:
     rotation_vector : Tensor of shape (..., 3)
         Of less than a full turn.
     """
-    cross, square, angle, small = _cross_and_angle(rotation_vector)
+    eye, cross, square, angle, small = _cross_and_angle(rotation_vector)
     exact = (1 - 0.5 * angle / torch.tan(0.5 * angle)) / angle.square()
-    return (
-        _eye(cross)
-        - 0.5 * cross
-        + torch.where(small, 1 / 12 + square / 720, exact) * (cross @ cross)
-    )
+    two = torch.where(small, 1 / 12 + square / 720, exact)
+    return eye - 0.5 * cross + two * (cross @ cross)
 
 
-def _eye(like: Tensor) -> Tensor:
-    return torch.eye(3, dtype=like.dtype, device=like.device)
-
-
-def _cross_and_angle(vector: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``[y]x``, and ``|y|^2``, ``|y|`` (1 where it is small) and whether it is, (..., 1, 1)."""
-    eye = _eye(vector).expand(*vector.shape, 3)
+def _cross_and_angle(vector: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """I, ``[y]x``, and ``|y|^2``, ``|y|`` (1 where it is small) and whether it is."""
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device).expand(*vector.shape, 3)
     cross = torch.linalg.cross(vector.unsqueeze(-1).expand_as(eye), eye, dim=-2)
     square = vector.square().sum(-1)[..., None, None]
-    small = square < 1e-4
-    return cross, square, torch.where(small, torch.ones_like(square), square).sqrt(), small
+    small = square < 1e-4  # where the series serve
+    angle = torch.where(small, torch.ones_like(square), square).sqrt()
+    return eye, cross, square, angle, small
 
 
 def mean(q: Tensor) -> Tensor:
@@ -330,7 +334,7 @@ def mean(q: Tensor) -> Tensor:
     0.3
     """
     found = torch.linalg.eigh(q.mT @ q).eigenvectors[..., -1]
-    for _ in range(MEAN_STEPS):
+    for _ in range(100):  # at most; a few are the rule
         step = log(product(conjugate(found).unsqueeze(-2), q)).mean(-2)
         found = normalize(product(found, exp(step)))
         if float(step.abs().amax()) < 1e2 * torch.finfo(q.dtype).eps:
@@ -387,20 +391,7 @@ def rotate(q: Tensor, vector: Tensor) -> Tensor:
 def to_matrix(q: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of unit quaternions ``q``."""
     pairs = (q[..., :, None] * q[..., None, :]).flatten(-2)
-    return (pairs @ _constant("rotation", q.dtype, q.device)).unflatten(-1, (3, 3))
-
-
-def _check_rotations(matrix: Tensor) -> None:
-    eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
-    error = (matrix.mT @ matrix - eye).abs().amax((-2, -1))
-    # written so that NaN is refused, too
-    if not bool((error <= ROTATION_TOLERANCE).all()):
-        raise DataError(
-            "a matrix is no rotation: R^T R differs from the identity by "
-            f"{float(error.max()):.3g}, the tolerance is {ROTATION_TOLERANCE}"
-        )
-    if bool((torch.linalg.det(matrix) < 0).any()):
-        raise DataError("a matrix is no rotation but a reflection: its determinant is -1")
+    return (pairs @ _constant("rotation", q)).unflatten(-1, (3, 3))
 
 
 def from_matrix(matrix: Tensor) -> Tensor:
@@ -424,9 +415,17 @@ def from_matrix(matrix: Tensor) -> Tensor:
     """
     if matrix.shape[-2:] != (3, 3):
         raise ShapeError(f"rotation matrices have shape (..., 3, 3), got {tuple(matrix.shape)}")
-    _check_rotations(matrix.detach())
-    flat = matrix.flatten(-2) @ _constant("outer", matrix.dtype, matrix.device)
-    outer = (flat + _constant("eye", matrix.dtype, matrix.device)).unflatten(-1, (4, 4))
+    gram = matrix.mT @ matrix
+    eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
+    error = (gram.detach() - eye[:3, :3]).abs().amax((-2, -1))
+    if not bool((error <= ROTATION_TOLERANCE).all()):  # NaN is refused, too
+        raise DataError(
+            "a matrix is no rotation: R^T R differs from the identity by "
+            f"{float(error.max()):.3g}, the tolerance is {ROTATION_TOLERANCE}"
+        )
+    if bool((torch.linalg.det(matrix.detach()) < 0).any()):
+        raise DataError("a matrix is no rotation but a reflection: its determinant is -1")
+    outer = (matrix.flatten(-2) @ _constant("rotation", matrix).mT).unflatten(-1, (4, 4)) + eye
     # the column of the symmetric 4 q q^T that belongs to the largest entry of q
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1, keepdim=True).unsqueeze(-1)
     q = outer.gather(-1, largest.expand(*outer.shape[:-1], 1)).squeeze(-1)

@@ -370,9 +370,8 @@ class WaitingProgress(Progress):
             measured = np.where(unknown, reference, measured)
         starts = self.regression.kinematics.quaternion_starts
         if starts:
-            blocks = quaternions.quaternion_blocks(starts, measured.shape[-1]).numpy()
-            inner = (measured * reference) @ blocks.T
-            measured = measured * (1 + (np.copysign(1.0, inner) - 1) @ blocks)
+            both = torch.from_numpy(measured), torch.from_numpy(reference)
+            measured = quaternions.match_hemisphere(*both, starts).numpy()
         return measured
 
 

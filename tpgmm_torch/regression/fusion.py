@@ -129,11 +129,7 @@ class KalmanUpdate:
         priors = [one for operator, one in pairs if _whole(operator)]
         self.task = Stack(*tasks) if tasks else None
         self.conditionals = Conditionals.stacked([*local, Conditionals.product(priors)])
-        starts = self.task.quaternion_starts(kinematics) if self.task is not None else ()
-        blocks = quaternions.quaternion_blocks(
-            starts, self.conditionals.mean.shape[-1] - kinematics.n_joints
-        )
-        self._blocks = blocks.to(self.conditionals.mean) if starts else None
+        self._starts = self.task.quaternion_starts(kinematics) if self.task is not None else ()
 
     @staticmethod
     def serves(operators: Sequence[Operator], kinematics: Kinematics) -> bool:
@@ -192,13 +188,13 @@ class KalmanUpdate:
         mean, covariance = conditionals.at(time).movedim(-2, 0), conditionals.covariance
         shape, width = (len(mean), *batch, -1, -1), mean.shape[-1] - n
         matrix = at.matrix
-        if self._blocks is not None:
+        if self._starts:
             present = at.present
             if present is None:
                 present = task.coordinates(state, frames)
             # of q and -q, which are one rotation, the mean is the one that is nearer
             local = mean.narrow(-1, 0, width)
-            signs = quaternions.hemisphere_signs(local, present, self._blocks)
+            signs = quaternions.hemisphere_signs(local, present, self._starts)
             matrix = matrix * signs.unsqueeze(-2)
         # tasks and joints are one vector z = (x, q - q_{t-1}), with r = [M, -J] z + c
         mean = mean - torch.nn.functional.pad(state.joints, (width, 0))

@@ -399,6 +399,8 @@ class Residual:
     Parameters
     ----------
     operator : Operator
+    starts : tuple of int
+        Where the operator's quaternions begin.
     blocks : Tensor of shape (Q, D), optional
         Where the operator's quaternions are; None if it has none.
     turns : Tensor of shape (Q, 3), optional
@@ -410,6 +412,7 @@ class Residual:
     """
 
     operator: Operator
+    starts: tuple[int, ...]
     blocks: Tensor | None
     turns: Tensor | None
     half_gains: Tensor
@@ -420,7 +423,8 @@ class Residual:
         """For an ``operator`` on the joints of ``kinematics``."""
         like = kinematics.lower
         starts = operator.quaternion_starts(kinematics)
-        blocks = quaternions.quaternion_blocks(starts, operator.dimension(kinematics)).to(like)
+        size = operator.dimension(kinematics)
+        blocks = quaternions.quaternion_blocks(starts, size, like.dtype, like.device)
         parts = leaves([operator])
         rows, gains, relative, row = [], [], [], 0
         for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
@@ -435,7 +439,12 @@ class Residual:
             row += 3
         turns = torch.tensor(rows, device=like.device) if rows else None
         return cls(
-            operator, blocks if starts else None, turns, like.new_tensor(gains), tuple(relative)
+            operator,
+            starts,
+            blocks if starts else None,
+            turns,
+            like.new_tensor(gains),
+            tuple(relative),
         )
 
     def __call__(
@@ -448,7 +457,7 @@ class Residual:
             present = at.present
             if present is None:
                 present = self.operator.coordinates(state, frames)
-            signs = quaternions.hemisphere_signs(mean, present, self.blocks)
+            signs = quaternions.hemisphere_signs(mean, present, self.starts)
             flipped = mean * signs
             if matrix is not None:
                 matrix = matrix * signs.unsqueeze(-2)

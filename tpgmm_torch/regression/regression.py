@@ -469,8 +469,7 @@ class Regression:
             starts = operator.quaternion_starts(self.kinematics)
             if starts:
                 present = operator.coordinates(state, frames).unsqueeze(-2)
-                blocks = quaternions.quaternion_blocks(starts, mean.shape[-1]).to(mean)
-                signs = quaternions.hemisphere_signs(mean, present, blocks)
+                signs = quaternions.hemisphere_signs(mean, present, starts)
                 mean, gain = signs * mean, signs * gain
                 covariance = signs[..., None] * covariance * signs[..., None, :]
             yield operator.linearize(state, frames), mean, gain, covariance

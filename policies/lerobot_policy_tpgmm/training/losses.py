@@ -92,8 +92,7 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
         local = operator.at(samples.time).coordinates(samples.state, samples.poses)
         expected = model.expected(j, samples.time)
         starts = operator.quaternion_starts(model.kinematics)
-        blocks = quaternions.quaternion_blocks(starts, local.shape[1]).to(local)
-        local = local * quaternions.hemisphere_signs(local, expected, blocks)
+        local = quaternions.match_hemisphere(local, expected, starts)
         points.append(torch.cat((samples.time[:, None], local), dim=1))
     return points
 
