@@ -55,7 +55,8 @@ metaworld: ## Try all tasks of Meta-World; ARGS="--tasks reach-v3 --demonstratio
 test: $(VENV)/.installed-test ## Run the tests; more options: PYTEST_ARGS="-k quaternions"
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 $(PYTEST_ARGS)
 
-# without lerobot; and the oldest pyarrow cannot write one of the damaged files
+# Without lerobot, whose oldest version `make test` takes (constraints.txt) and whose newest
+# `make newest`; and the oldest pyarrow cannot write one of the damaged files.
 oldest: ## Run the tests of the core with the oldest versions promised, in .venv-oldest
 	$(firstword $(wildcard $(BIN)/python) python3) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install --disable-pip-version-check \

@@ -183,6 +183,18 @@ def test_constraints_satisfy_every_extra(extra):
         assert version is None or requirement.specifier.contains(version), str(requirement)
 
 
+def test_the_tests_run_with_the_oldest_lerobot_and_make_newest_with_the_newest():
+    ranges = {
+        str(requirement.specifier)
+        for project in PROJECTS.values()
+        for line in chain(
+            project.get("dependencies", ()), *project.get("optional-dependencies", {}).values()
+        )
+        if (requirement := Requirement(line)).name == "lerobot"
+    }
+    assert ranges == {f"<0.7,>={constraints()['lerobot']}"}
+
+
 def test_constraints_name_everything_that_the_tests_install():
     assert {"data", "plot", "simulation", "lerobot"} <= EXTRAS.keys()
     needed = {canonicalize_name(requirement.name) for requirement in requirements("test")}
