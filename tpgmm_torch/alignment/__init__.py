@@ -6,7 +6,6 @@ fitted as it is; without alignment, demonstrations are fitted on their own clock
 
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping
-from tpgmm_torch.alignment.events import EventAlignment
-from tpgmm_torch.alignment.linear import LinearTimeNormalization
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
 
 __all__ = ["Alignment", "DynamicTimeWarping", "EventAlignment", "LinearTimeNormalization"]

@@ -1,4 +1,4 @@
-"""Demonstrations on another clock, and what all alignments in time have in common."""
+"""Demonstrations on another clock, and the base class of all alignments in time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator, TransformerMixin
 from torch import Tensor
 
@@ -24,26 +23,14 @@ from tpgmm_torch.data.demonstrations import (
 )
 from tpgmm_torch.exceptions import DataError, NotFittedError
 
-__all__ = ["Alignment", "retime", "seconds", "steps_at"]
-
-
-def seconds(demonstration: Demonstration) -> Array:
-    """The time of a demonstration as an array of shape (T,)."""
-    return as_array(demonstration.time)
-
-
-def steps_at(demonstration: Demonstration, instants: Array) -> Tensor:
-    """The fractional time steps at which a demonstration reaches ``instants`` [s]."""
-    time = seconds(demonstration)
-    return torch.from_numpy(np.interp(instants, time, np.arange(len(time))))
+__all__ = ["Alignment", "retime"]
 
 
 def retime(
     demonstration: Demonstration,
-    path: Tensor,
+    path: Array,
     time: Tensor,
     quaternion_blocks: Sequence[Sequence[int]] = (),
-    interpolation: str = "linear",
 ) -> Demonstration:
     """Play a demonstration on another clock.
 
@@ -51,55 +38,43 @@ def retime(
     ----------
     demonstration : Demonstration
         Of at least two time steps.
-    path : Tensor of shape (N,)
-        Strictly increasing fractional time steps of the demonstration.
+    path : ndarray of shape (N,)
+        Strictly increasing instants of the demonstration [s].
     time : Tensor of shape (N,)
         When they are reached [s].
     quaternion_blocks : sequence of four columns each, optional
         Where the joints hold unit quaternions.
-    interpolation : {"linear", "cubic"}, default="linear"
-        Of the joints.
 
     Returns
     -------
     Demonstration
-        Quaternions are interpolated by slerp, constant frames are the same. An event at a
-        step that the path does not reach is left out.
+        Quaternions are interpolated by slerp, everything else linearly; constant frames are
+        the same. An event after the end of the path is left out.
     """
-    lower = path.floor().long().clamp(0, len(demonstration) - 2)
-    fraction = path - lower
-    if interpolation == "cubic":
-        before = seconds(demonstration)
-        spline = CubicSpline(before, as_array(demonstration.joints))
-        instants = np.interp(path.numpy(), np.arange(len(before)), before)
-        joints = torch.from_numpy(spline(instants)).to(demonstration.joints)
-    else:
-        joints = _lerp(demonstration.joints, lower, fraction)
-    for block in quaternion_blocks:
-        turn = quaternions.normalize(demonstration.joints[:, list(block)])
-        joints[:, list(block)] = _slerp(turn, lower, fraction)
+    own, joints = as_array(demonstration.time), demonstration.joints
+    steps = np.arange(len(own))
+    at = np.interp(path, own, steps)
+    place = torch.from_numpy(at)
+    lower = place.floor().long().clamp(0, len(demonstration) - 2)
+    fraction = place - lower
+    start, end = joints[lower.to(joints.device)], joints[lower.to(joints.device) + 1]
+    weight = fraction.to(joints)
+    moved = torch.lerp(start, end, weight[:, None])
+    for block in map(list, quaternion_blocks):
+        before, after = (quaternions.normalize(values[:, block]) for values in (start, end))
+        moved[:, block] = quaternions.slerp(before, after, weight)
     frames = {
         name: frame.between(lower, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
     }
-    steps = steps_at(demonstration, np.array(list(demonstration.events.values()))).tolist()
+    reached = np.interp(list(demonstration.events.values()), own, steps).tolist()
     events = {
-        name: float(np.interp(step, path.numpy(), time.numpy()))
-        for name, step in zip(demonstration.events, steps, strict=True)
-        if step <= path[-1] + 1e-9
+        name: float(np.interp(step, at, as_array(time)))
+        for name, step in zip(demonstration.events, reached, strict=True)
+        if step <= at[-1] + 1e-9
     }
     time = time.to(demonstration.time)
-    return Demonstration(time, joints, frames, demonstration.joint_names, events)
-
-
-def _lerp(values: Tensor, lower: Tensor, fraction: Tensor) -> Tensor:
-    lower = lower.to(values.device)
-    return torch.lerp(values[lower], values[lower + 1], fraction.to(values)[:, None])
-
-
-def _slerp(values: Tensor, lower: Tensor, fraction: Tensor) -> Tensor:
-    lower = lower.to(values.device)
-    return quaternions.slerp(values[lower], values[lower + 1], fraction.to(values))
+    return Demonstration(time, moved, frames, demonstration.joint_names, events)
 
 
 class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
@@ -109,16 +84,15 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
     ----------
     time_ : Tensor of shape (T,)
         The grid [s].
-    paths_ : list of Tensor of shape (T,)
-        For each demonstration of ``fit``, its fractional time step at each time of the grid.
+    paths_ : list of ndarray of shape (T,)
+        For each demonstration of ``fit``, its own instant at each time of the grid [s].
     joint_names_ : tuple of str or None
         Order of the joints.
     """
 
-    interpolation: str
     robot: Any
     time_: Tensor
-    paths_: list[Tensor]
+    paths_: list[Array]
     joint_names_: tuple[str, ...] | None
 
     def fit_transform(
@@ -127,8 +101,7 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
         """Fit, and align the same demonstrations without warping them again."""
         X = check_demonstrations(X)
         self.fit(X, y)
-        pairs = zip(self._checked(X), self.paths_, strict=True)
-        return [self._warped(demonstration, path) for demonstration, path in pairs]
+        return list(map(self._retimed, self._checked(X), self.paths_))
 
     def transform(self, X: Sequence[Any]) -> list[Any]:
         """Align demonstrations onto the time grid learned by ``fit``.
@@ -142,8 +115,7 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
         Returns
         -------
         list of Demonstration
-            All with the time ``time_``. Events keep the instant of the motion they belong
-            to; those after the end of an open-ended match are left out.
+            All with the time ``time_``. Events keep the instant of the motion they belong to.
 
         Raises
         ------
@@ -157,18 +129,18 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
             raise NotFittedError(f"this {name} is not fitted: call fit(demonstrations) first")
         if isinstance(X, Sequence) and X and all(isinstance(item, Situation) for item in X):
             return list(X)
-        return [self._warped(one, self._path(one)) for one in self._checked(X)]
+        return [self._retimed(one, self._path(one)) for one in self._checked(X)]
 
     @abc.abstractmethod
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Learn ``time_``, ``paths_`` and ``joint_names_``."""
 
     @abc.abstractmethod
-    def _path(self, demonstration: Demonstration) -> Tensor:
-        """Fractional time steps of a demonstration at each time of the grid."""
+    def _path(self, demonstration: Demonstration) -> Array:
+        """Instants of a demonstration at each time of the grid [s]."""
 
     def _start(self, X: Any) -> list[Demonstration]:
-        """What each ``fit`` begins with: check parameters and demonstrations."""
+        """Check parameters and demonstrations, as each ``fit`` does first."""
         check_parameters(self)
         check_robot(self.robot)
         demonstrations = check_demonstrations(X)
@@ -186,9 +158,9 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
         names = self.joint_names_
         return demonstrations if names is None else [d.reordered(names) for d in demonstrations]
 
-    def _warped(self, demonstration: Demonstration, path: Tensor) -> Demonstration:
+    def _retimed(self, demonstration: Demonstration, path: Array) -> Demonstration:
         blocks = quaternion_columns(demonstration, self.robot)
-        return retime(demonstration, path, self.time_, blocks, self.interpolation)
+        return retime(demonstration, path, self.time_, blocks)
 
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()

@@ -1,8 +1,8 @@
-"""What demonstrations are compared by when they are aligned in time."""
+"""Features by which demonstrations are compared when they are aligned in time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -22,15 +22,15 @@ __all__ = ["AlignmentFeatures", "quaternion_columns"]
 VELOCITY_SMOOTHING = 0.1
 #: Below this fraction of a demonstration's root mean square speed the direction fades out.
 STANDSTILL = 0.3
-#: Weights where those of the postures together have 1: postures differ between demonstrations
-#: at equal phase, by start and goal, and would shift a rhythm.
-SPEED_WEIGHT, DIRECTIONS_WEIGHT = 5.0, 4.5
-#: Columns that vary by less than this, relative to their size, count as constant.
+#: Weights of groups; the n others have ``n ** -0.5`` each. Postures differ between
+#: demonstrations at equal phase, by start and goal, and would shift a rhythm.
+WEIGHTS = {"speed": 5.0, "directions": 4.5}
+#: Columns that vary by less than this share of their size count as constant.
 CONSTANT = 1e-9
 
 
 def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[int]]:
-    """Where the joints hold unit quaternions, which is so for recorded poses.
+    """Columns of the joints that hold unit quaternions, as those of recorded poses do.
 
     Returns
     -------
@@ -69,17 +69,14 @@ class AlignmentFeatures:
 
     Parameters
     ----------
-    names : tuple of str
-        The groups in use.
     robot : Kinematics or None
         Gives the link positions.
     columns : mapping of str to ndarray of bool
-        Which columns of each group are not constant.
+        Which columns of each group in use are not constant.
     scales : mapping of str to float
-        What each group is multiplied by.
+        By which each group is multiplied.
     """
 
-    names: tuple[str, ...]
     robot: Any
     columns: Mapping[str, NDArray[np.bool_]]
     scales: Mapping[str, float]
@@ -90,7 +87,6 @@ class AlignmentFeatures:
         demonstrations: Sequence[Demonstration],
         robot: Any = None,
         names: Sequence[str] | None = None,
-        weights: Mapping[str, float] | None = None,
     ) -> Self:
         """Choose and scale the groups.
 
@@ -100,9 +96,9 @@ class AlignmentFeatures:
         Parameters
         ----------
         demonstrations, robot : sequence of Demonstration, Kinematics or None
-            What to compare.
-        names, weights : sequence of str, mapping of str to float, optional
-            As ``features`` and ``weights`` of :class:`DynamicTimeWarping`. Directions are no
+            To be compared.
+        names : sequence of str, optional
+            As ``features`` of :class:`DynamicTimeWarping`. Directions are no
             default: two demonstrations that reach for objects on either side move against each
             other, and the matching would rather skip the way. Neither are features seen from
             a frame: away from the object that the motion is about, they differ between
@@ -113,51 +109,47 @@ class AlignmentFeatures:
         UnknownNameError
             If a group does not exist.
         DataError
-            If a weight is negative, or no feature changes.
+            If no feature changes.
         """
         raw = [_groups(one, robot) for one in demonstrations]
-        if names is None:
-            names = ("speed", "joints", *getattr(robot, "links", ()))
-        _check_names(names, raw[0], "feature")
-        weights = dict(weights or {})
-        _check_names(weights, names, "weight")
-        usual = max(1, len(set(names) - {"speed", "directions"})) ** -0.5
-        defaults = dict.fromkeys(names, usual) | {
-            "speed": SPEED_WEIGHT,
-            "directions": DIRECTIONS_WEIGHT,
-        }
+        names = tuple(dict.fromkeys(names or ("speed", "joints", *getattr(robot, "links", ()))))
+        usual = max(1, len(set(names) - set(WEIGHTS))) ** -0.5
         columns: dict[str, NDArray[np.bool_]] = {}
         scales: dict[str, float] = {}
-        for name in dict.fromkeys(names):
-            weight = float(weights[name] if name in weights else defaults[name])
-            if not 0 <= weight < np.inf:
-                raise DataError(f"the weight of {name!r} is a number >= 0, got {weight}")
-            sizes = [len(groups[name]) for groups in raw]
-            within = np.stack([groups[name].var(axis=0) for groups in raw])
-            variance = np.average(within, axis=0, weights=sizes)
-            size = np.max([np.abs(groups[name]).max(axis=0) for groups in raw], axis=0)
+        for name in names:
+            if name not in raw[0]:
+                raise UnknownNameError("feature", name, "the features", raw[0])
+            groups = [one[name] for one in raw]
+            within = np.stack([group.var(axis=0) for group in groups])
+            variance = np.average(within, axis=0, weights=list(map(len, groups)))
+            size = np.max([np.abs(group).max(axis=0) for group in groups], axis=0)
             varying = np.sqrt(variance) > CONSTANT * size
-            if weight and varying.any():
+            if varying.any():
                 columns[name] = varying
-                scales[name] = weight / float(np.sqrt(variance[varying].sum()))
+                spread = float(np.sqrt(variance[varying].sum()))
+                scales[name] = WEIGHTS.get(name, usual) / spread
         if not columns:
             raise DataError(
                 f"none of the features {list(names)} changes in the demonstrations: "
                 "there is nothing to align by"
             )
-        return cls(tuple(columns), robot, columns, scales)
+        return cls(robot, columns, scales)
 
-    @classmethod
-    def others(cls, demonstrations: Sequence[Demonstration], used: Self) -> Self | None:
-        """What the features in use leave out: postures, speed, directions; None if nothing.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The groups in use."""
+        return tuple(self.columns)
+
+    def others(self, demonstrations: Sequence[Demonstration]) -> Self | None:
+        """The groups that are not in use, seen from frames left aside; None if none changes.
 
         Whether a matching by some features is right shows in others.
         """
-        names = ("speed", "joints", "directions", *getattr(used.robot, "links", ()))
-        rest = [name for name in names if name not in used.names]
+        names = ("speed", "joints", "directions", *getattr(self.robot, "links", ()))
+        rest = [name for name in names if name not in self.names]
         try:
-            return cls.fit(demonstrations, used.robot, rest) if rest else None
-        except DataError:  # nothing of it changes
+            return type(self).fit(demonstrations, self.robot, rest) if rest else None
+        except DataError:
             return None
 
     def __call__(self, demonstration: Demonstration) -> Array:
@@ -172,25 +164,17 @@ class AlignmentFeatures:
         )
 
 
-def _check_names(names: Iterable[str], available: Iterable[str], kind: str) -> None:
-    for name in names:
-        if name not in available:
-            raise UnknownNameError(kind, name, "the features", available)
-
-
 def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
-    """All feature groups that a demonstration has, unscaled, each of shape (T, d)."""
+    """All feature groups of a demonstration, unscaled, each of shape (T, d)."""
     joints = demonstration.joints
     quaternion = quaternion_columns(demonstration, robot)
-    inside = {column for block in quaternion for column in block}
-    others = [column for column in range(demonstration.n_joints) if column not in inside]
+    others = np.setdiff1d(np.arange(demonstration.n_joints), np.ravel(quaternion))
     turns = [quaternions.to_matrix(joints[:, block]).flatten(1) for block in quaternion]
     values = as_array(torch.cat((joints[:, others], *turns), dim=1))
     velocity = _velocity(values, demonstration)
     groups = {"joints": values, "directions": _directions(velocity)}
     if robot is None or not robot.links:
-        groups["speed"] = _speed(velocity)
-        return groups
+        return groups | {"speed": _speed(velocity)}
     names = getattr(robot, "joint_names", None)
     ordered = demonstration if names is None else demonstration.reordered(names)
     state = robot.state(ordered.joints.detach())
@@ -200,15 +184,13 @@ def _groups(demonstration: Demonstration, robot: Any) -> dict[str, Array]:
         groups[link] = as_array(position)
         speeds.append(_speed(_velocity(groups[link], demonstration)))
         for name, frame in demonstration.frames.items():
-            groups[f"{link} in {name}"] = as_array(
-                frame.to(position).inverse_transform(position)
-            )
-    groups["speed"] = np.concatenate(speeds, axis=1)
-    return groups
+            seen = frame.to(position).inverse_transform(position)
+            groups[f"{link} in {name}"] = as_array(seen)
+    return groups | {"speed": np.concatenate(speeds, axis=1)}
 
 
 def _velocity(values: Array, demonstration: Demonstration) -> Array:
-    """Smoothed rates of change, zero for what does not change, shape (T, d)."""
+    """Smoothed rates of change, zero where values are constant, shape (T, d)."""
     time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
@@ -218,7 +200,7 @@ def _velocity(values: Array, demonstration: Demonstration) -> Array:
 
 
 def _speed(velocity: Array) -> Array:
-    """Over its root mean square, which may be zero, shape (T, 1)."""
+    """Speed over its root mean square, which may be zero, shape (T, 1)."""
     speed = np.linalg.norm(velocity, axis=1, keepdims=True)
     usual = np.sqrt((speed**2).mean())
     return speed / usual if usual > 0 else speed

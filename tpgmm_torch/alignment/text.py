@@ -7,20 +7,19 @@ from typing import Any
 
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping
-from tpgmm_torch.alignment.events import EventAlignment
-from tpgmm_torch.alignment.linear import LinearTimeNormalization
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["METHODS", "parse_alignment"]
 
-#: The names that there are.
+#: Names of alignments.
 METHODS = ("dtw", "barycenter", "linear", "events", "events+dtw", "none")
 
 
 def parse_alignment(
     method: str, robot: Any = None, features: Sequence[str] | None = None
 ) -> Alignment | None:
-    """The transformer that a name stands for; None for ``"none"``.
+    """The transformer of a name; None for ``"none"``.
 
     Parameters
     ----------
@@ -29,7 +28,7 @@ def parse_alignment(
     robot : Kinematics, optional
         Gives link positions, and where joints hold quaternions.
     features : sequence of str, optional
-        What time warping compares, as in :class:`DynamicTimeWarping`.
+        Compared by time warping, as in :class:`DynamicTimeWarping`.
 
     Raises
     ------
@@ -41,14 +40,17 @@ def parse_alignment(
     >>> parse_alignment("linear")
     LinearTimeNormalization()
     """
-    if method not in METHODS:
-        raise DataError(f"an alignment is one of {list(METHODS)}, got {method!r}")
-    if method == "none":
-        return None
-    if method == "linear":
-        return LinearTimeNormalization(robot=robot)
-    if method == "events":
-        return EventAlignment(robot=robot)
     reference = "barycenter" if method == "barycenter" else "medoid"
     warping = DynamicTimeWarping(reference, features=features, robot=robot)
-    return EventAlignment(within=warping, robot=robot) if method == "events+dtw" else warping
+    match method:
+        case "none":
+            return None
+        case "linear":
+            return LinearTimeNormalization(robot=robot)
+        case "events":
+            return EventAlignment(robot=robot)
+        case "events+dtw":
+            return EventAlignment(within=warping, robot=robot)
+        case "dtw" | "barycenter":
+            return warping
+    raise DataError(f"an alignment is one of {list(METHODS)}, got {method!r}")

@@ -7,7 +7,8 @@ demonstrations.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,12 @@ __all__ = ["barycenter", "medoid", "moving_average", "resample", "warping_map", 
 
 Floats = NDArray[np.floating[Any]]
 
-#: A warp never runs slower than this, relative to its mean: events have one instant each.
+#: A warp never runs slower than this share of its mean: an event has one instant.
 SLOWEST = 1e-3
-#: The medoid is chosen on sequences of at most this many steps.
+#: Steps of the sequences of which the medoid is chosen; each pair costs their square.
 MEDOID_STEPS = 200
-#: The barycentre has converged when a round lowers the summed cost by less, relatively.
-BARYCENTER_TOLERANCE = 1e-3
+#: Rounds of the barycentre at most, and the relative fall of its cost at which it stops.
+BARYCENTER_ROUNDS, BARYCENTER_TOLERANCE = 10, 1e-3
 
 
 def resample(values: Array, time: Floats, grid: Floats) -> Array:
@@ -54,12 +55,7 @@ def moving_average(values: Array, width: int) -> Array:
 
 
 def warping_path(
-    reference: Array,
-    source: Array,
-    window: int | None = None,
-    penalty: float = 0.0,
-    open_end: bool = False,
-    max_slope: int = 2,
+    reference: Array, source: Array, penalty: float = 0.0, max_slope: int = 2
 ) -> tuple[NDArray[np.intp], float]:
     """The cheapest monotone matching of two sequences, within bounds of its slope.
 
@@ -71,12 +67,8 @@ def warping_path(
     ----------
     reference, source : ndarray of shape (N, D) and (M, D)
         The sequences.
-    window : int, optional
-        Matched indices differ by at most this.
     penalty : float, default=0.0
         Its square is added for each step that advances in one sequence alone.
-    open_end : bool, default=False
-        Match the whole reference with the best prefix of the source.
     max_slope : int, default=2
         At least one, which leaves the diagonal alone.
 
@@ -85,81 +77,49 @@ def warping_path(
     path : ndarray of shape (L, 2)
         Matched (reference, source) indices from (0, 0) on.
     cost : float
-        Summed squared distances and penalties, infinite if no path reaches an end.
+        Summed squared distances and penalties, infinite if no path reaches the end.
 
     References
     ----------
     .. [1] H. Sakoe, S. Chiba: Dynamic programming algorithm optimization for spoken word
        recognition. IEEE Transactions on Acoustics, Speech, and Signal Processing 26 (1978).
     """
-    costs, totals = _accumulated(reference, source, window, penalty**2, max_slope)
-    i, j = totals.shape[0] - 1, totals.shape[1] - 1
-    if open_end:
-        j = max_slope + int(np.argmin(totals[i, max_slope:]))
-    cost = float(totals[i, j])
-    if not np.isfinite(cost):
-        return np.empty((0, 2), dtype=np.intp), cost
-    return _backtrack(costs, totals, i, j, penalty**2, max_slope), cost
-
-
-def _accumulated(
-    reference: Array, source: Array, window: int | None, penalty: float, border: int
-) -> tuple[Array, Array]:
-    """Local costs and those of the cheapest paths to each pair, from ``border`` indices on.
-
-    A path begins at the last pair of the border, whose others cannot be reached.
-    """
-    n, m = len(reference), len(source)
+    n, m, border = len(reference), len(source), max_slope
     costs = np.zeros((n + border, m + border))
     costs[border:, border:] = cdist(reference, source, "sqeuclidean")
-    if window is not None:
-        far = np.abs(np.arange(n)[:, None] - np.arange(m)) > window
-        costs[border:, border:][far] = np.inf
+    # a path begins at the last pair of the border, whose others cannot be reached
     totals = np.full_like(costs, np.inf)
     totals[border - 1, border - 1] = 0.0
+    segments = [(1, 1), *((a, b) for k in range(2, border + 1) for a, b in ((1, k), (k, 1)))]
+
+    def candidates(i: int, begin: int, end: int) -> Iterator[Array]:
+        """Costs of the pairs (i, begin) to (i, end - 1), reached by each of the segments."""
+        along = across = costs[i, begin:end]
+        yield totals[i - 1, begin - 1 : end - 1] + along
+        for k in range(2, border + 1):
+            along = along + costs[i, begin - k + 1 : end - k + 1] + penalty**2
+            across = across + costs[i - k + 1, begin:end] + penalty**2
+            yield totals[i - 1, begin - k : end - k] + along
+            yield totals[i - k, begin - 1 : end - 1] + across
+
     for i in range(border, n + border):
-        row, before = costs[i], totals[i - 1]
-        best = before[border - 1 : -1] + row[border:]
-        # of segments that advance by k in the source, then in the reference
-        along, across = row[border:], row[border:]
-        for k in range(2, border + 1):
-            start = border - k
-            along = along + row[start + 1 : start + 1 + m] + penalty
-            np.minimum(best, before[start : start + m] + along, out=best)
-            across = across + costs[i - k + 1, border:] + penalty
-            np.minimum(best, totals[i - k, border - 1 : -1] + across, out=best)
-        totals[i, border:] = best
-    return costs, totals
-
-
-def _backtrack(
-    costs: Array, totals: Array, i: int, j: int, penalty: float, border: int
-) -> NDArray[np.intp]:
-    """Follow the accumulated costs back to the border; in doubt, diagonally."""
+        totals[i, border:] = reduce(np.minimum, candidates(i, border, m + border))
     path = []
-    while i >= border:
-        best, step = totals[i - 1, j - 1] + costs[i, j], (1, 1)
-        along = across = costs[i, j]
-        for k in range(2, border + 1):
-            along = along + costs[i, j - k + 1] + penalty
-            across = across + costs[i - k + 1, j] + penalty
-            for total, other in (
-                (totals[i - 1, j - k] + along, (1, k)),
-                (totals[i - k, j - 1] + across, (k, 1)),
-            ):
-                if total < best:
-                    best, step = total, other
-        path += [(i - min(k, step[0] - 1), j - min(k, step[1] - 1)) for k in range(max(step))]
-        i, j = i - step[0], j - step[1]
-    return np.array(path[::-1], dtype=np.intp) - border
+    i, j = n + border - 1, m + border - 1
+    cost = float(totals[i, j])
+    while np.isfinite(cost) and i >= border:
+        a, b = segments[np.argmin([c[0] for c in candidates(i, j, j + 1)])]
+        path += [(i - min(k, a - 1), j - min(k, b - 1)) for k in range(max(a, b))]
+        i, j = i - a, j - b
+    return np.array(path[::-1], dtype=np.intp).reshape(-1, 2) - border, cost
 
 
 def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
     """Turn a ``path`` (L, 2) into an increasing function of the reference index.
 
-    Each reference index gets the mean of the source indices matched with it. What a path
-    leaves is a staircase, whose steps would be bursts of speed: a moving average of that
-    ``width`` removes them. The ends of the path are kept.
+    Each reference index gets the mean of the source indices matched with it. The result is a
+    staircase, whose steps would be bursts of speed: a moving average of that ``width`` removes
+    them. The ends of the path are kept.
 
     Returns
     -------
@@ -173,33 +133,28 @@ def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
     return (1 - SLOWEST) * moving_average(means, width) + SLOWEST * line
 
 
-def medoid(sequences: Sequence[Array], window: float | None = None, max_slope: int = 2) -> int:
+def medoid(sequences: Sequence[Array], max_slope: int = 2) -> int:
     """Index of the sequence with the least summed warping distance to the others.
 
     Parameters
     ----------
     sequences : sequence of ndarray of shape (T_m, D)
         At least one.
-    window : float, optional
-        As a fraction of the duration.
     max_slope : int, default=2
         As in :func:`warping_path`.
     """
     if len(sequences) < 3:
         return 0
-    steps = min(MEDOID_STEPS, max(map(len, sequences)))
-    phase = np.linspace(0, 1, steps)
+    phase = np.linspace(0, 1, min(MEDOID_STEPS, max(map(len, sequences))))
     short = [resample(s, np.linspace(0, 1, len(s)), phase) for s in sequences]
-    band = None if window is None else max(1, round(window * (steps - 1)))
     total = np.zeros(len(short))
     for i, j in itertools.combinations(range(len(short)), 2):
-        _, costs = _accumulated(short[i], short[j], band, 0.0, max_slope)
-        total[[i, j]] += np.sqrt(costs[-1, -1])
+        total[[i, j]] += np.sqrt(warping_path(short[i], short[j], 0.0, max_slope)[1])
     return int(np.argmin(total))
 
 
 def barycenter(
-    sequences: Sequence[Array], start: Array, n_iter: int = 10, **options: Any
+    sequences: Sequence[Array], start: Array, penalty: float = 0.0, max_slope: int = 2
 ) -> Array:
     """Average sequences by dynamic time warping barycentre averaging (DBA).
 
@@ -212,10 +167,8 @@ def barycenter(
         At least one.
     start : ndarray of shape (N, D)
         First guess, usually the medoid.
-    n_iter : int, default=10
-        Largest number of rounds.
-    **options
-        Passed to :func:`warping_path`.
+    penalty, max_slope : float, int
+        As in :func:`warping_path`.
 
     References
     ----------
@@ -223,10 +176,10 @@ def barycenter(
     with applications to clustering, Pattern Recognition 44(3), 2011.
     """
     average, last = start, np.inf
-    for _ in range(n_iter):
+    for _ in range(BARYCENTER_ROUNDS):
         total, counts, cost = np.zeros_like(start), np.zeros(len(start)), 0.0
         for sequence in sequences:
-            path, one = warping_path(average, sequence, **options)
+            path, one = warping_path(average, sequence, penalty, max_slope)
             np.add.at(total, path[:, 0], sequence[path[:, 1]])
             counts += np.bincount(path[:, 0], minlength=len(start))
             cost += one

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 
-from tpgmm_torch.alignment.events import EventAlignment
-from tpgmm_torch.alignment.linear import LinearTimeNormalization
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.alignment.base import retime, steps_at
+from tpgmm_torch.alignment.base import retime
 from tpgmm_torch.alignment.features import quaternion_columns
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
@@ -261,8 +261,7 @@ def on_grid(
         )
     there = instants[inside]
     blocks = quaternion_columns(demonstration, kinematics)
-    path = steps_at(demonstration, as_array(there))
-    return retime(demonstration, path, there, blocks), int(inside[0])
+    return retime(demonstration, as_array(there), there, blocks), int(inside[0])
 
 
 def gather_rows(

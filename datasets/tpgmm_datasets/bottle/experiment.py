@@ -292,19 +292,18 @@ class _Measure:
     def alignment(
         self,
         demonstrations: Sequence[Demonstration],
-        paths: Sequence[Tensor],
+        paths: Sequence[NDArray[np.float64]],
         trajectories: Sequence[Trajectory],
     ) -> dict[str, float]:
         """How unlike the demonstrations shake, and the reproductions from each of them.
 
-        The true phase of a demonstration is known from its events, and ``paths`` say which
-        of its time steps stands at each instant of the common clock.
+        The true phase of a demonstration is known from its events, and ``paths`` are its
+        instants at each time of the common clock [s].
         """
         phases = []
         for demonstration, path in zip(demonstrations, paths, strict=True):
             shake, rest = (demonstration.events[name] for name in ("shake", "rest"))
-            source = path / self.skill.rate
-            done = ((source - shake) / (rest - shake)).clamp(0, 1)
+            done = ((torch.from_numpy(path) - shake) / (rest - shake)).clamp(0, 1)
             phases.append(2 * math.pi * self.skill.cycles * done)
         spread = torch.stack(phases)[:, self.steady].std(0)
         shoulders = torch.stack([self.skill.shoulders(t) for t in trajectories])

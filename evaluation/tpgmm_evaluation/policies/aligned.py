@@ -13,7 +13,7 @@ from torch import Tensor
 from tpgmm_datasets import describe_lerobot, load_lerobot
 from tpgmm_torch import Demonstration, Kinematics
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.alignment.base import retime, seconds
+from tpgmm_torch.alignment.base import retime
 
 __all__ = ["Aligned"]
 
@@ -100,13 +100,10 @@ def _on_mean_clock(
         return list(demonstrations)
     warping = DynamicTimeWarping(robot=robot).fit(demonstrations)
     clock = warping.time_.numpy()
-    paths = [path.numpy() for path in warping.paths_]
-    pairs = zip(paths, demonstrations, strict=True)
-    own = [np.interp(path, np.arange(len(one)), seconds(one)) for path, one in pairs]
-    mean = np.mean(own, axis=0)
+    mean = np.mean(warping.paths_, axis=0)
     grid = np.arange(np.floor((mean[-1] - mean[0]) * fps + 1e-6) + 1) / fps
     at = np.interp(grid + mean[0], mean, clock)
     return [
-        retime(one, torch.from_numpy(np.interp(at, clock, path)), torch.from_numpy(grid))
-        for path, one in zip(paths, demonstrations, strict=True)
+        retime(one, np.interp(at, clock, path), torch.from_numpy(grid))
+        for path, one in zip(warping.paths_, demonstrations, strict=True)
     ]

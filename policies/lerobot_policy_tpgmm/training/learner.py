@@ -50,7 +50,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment.base import Alignment
-from tpgmm_torch.alignment.events import EventAlignment
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.events.detection import Detector, find_events
@@ -406,7 +406,7 @@ class Learner:
             time = aligner.time_.numpy()
             instants = np.interp(grid, grid[[0, -1]], time[[0, -1]])
             for number, path in zip(numbers, aligner.paths_, strict=True):
-                paths[number] = np.interp(instants, time, path.numpy())
+                paths[number] = self._fps * np.interp(instants, time, path - path[0])
         return Clock(lengths, grid, paths, self._fps)
 
     def _gradient_loss(self, batch: Mapping[str, Any], training: bool) -> Tensor:

@@ -37,8 +37,8 @@ from tpgmm_torch.robots.tracked_poses import Poses
 def spread_of_shake(paths):
     """Standard deviation between demonstrations of the shake's phase [rad], worst instant."""
     reached = [
-        np.interp(path.numpy(), np.arange(len(phase)), phase)
-        for path, phase in zip(paths, PHASES, strict=True)
+        np.interp(path, one.time, phase)
+        for path, one, phase in zip(paths, DEMONSTRATIONS, PHASES, strict=True)
     ]
     shaking = np.all([(s > 8.2) & (s < 11.8) for s in reached], axis=0)
     assert shaking.sum() > 100
@@ -60,7 +60,6 @@ def warped(request):
     transformer = DynamicTimeWarping(
         "barycenter" if request.param == "barycenter" else "medoid",
         robot=Arm() if request.param == "robot" else None,
-        n_iter=4,
     )
     return transformer, transformer.fit_transform(DEMONSTRATIONS)
 
@@ -85,9 +84,8 @@ def test_all_results_share_one_increasing_clock(warped):
 
 def test_paths_increase_and_keep_both_ends(warped):
     for path, demonstration in zip(warped[0].paths_, DEMONSTRATIONS, strict=True):
-        assert (path.diff() > 0).all()
-        assert path[0] == pytest.approx(0, abs=1e-9)
-        assert path[-1] == pytest.approx(len(demonstration) - 1, abs=1e-9)
+        assert (np.diff(path) > 0).all()
+        assert path[[0, -1]] == pytest.approx(demonstration.time[[0, -1]].numpy(), abs=1e-9)
 
 
 def test_warped_joints_have_no_bursts_of_speed(warped):
@@ -115,12 +113,10 @@ def test_the_reference_is_recovered_exactly():
     transformer = DynamicTimeWarping(reference=2, robot=Arm())
     aligned = transformer.fit_transform(DEMONSTRATIONS[:4])
     own = DEMONSTRATIONS[2]
-    assert transformer.reference_ is own and transformer.reference_index_ == 2
+    assert transformer.reference_index_ == 2
     torch.testing.assert_close(aligned[2].joints, own.joints, rtol=0, atol=1e-11)
     assert torch.equal(aligned[2].time, own.time)
     assert dict(aligned[2].events) == pytest.approx(dict(own.events), abs=1e-9)
-    assert transformer.distortions_[2] < 1e-9
-    assert (np.delete(transformer.distortions_, 2) > 0.01).all()
 
 
 @settings(max_examples=15)
@@ -141,19 +137,15 @@ def test_a_time_warped_copy_is_recovered(seed, scale, rate):
     aligned = transformer.fit_transform([original, copy])[1]
     assert (aligned.joints - original.joints).abs().max() < 0.02
     moving = ((even > 0.8) & (even < 2.2)) | ((even > 8.4) & (even < 11.6))
-    reached = np.interp(transformer.paths_[1].numpy(), np.arange(len(phase)), phase)
+    reached = np.interp(transformer.paths_[1], time, phase)
     assert np.abs(reached - even)[moving].max() < 0.05
 
 
-def test_the_barycenter_represents_all_better_than_any_one_of_them():
-    medoid = DynamicTimeWarping().fit(DEMONSTRATIONS)
-    average = DynamicTimeWarping("barycenter", n_iter=4).fit(DEMONSTRATIONS)
-    assert np.sqrt((average.distortions_**2).mean()) < 0.95 * np.sqrt(
-        (medoid.distortions_**2).mean()
-    )
-    assert average.reference_.shape[0] == len(average.time_) == len(medoid.time_)
-    durations = [d.duration for d in DEMONSTRATIONS]
-    assert float(average.time_[-1]) == pytest.approx(np.mean(durations), rel=1e-9)
+def test_the_barycenter_runs_on_the_average_clock():
+    family = DEMONSTRATIONS[:3]
+    time = DynamicTimeWarping("barycenter").fit(family).time_
+    assert time[0] == 0
+    assert float(time[-1]) == pytest.approx(np.mean([one.duration for one in family]), rel=1e-9)
 
 
 def test_the_medoid_is_the_one_in_the_middle():
@@ -174,57 +166,15 @@ def test_the_sign_of_recorded_quaternions_does_not_matter():
         DynamicTimeWarping(0, robot=Poses(["hand"])).fit([one, d]).paths_[1]
         for d in (other, negative)
     )
-    torch.testing.assert_close(same, opposite, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(same, opposite, rtol=0, atol=1e-9)
 
 
-def test_units_do_not_decide_but_weights_do():
-    rng = np.random.default_rng(3)
-    family = DEMONSTRATIONS[:3]
+def test_units_do_not_decide():
     # a power of two: where nothing moves, rounding decides
+    family = DEMONSTRATIONS[:3]
     milli = [Demonstration(d.time, d.joints * 1024, d.frames) for d in family]
-    paths = [DynamicTimeWarping(0, n_steps=200).fit(x).paths_[1] for x in (family, milli)]
-    torch.testing.assert_close(*paths, rtol=0, atol=1e-9)
-    noise = [Demonstration(d.time, rng.normal(size=(len(d), 5)), d.frames) for d in family]
-    with_weight = DynamicTimeWarping(weights={"speed": 0}, fallback=False).fit(noise)
-    assert with_weight.feature_names_ == ("joints",)
-
-
-def test_an_open_end_matches_the_best_prefix():
-    even = np.linspace(0, 8, 801)
-    short = Demonstration(even, motion(even, np.zeros(5), np.ones(5)))
-    time, phase = random_clock(np.random.default_rng(5), 13.0)
-    events = {name: np.interp(s, phase, time) for name, s in (("early", 6.5), ("late", 12.0))}
-    whole = Demonstration(time, motion(phase, np.zeros(5), np.ones(5)), events=events)
-    open_end = DynamicTimeWarping(0, features=["joints"], penalty=0.0, open_end=True)
-    aligned = open_end.fit_transform([short, whole])[1]
-    assert (aligned.joints - short.joints).abs().max() < 0.02
-    assert np.interp(open_end.paths_[1][-1], np.arange(len(phase)), phase) < 8.3
-    assert aligned.events["early"] == pytest.approx(6.5, abs=0.05)
-    assert "late" not in aligned.events
-    closed = DynamicTimeWarping(0).fit_transform([short, whole])[1]
-    assert (closed.joints - short.joints).abs().max() > 0.1
-
-
-def test_the_window_bounds_the_difference_from_linear_normalization():
-    transformer = DynamicTimeWarping(window=0.02, smoothing=0).fit(DEMONSTRATIONS)
-    free = DynamicTimeWarping(smoothing=0).fit(DEMONSTRATIONS)
-
-    def deviation(fitted):
-        return max(
-            np.abs(path.numpy() / path[-1].item() - np.linspace(0, 1, len(path))).max()
-            for path in fitted.paths_
-        )
-
-    assert deviation(transformer) < 0.0205 < deviation(free)
-
-
-def test_a_window_too_narrow_for_an_open_end_names_the_smallest():
-    even = np.linspace(0, 10, 501)
-    long = Demonstration(even, np.sin(even)[:, None])
-    short = Demonstration(even[:401], np.sin(even[:401])[:, None])
-    with pytest.raises(DataError, match=r"smallest possible is 0\.2000"):
-        DynamicTimeWarping(0, open_end=True, window=0.1).fit([long, short])
-    DynamicTimeWarping(0, open_end=True, window=0.2).fit([long, short])
+    paths = [DynamicTimeWarping(0).fit(x).paths_[1] for x in (family, milli)]
+    np.testing.assert_allclose(*paths, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("reference", ["medoid", "barycenter", 0, -1])
@@ -234,33 +184,13 @@ def test_one_demonstration_alone_stays_itself(reference):
     torch.testing.assert_close(aligned.joints, own.joints, rtol=0, atol=1e-9)
 
 
-def test_float32_and_uneven_sampling_are_kept():
-    own = DEMONSTRATIONS[0]
-    keep = torch.from_numpy(np.sort(np.random.default_rng(0).permutation(len(own))[:700]))
-    keep[0], keep[-1] = 0, len(own) - 1
-    uneven = Demonstration(own.time[keep].float(), own.joints[keep].float(), own.frames)
-    transformer = DynamicTimeWarping(1)
-    aligned = transformer.fit_transform([uneven, own])
-    assert aligned[0].joints.dtype == aligned[0].time.dtype == torch.float32
-    assert (aligned[0].joints - own.joints).abs().max() < 0.02
-
-
-def test_joints_are_brought_into_the_order_of_the_first():
-    first, second = DEMONSTRATIONS[:2]
-    swapped = second.reordered(tuple("edcba"))
-    expected = DynamicTimeWarping(0).fit_transform([first, second])[1]
-    given_swapped = DynamicTimeWarping(0).fit_transform([first, swapped])[1]
-    assert given_swapped.joint_names == first.joint_names
-    torch.testing.assert_close(given_swapped.joints, expected.joints, rtol=0, atol=0)
-
-
 def test_it_is_a_transformer_of_scikit_learn():
-    transformer = DynamicTimeWarping("barycenter", weights={"joints": 2.0}, n_steps=100)
+    transformer = DynamicTimeWarping("barycenter", features=["joints"])
     copy = clone(transformer)
     assert copy.get_params() == transformer.get_params()
     fitted = pickle.loads(pickle.dumps(transformer.fit(DEMONSTRATIONS[:2])))
     [aligned] = Pipeline([("align", fitted)]).transform(DEMONSTRATIONS[:1])
-    assert len(aligned) == 100
+    assert len(aligned) == len(fitted.time_)
     situations = [Situation(torch.zeros(5))]
     assert fitted.transform(situations) == situations
 
@@ -269,12 +199,8 @@ def test_it_is_a_transformer_of_scikit_learn():
     "parameters, error, message",
     [
         ({"features": ["elbow"]}, UnknownNameError, "'elbow' is not in the features; it has"),
-        ({"weights": {"hand": 1.0}}, UnknownNameError, "weight 'hand' is not in the features"),
-        ({"weights": {"joints": -1.0}}, DataError, "number >= 0, got -1"),
         ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
         ({"reference": "mean"}, ValueError, "reference"),
-        ({"window": 0}, ValueError, "window"),
-        ({"max_slope": 0}, ValueError, "max_slope"),
         ({"max_slope": 1.5}, ValueError, "max_slope"),
         ({"fallback": "linear"}, ValueError, "fallback"),
     ],
@@ -284,38 +210,20 @@ def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message
         DynamicTimeWarping(**parameters).fit(DEMONSTRATIONS[:2])
 
 
-@pytest.mark.parametrize("options", [{}, {"open_end": True}, {"reference": "barycenter"}])
-def test_when_a_clock_starts_does_not_matter(options):
-    options = {"reference": 0, "n_iter": 2} | options
+@pytest.mark.parametrize("reference", [0, "barycenter"])
+def test_when_a_clock_starts_does_not_matter(reference):
     family = DEMONSTRATIONS[1:4]
     later = [
         Demonstration(d.time + shift, d.joints, d.frames, d.joint_names)
         for d, shift in zip(family, (0.0, 7.0, -3.0), strict=True)
     ]
-    same, shifted = (DynamicTimeWarping(**options).fit(x) for x in (family, later))
+    same, shifted = (DynamicTimeWarping(reference).fit(x) for x in (family, later))
     for one, other in zip(same.transform(family), shifted.transform(later), strict=True):
         # where nothing moves, rounding decides what is matched
         torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=5e-3)
-    np.testing.assert_allclose(same.distortions_, shifted.distortions_, rtol=1e-3)
-    moved = DynamicTimeWarping(**options).fit([later[1], *later[::2]])
-    start = 0.0 if options["reference"] == "barycenter" else 7.0
+    moved = DynamicTimeWarping(reference).fit([later[1], *later[::2]])
+    start = 0.0 if reference == "barycenter" else 7.0
     assert float(moved.time_[0]) == pytest.approx(start)
-
-
-def test_distortions_are_distances_of_features_along_the_paths():
-    family = DEMONSTRATIONS[:3]
-    fitted = DynamicTimeWarping(0, features=["joints"]).fit(family)
-    joints = [one.joints for one in fitted.fit_transform(family)]
-    scale = np.sqrt(
-        np.average(
-            [d.joints.var(0, correction=0).sum() for d in family],
-            weights=list(map(len, family)),
-        )
-    )
-    expected = [
-        float((one - joints[0]).square().sum(1).mean().sqrt()) / scale for one in joints
-    ]
-    assert fitted.distortions_ == pytest.approx(expected, rel=1e-2, abs=1e-9)
 
 
 def test_smoothing_covers_its_seconds_on_both_sides():
@@ -326,8 +234,7 @@ def test_smoothing_covers_its_seconds_on_both_sides():
     # a wait, that the other does not have, is steeper than any usual bound
     options = {"features": ["joints"], "penalty": 0.0, "max_slope": 60, "fallback": False}
     sharp, smooth = (
-        DynamicTimeWarping(0, smoothing=s, **options).fit([waiting, steady]).paths_[1].numpy()
-        / 100
+        DynamicTimeWarping(0, smoothing=s, **options).fit([waiting, steady]).paths_[1]
         for s in (0.0, 0.5)
     )
     np.testing.assert_allclose(sharp, halting, rtol=0, atol=0.02)
@@ -335,19 +242,6 @@ def test_smoothing_covers_its_seconds_on_both_sides():
     np.testing.assert_allclose(smooth[far], sharp[far], rtol=0, atol=0.02)
     near = (abs(even - 2) < 0.3) | (abs(even - 3) < 0.3)
     assert np.abs(smooth - sharp)[near].max() > 0.05
-
-
-@pytest.mark.parametrize("window, steps", [(0.0724, 1), (0.0776, 2), (0.12, 2), (0.01, 1)])
-def test_the_window_is_the_nearest_number_of_steps_of_the_reference(window, steps):
-    # two peaks, on twenty steps, are matched if the window lets one reach the other
-    peaks = [(np.arange(21.0) == peak)[:, None] * 1.0 for peak in (8, 8 + steps, 9 + steps)]
-    own, near, far = (Demonstration(np.arange(21.0), peak) for peak in peaks)
-    warping = DynamicTimeWarping(
-        0, features=["joints"], penalty=0.0, smoothing=0.0, window=window
-    )
-    assert (
-        warping.fit([own, near]).distortions_[1] < 0.1 < warping.fit([own, far]).distortions_[1]
-    )
 
 
 @cache
@@ -394,7 +288,7 @@ def test_no_second_of_a_warp_is_steeper_or_flatter_than_allowed(max_slope):
     fitted = DynamicTimeWarping(0, features=["joints"], max_slope=max_slope, fallback=False)
     for path in fitted.fit(DEMONSTRATIONS[:4]).paths_:
         steps = round(1.0 / float(fitted.time_[1]))
-        share = path / path[-1]
+        share = (path - path[0]) / (path[-1] - path[0])
         slopes = (share[steps:] - share[:-steps]) * (len(path) - 1) / steps
         # a segment that is cut by the ends of the second belongs to it in part
         assert slopes.max() < max_slope * 1.05 and slopes.min() > 0.95 / max_slope
@@ -408,7 +302,7 @@ def unlike(seed, duration=10.0):
 
 
 def linear_path(transformer, one):
-    return torch.linspace(0, len(one) - 1, len(transformer.time_), dtype=torch.float64)
+    return np.linspace(*one.time[[0, -1]].tolist(), len(transformer.time_))
 
 
 @pytest.mark.parametrize("reference", [0, "barycenter"])
@@ -421,7 +315,7 @@ def test_what_warping_does_not_bring_nearer_stays_linear_with_a_warning(referenc
         aligned = transformer.fit_transform(family)
     assert len(caught) == 1
     assert list(transformer.fallback_) == [1]
-    torch.testing.assert_close(transformer.paths_[1], linear_path(transformer, family[1]))
+    np.testing.assert_allclose(transformer.paths_[1], linear_path(transformer, family[1]))
     assert len({len(one) for one in aligned}) == 1
     with pytest.warns(PlausibilityWarning, match="linear time"):
         [again] = transformer.transform(family[1:2])
@@ -434,7 +328,7 @@ def test_the_fallback_can_be_turned_off():
         linear = DynamicTimeWarping(0).fit(family)
     warped = DynamicTimeWarping(0, fallback=False).fit(family)
     assert list(linear.fallback_) == [1] and warped.fallback_ == {}
-    assert (warped.paths_[1] - linear.paths_[1]).abs().max() > 0.02 * 250
+    assert np.abs(warped.paths_[1] - linear.paths_[1]).max() > 0.02 * 10
 
 
 def test_demonstrations_on_one_clock_need_no_warping_and_no_warning():
@@ -442,13 +336,4 @@ def test_demonstrations_on_one_clock_need_no_warping_and_no_warning():
     family = [Demonstration(time, motion(time, np.full(5, c), np.ones(5))) for c in (0.0, 0.1)]
     fitted = DynamicTimeWarping(0).fit(family)
     assert fitted.fallback_ == {}
-    assert (fitted.paths_[1] - linear_path(fitted, family[1])).abs().max() < 0.02 * 400
-
-
-def test_an_end_that_no_allowed_slope_reaches_is_refused():
-    even = np.linspace(0, 10, 501)
-    long = Demonstration(even, np.sin(even)[:, None])
-    short = Demonstration(even[:201], np.sin(even[:201])[:, None])
-    with pytest.raises(DataError, match="4 s is too short for a reference of 10 s: within max"):
-        DynamicTimeWarping(0, open_end=True).fit([long, short])
-    DynamicTimeWarping(0, open_end=True, max_slope=3).fit([long, short])
+    assert np.abs(fitted.paths_[1] - linear_path(fitted, family[1])).max() < 0.02 * 8

@@ -21,6 +21,8 @@ from tpgmm_torch.robots.tracked_poses import Poses
 def test_features_are_named_and_constant_ones_left_out():
     transformer = DynamicTimeWarping(0, robot=Arm()).fit(DEMONSTRATIONS[:2])
     assert transformer.feature_names_ == ("speed", "joints", "elbow", "hand")
+    with pytest.raises(UnknownNameError, match="'knee' is not in the features; it has"):
+        DynamicTimeWarping(features=["knee"]).fit(DEMONSTRATIONS[:2])
     chosen = ["hand in bottle", "joints"]
     transformer = DynamicTimeWarping(0, features=chosen, robot=Arm()).fit(DEMONSTRATIONS[:2])
     assert transformer.feature_names_ == tuple(chosen)
@@ -45,9 +47,9 @@ def test_frames_unknown_to_fit_are_an_error():
         fitted.transform([bare])
 
 
-def unscaled(demonstrations, name, robot=None):
-    """The columns of one group, which has weight 1."""
-    features = AlignmentFeatures.fit(demonstrations, robot, [name], {name: 1.0})
+def scaled(demonstrations, name, robot=None):
+    """The columns of one group."""
+    features = AlignmentFeatures.fit(demonstrations, robot, [name])
     return [features(one) for one in demonstrations]
 
 
@@ -57,11 +59,19 @@ def variance(rows):
     return np.average([one.var(axis=0).sum() for one in rows], weights=sizes)
 
 
-@pytest.mark.parametrize("name", ["joints", "directions", "hand", "hand in bottle"])
-def test_a_group_has_the_square_of_its_weight_as_variance(name):
+@pytest.mark.parametrize(
+    "name, weight",
+    [
+        ("joints", 1.0),
+        ("speed", 5.0),
+        ("directions", 4.5),
+        ("hand", 1.0),
+        ("hand in bottle", 1.0),
+    ],
+)
+def test_a_group_has_the_square_of_its_weight_as_variance(name, weight):
     family = DEMONSTRATIONS[:3]
-    features = AlignmentFeatures.fit(family, Arm(), [name], {name: 2.5})
-    assert variance([features(one) for one in family]) == pytest.approx(2.5**2)
+    assert variance(scaled(family, name, Arm())) == pytest.approx(weight**2)
 
 
 def test_speed_and_directions_weigh_more_than_all_others_together():
@@ -70,25 +80,19 @@ def test_speed_and_directions_weigh_more_than_all_others_together():
     names = ["speed", "joints", "directions", "elbow", "hand"]
     features = AlignmentFeatures.fit(family, Arm(), names)
     assert features.names == tuple(names)
-    assert list(features.scales) == list(features.columns) == list(features.names)
-    by_group = {
-        name: features.scales[name]
-        / AlignmentFeatures.fit(family, Arm(), [name], {name: 1.0}).scales[name]
-        for name in features.names
-    }
+    alone = {n: AlignmentFeatures.fit(family, Arm(), [n]).scales[n] for n in names}
+    shares = {name: features.scales[name] / alone[name] for name in names}
     other = 3**-0.5
-    expected = {"speed": 5.0, "joints": other, "directions": 4.5, "elbow": other, "hand": other}
-    assert by_group == pytest.approx(expected)
-    alone = AlignmentFeatures.fit(family, None, ["directions"])
-    assert variance([alone(one) for one in family]) == pytest.approx(4.5**2)
+    expected = {"speed": 1.0, "joints": other, "directions": 1.0, "elbow": other, "hand": other}
+    assert shares == pytest.approx(expected)
 
 
 def test_features_are_what_they_are_called():
     family = DEMONSTRATIONS[:2]
-    [joints, _] = unscaled(family, "joints")
+    [joints, _] = scaled(family, "joints")
     given = family[0].joints.numpy()
     np.testing.assert_allclose(joints / joints[500, 0], given / given[500, 0], rtol=1e-9)
-    seen = unscaled(family, "hand in bottle", Arm())[0]
+    seen = scaled(family, "hand in bottle", Arm())[0]
     frame = family[0].frames["bottle"]
     place = frame.inverse_transform(Arm().state(family[0].joints).position("hand")).numpy()
     moved = place.std(axis=0) > 1e-9
@@ -99,7 +103,7 @@ def test_directions_do_not_depend_on_the_speed_and_fade_out_at_standstill():
     time = np.linspace(0, 4, 401)
     # forth along (3, 4), a rest, and back at half the speed
     way = np.interp(time, [0, 1, 2, 4], [0, 1, 1, 0])
-    direction = unscaled([Demonstration(time, np.outer(way, [3.0, 4.0]))], "directions")[0]
+    direction = scaled([Demonstration(time, np.outer(way, [3.0, 4.0]))], "directions")[0]
     forth, rest, back = direction[50], direction[150], direction[300]
     np.testing.assert_allclose(forth[1] / forth[0], 4 / 3)
     np.testing.assert_allclose(rest, 0, atol=1e-9)
@@ -119,7 +123,7 @@ def test_directions_are_those_of_uneven_time_steps_too():
         return np.stack((np.sin(2 * t), np.cos(3 * t)), axis=1)
 
     uneven, regular = (
-        unscaled([Demonstration(t, path(t))], "directions")[0] for t in (time, even)
+        scaled([Demonstration(t, path(t))], "directions")[0] for t in (time, even)
     )
     for column in range(2):
         expected = np.interp(time, even, regular[:, column])
@@ -147,29 +151,9 @@ def test_quaternions_count_as_rotations():
     time = np.linspace(0, 1, 30)
     own = turning(time, time)
     turns = own.frames["moving"].orientation
-    [rows] = unscaled([own], "joints", Poses(["hand"]))
+    [rows] = scaled([own], "joints", Poses(["hand"]))
     expected = np.column_stack((own.joints[:, :3], quaternions.to_matrix(turns).flatten(1)))
     np.testing.assert_allclose(rows / rows[9, 0], expected / expected[9, 0], rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("names", "weights", "error", "message"),
-    [
-        (["knee"], None, UnknownNameError, "feature 'knee' is not in the features; it has"),
-        (None, {"knee": 1.0}, UnknownNameError, "weight 'knee' is not in the features"),
-        (None, {"joints": -1.0}, DataError, "'joints' is a number >= 0, got -1"),
-        (None, {"joints": np.inf}, DataError, "'joints' is a number >= 0, got inf"),
-        (["joints"], {"joints": 0.0}, DataError, r"none of the features \['joints'\] changes"),
-    ],
-)
-def test_what_is_no_feature_or_weight_is_refused(names, weights, error, message):
-    with pytest.raises(error, match=message):
-        AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, names, weights)
-
-
-def test_a_weight_of_nothing_leaves_a_group_out():
-    features = AlignmentFeatures.fit(DEMONSTRATIONS[:2], None, None, {"joints": 0})
-    assert features.names == ("speed",)
 
 
 @pytest.mark.parametrize(
@@ -183,16 +167,16 @@ def test_a_weight_of_nothing_leaves_a_group_out():
 def test_the_others_are_what_is_not_used(names, left):
     family = DEMONSTRATIONS[:2]
     features = AlignmentFeatures.fit(family, Arm(), names)
-    assert AlignmentFeatures.others(family, features).names == left
+    assert features.others(family).names == left
     everything = AlignmentFeatures.fit(family, None, ["joints", "speed", "directions"])
-    assert AlignmentFeatures.others(family, everything) is None
+    assert everything.others(family) is None
     # of what never changes in any other way than the features do, nothing is left
     still = [
         Demonstration(d.time, torch.zeros_like(d.joints), {"bottle": Frame(d.joints[:, :3])})
         for d in family
     ]
     seen = AlignmentFeatures.fit(still, Arm(), ["hand in bottle"])
-    assert AlignmentFeatures.others(still, seen) is None
+    assert seen.others(still) is None
 
 
 def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():
@@ -201,7 +185,7 @@ def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():
     usual = np.sqrt((1 + 0 + 0.25 + 0.25) / 4)
     for scale in (1.0, 100.0):
         moving = Demonstration(time, scale * np.outer(way, [0.6, 0.8]))
-        [speed] = unscaled([moving], "speed")
+        [speed] = scaled([moving], "speed")
         assert speed.shape == (401, 1)
         speed = speed[:, 0] / np.sqrt((speed**2).mean())
         np.testing.assert_allclose(
@@ -212,13 +196,3 @@ def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():
     joints[:, 4] = way
     names = AlignmentFeatures.fit([Demonstration(time, joints)], Arm(), ["speed", "elbow"])
     assert names.columns["speed"].tolist() == [False, True]
-
-
-def test_each_quaternion_has_four_columns_wherever_it_stands():
-    poses = Poses(["left", "right"])
-    values = np.ones((3, 15))
-    names = ("lift", *poses.joint_names[7:], *poses.joint_names[:7])
-    named = Demonstration(np.arange(3.0), values, joint_names=names)
-    assert quaternion_columns(named, poses) == [[11, 12, 13, 14], [4, 5, 6, 7]]
-    plain = Demonstration(np.arange(3.0), values[:, :14])
-    assert quaternion_columns(plain, poses) == [[3, 4, 5, 6], [10, 11, 12, 13]]

@@ -240,7 +240,7 @@ def count_or_auto(text: str | int) -> int | str:
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | Pipeline | None:
     """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
-    from tpgmm_torch.alignment.events import EventAlignment
+    from tpgmm_torch.alignment.piecewise_linear import EventAlignment
     from tpgmm_torch.alignment.text import parse_alignment
 
     if method != "parts":
