@@ -1,6 +1,5 @@
 """Whole reproductions of many situations at once."""
 
-import copy
 from collections.abc import Iterator
 from functools import partial
 
@@ -16,28 +15,24 @@ __all__ = ["measure"]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Fifty situations from start to end, and one; plain, compiled, and with candidates."""
+    """Fifty situations from start to end, and one; plain, and with candidates."""
     model = learned(settings)
     situations = skill(settings).situations(settings.size(50, 2), settings.seed + 1000)
     first, last = float(model.time_[0]), float(model.time_[-1])
     time = torch.linspace(first, last, settings.size(1300, len(model.time_)))
     situations = [Situation(s.joints, s.frames, time.double()) for s in situations]
     rounds = settings.rounds(3)
-    compiled = copy.copy(model).compile(
-        "inductor" if settings.full else "aot_eager", n_robots=len(situations)
-    )
     one = situations[:1]
     work = [
-        ("eager", model, situations, {"candidates": False}, settings.asked("most", 5)),
-        ("with candidates", model, situations, {}, None),
-        ("compiled", compiled, situations, {"candidates": False}, None),
-        ("eager", model, one, {"candidates": False}, None),
-        ("with candidates", model, one, {}, None),
+        ("eager", situations, {"candidates": False}, settings.asked("most", 5)),
+        ("with candidates", situations, {}, None),
+        ("eager", one, {"candidates": False}, None),
+        ("with candidates", one, {}, None),
     ]
     measurements, limits = {}, {}
-    for how, which, given, options, most in work:
+    for how, given, options, most in work:
         name = f"predict, {len(given)} situation(s) x {len(time)} steps, float64, {how}"
-        measurements[name] = partial(seconds, partial(which.predict, given, **options))
+        measurements[name] = partial(seconds, partial(model.predict, given, **options))
         limits[name] = most
     taken = medians(in_turns(measurements, rounds, warm_up=settings.full))
     for name, figure in taken.items():

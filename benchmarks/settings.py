@@ -18,7 +18,7 @@ CASES = {
     "processes": "processes",
     "kinematics": "kinematics",
     "step": "control_step",
-    "exported": "exported_tick",
+    "controller": "controller_tick",
     "batch": "batched_step",
     "predict": "prediction",
     "curves": "curves",

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     )
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.control.exported import load_exported
     from tpgmm_torch.data.affine import Affine
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
@@ -100,7 +99,6 @@ __all__ = [
     "ViaPoint",
     "WaitingClock",
     "find_holds",
-    "load_exported",
     "parse_clock",
 ]
 
@@ -108,7 +106,6 @@ _HOMES = {
     "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
-    "control.exported": ("load_exported",),
     "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
     "impedance.stiffness": ("Impedance", "Stiffness"),
     "data.affine": ("Affine",),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,9 +21,7 @@ from torch import Tensor
 from tpgmm_torch import gaussians
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clocks import Clock, parse_clock
-from tpgmm_torch.control.compiled_tick import CompiledRegression, check_compiler
 from tpgmm_torch.control.controller import Controller
-from tpgmm_torch.control.exported_tick import export
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
@@ -365,8 +362,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     #: What :meth:`partial_fit` goes on with.
     _kept: KeptRows | None
 
-    #: What compiles; None until :meth:`compile` is called.
-    _backend: str | None = None
     #: Whether no tick of :meth:`step` was looked at since the model was fitted.
     _untried = True
 
@@ -843,108 +838,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             state = kinematics.state(state)
         return regression.step(now, state, known, candidates, limits)
 
-    def compile(self, backend: str = "inductor", n_robots: int = 1) -> Self:
-        """Make :meth:`step`, :meth:`controller` and :meth:`predict` one compiled graph.
-
-        Kinematics, operators and fusion of a tick run as one graph, compiled ahead of time by
-        AOTInductor; what they give is the same. There is a graph for one robot and one for
-        any number of robots. The one that is asked for is compiled at once, which takes about
-        a minute: not while a robot waits. Ticks with candidates, with several times or that
-        are differentiated run as before.
-
-        Parameters
-        ----------
-        backend : str, default="inductor"
-            AOTInductor, which needs a C++ compiler; others are those of ``torch.compile``.
-        n_robots : int, default=1
-            How many robots to compile for now, one or several; the other graph is compiled
-            when it is first needed.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        DependencyError
-            If there is no C++ compiler.
-        DataError
-            If the model has operators or a robot of another kind than the graph serves.
-        NotFittedError
-            If the model is not fitted.
-        """
-        self._check_fitted()
-        check_compiler(backend)
-        previous, self._backend = self._backend, backend
-        try:
-            batch = () if n_robots == 1 else (n_robots,)
-            like = self.time_
-            start = like.new_zeros(*batch, self.kinematics_.n_joints)
-            here = Frame(like.new_zeros(*batch, 3))
-            limits = (self.kinematics_.lower, self.kinematics_.upper)
-            frames = dict.fromkeys(self.frame_names_, here)
-            self.regression().estimate(
-                like[0], start, frames, limits if self.keep_limits else None
-            )
-        except BaseException:
-            self._backend = previous
-            raise
-        return self
-
-    def export(
-        self,
-        path: str | Path,
-        *,
-        clock: Clock | str = "even",
-        bounds: MotionBounds | Mapping[str, Any] | None = None,
-    ) -> None:
-        """Write a controller of one robot that loads in an instant, without a compiler.
-
-        It is the controller with ``trust=None``: one compiled graph from what is measured to
-        the next reference, state included, for Python (:func:`load_exported`) and for C++
-        (AOTInductor's package, .pt2). Making it takes about a minute and a compiler. It runs
-        on processors like this one's with this version of PyTorch.
-
-        Parameters
-        ----------
-        path : str or Path
-            A file, replaced in one step.
-        clock : Clock or str, default="even"
-            One of the library's; a localising one begins at the beginning.
-        bounds : MotionBounds or mapping, optional
-            As for :meth:`controller`.
-
-        Raises
-        ------
-        DependencyError
-            If there is no C++ compiler.
-        DataError
-            If the model is none that :meth:`compile` serves, holds objects, lives on another
-            device than the processor or does not keep limits, or the clock is another one.
-        NotFittedError
-            If the model is not fitted.
-        """
-        self._check_fitted()
-        if not isinstance(bounds, MotionBounds):
-            bounds = self.motion_bounds(**(bounds or {}))
-        if self.via_points_:
-            raise DataError("export() knows no via-points: use controller()")
-        if self.holds_ or not self.keep_limits or self.time_.device.type != "cpu":
-            raise DataError(
-                "export() serves models on the CPU with keep_limits=True in which nothing is "
-                f"held; this one has keep_limits={self.keep_limits}, holds={self.holds_} and "
-                f"is on {self.time_.device}: use controller()"
-            )
-        export(
-            self.regression(),
-            path,
-            begin=float(self.time_[0]),
-            end=float(self.time_[-1]),
-            blend=self.blend,
-            bounds=bounds,
-            clock=parse_clock(clock),
-        )
-
     def controller(
         self,
         joints: Any,
@@ -1240,20 +1133,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             repr(self.priorities),
             self.prior_std if isinstance(self.prior_std, Real) else repr(self.prior_std),
         )
-        backend = self._backend
         prepared = getattr(self, "_prepared", None)
-        if prepared is None or prepared[0] != (key, backend) or prepared[1] is not self.means_:
+        if prepared is None or prepared[0] != key or prepared[1] is not self.means_:
             conditionals = [
                 Conditionals.of(mean, covariance)
                 for mean, covariance in zip(self.means_, self.covariances_, strict=True)
             ]
             log_weights = self.weights_.log()
-            make: Any = Regression
-            if backend is not None:
-                make = functools.partial(CompiledRegression, backend=backend)
             fitted = self.kinematics_, self.operators_, conditionals, log_weights
             mixture = self.weights_, self.means_, self.covariances_
-            regression = make(
+            regression = Regression(
                 *fitted,
                 fusion=self.fusion,
                 activation=self.activation,
@@ -1272,7 +1161,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 motion_bounds=self.motion_bounds() if limited else None,
                 novelty=None if self.shown_ is None else self.shown_.novelty,
             )
-            self._prepared = prepared = ((key, backend), self.means_, regression)
+            self._prepared = prepared = (key, self.means_, regression)
         return prepared[2]
 
     def unfitted_mixture(

@@ -1,10 +1,11 @@
-// A control loop without Python: the package that model.export(path) wrote.
+// The estimate of a skill without Python: the package that export_estimate(skill, path) wrote.
 //
-//   control_loop PACKAGE.pt2 SECONDS_PER_TICK TICKS < numbers > references
+//   estimate_loop PACKAGE.pt2 SECONDS_PER_TICK TICKS < numbers > estimates
 //
 // reads the start posture and the objects' poses (x y z qw qx qy qz each, in the order of the
-// package), and prints the reference of every tick. A real loop measures both at every tick,
-// sends the reference, and sleeps until the next one.
+// package), and prints time, mean and variances of the joints at every tick. Each mean is the
+// state of the next tick. A real loop measures the objects at every tick, keeps the means within
+// the robot's bounds of position, speed and acceleration, sends them, and sleeps until the next.
 
 #include <algorithm>
 #include <chrono>
@@ -18,7 +19,6 @@
 #include <ATen/Parallel.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/full.h>
-#include <ATen/ops/zeros.h>
 #include <c10/core/InferenceMode.h>
 #include <torch/csrc/inductor/aoti_package/model_package_loader.h>
 
@@ -47,25 +47,28 @@ static int run(const std::string& path, double dt, int ticks) {
   auto contents = package.get_metadata();
   at::Tensor joints = numbers({std::stol(contents.at("n_joints"))});
   at::Tensor frames = numbers({std::stol(contents.at("n_frames")), 7});
-  // a state of zeros begins the skill where the robot stands
-  at::Tensor state = at::zeros({std::stol(contents.at("state_size"))}, at::kDouble);
-  at::Tensor step = at::full({}, dt, at::kDouble);
+  const double begin = std::stod(contents.at("begin")), end = std::stod(contents.at("end"));
 
   std::vector<double> taken;
   for (int tick = 0; tick < ticks; ++tick) {
+    const double now = std::min(begin + tick * dt, end);
+    at::Tensor time = at::full({}, now, at::kDouble);
     const auto start = Clock::now();
-    // state, reference, velocity, covariance
-    std::vector<at::Tensor> out = package.run({state, step, joints, frames});
+    std::vector<at::Tensor> out = package.run({time, joints, frames});  // mean, covariance
     taken.push_back(milliseconds(start));
-    state = out[0];
-    joints = out[1];  // what is measured, on a robot
-    for (int64_t i = 0; i < joints.numel(); ++i) {
-      std::printf(i ? " %.17g" : "%.17g", joints.data_ptr<double>()[i]);
+    joints = out[0].contiguous();
+    const at::Tensor covariance = out[1].contiguous();
+    const int64_t n = joints.numel();
+    std::printf("%.17g", now);
+    for (int64_t i = 0; i < n; ++i) std::printf(" %.17g", joints.data_ptr<double>()[i]);
+    for (int64_t i = 0; i < n; ++i) {
+      std::printf(" %.17g", covariance.data_ptr<double>()[i * (n + 1)]);
     }
     std::printf("\n");
   }
   std::sort(taken.begin(), taken.end());
-  std::fprintf(stderr, "loaded in %.1f ms; a tick takes %.4f ms, 99 %% of them less than %.4f ms\n",
+  std::fprintf(stderr,
+               "loaded in %.1f ms; an estimate takes %.4f ms, 99 %% of them less than %.4f ms\n",
                loaded, taken[taken.size() / 2], taken[taken.size() * 99 / 100]);
   return 0;
 }

@@ -65,12 +65,6 @@ class ActiveComponents:
         """Components that count at an instant [s]."""
         return self._sets[bisect.bisect_right(self._edge_list, time)]
 
-    def between(self, begin: float, end: float) -> tuple[Tensor, list[tuple[int, ...]]]:
-        """The windows that two instants lie in, and those between: their edges and sets."""
-        first = bisect.bisect_right(self._edge_list, begin)
-        last = bisect.bisect_right(self._edge_list, end)
-        return self._edges[first:last].clone(), self._sets[first : last + 1]
-
     def counts(self, time: Tensor) -> Tensor:
         """Whether each component counts at times of shape (...): bool of shape (..., K)."""
         instants = time.detach().double().cpu().contiguous()

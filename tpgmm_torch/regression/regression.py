@@ -254,28 +254,6 @@ class Regression:
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
-    def windows(self, begin: float, end: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Which components count between two instants, as tables for a graph.
-
-        Returns
-        -------
-        edges : Tensor of shape (W - 1,)
-            Instants between windows [s].
-        index : Tensor of shape (W, A)
-            Components that count; windows with fewer have others too.
-        log_peak : Tensor of shape (W, A)
-            As in :class:`TimeMarginals`; those others have no weight.
-        """
-        edges, sets = torch.empty(0, dtype=torch.float64), [(*range(len(self.log_weights)),)]
-        if self._active is not None:
-            edges, sets = self._active.between(begin, end)
-        width = max(map(len, sets))
-        index = torch.tensor([(*one, *one[:1] * (width - len(one))) for one in sets])
-        log_peak = self._marginals.log_peak.detach()[index]
-        for row, one in zip(log_peak, sets, strict=True):
-            row[len(one) :] = -torch.inf
-        return edges, index, log_peak
-
     def candidates(
         self,
         time: Tensor,
@@ -370,8 +348,8 @@ class Regression:
             return TimeMarginals.of(self.log_weights, first.time_mean, first.time_variance)
 
     @cached_property
-    def _components(self) -> Components:
-        """All of them."""
+    def components(self) -> Components:
+        """All components of the mixture."""
         conditionals = self.fused
         if self._update is not None:
             conditionals = (self._update.conditionals,)
@@ -394,7 +372,7 @@ class Regression:
     def _components_at(self, time: Tensor) -> Components:
         """Those that count at one of the times."""
         if self._active is None or time.numel() == 0:
-            return self._components
+            return self.components
         if time.ndim == 0:
             active = self._active.at(time.item())
         else:
@@ -406,7 +384,7 @@ class Regression:
         return self._selected[active]
 
     def _select(self, active: tuple[int, ...]) -> Components:
-        return self._components.select(active)
+        return self.components.select(active)
 
     def _log_activation(self, components: Components, time: Tensor) -> Tensor:
         """``log h_i(t)``, up to a constant, from the components' time marginal, taken once."""

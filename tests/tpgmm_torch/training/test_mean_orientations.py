@@ -26,6 +26,7 @@ from tpgmm_torch.control import localization
 from tpgmm_torch.control.localization import Localizer
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.posture import _Cost
+from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 
 HAND = Poses(("hand",))
@@ -389,7 +390,7 @@ def test_a_controller_and_a_batch_run_it():
 
 def test_what_compiles_no_logarithms_says_so():
     with pytest.raises(DataError, match="geometry='quaternion'"):
-        handling().compile("eager")
+        compile_skill(handling().regression(), backend="eager")
 
 
 def test_what_is_learned_later_lies_about_the_same_mean():

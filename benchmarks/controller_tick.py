@@ -1,6 +1,6 @@
-"""One tick of a controller beside the model's own step: eager, and exported for Python and C++.
+"""One tick of a controller beside the model's own step, and the exported estimate in C++.
 
-python -m benchmarks --only exported
+python -m benchmarks --only controller
 """
 
 import re
@@ -19,7 +19,8 @@ from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
 from benchmarks.skill import learned, skill
 from benchmarks.timing import in_turns, medians, seconds
-from tpgmm_torch import Situation, load_exported
+from tpgmm_torch import Situation
+from tpgmm_torch.skills.compiled import export_estimate
 
 __all__ = ["measure"]
 
@@ -39,7 +40,7 @@ Step = Callable[[float], Any]
 
 
 def measure(settings: Settings) -> Iterator[Row]:
-    """Loading, ticks of the skill from its start to its end in turns, and whole skills."""
+    """Ticks of the skill from its start to its end in turns, and whole skills."""
     model, ticks = learned(settings), settings.size(5_000, 30)
     [situation] = skill(settings).situations(1, settings.seed + 1000)
     start, frames = situation.joints, situation.frames
@@ -71,23 +72,10 @@ def measure(settings: Settings) -> Iterator[Row]:
     for name, (options, most) in CONTROLLERS.items():
         ways[name] = partial(controlled, options)
         asked[name] = most if settings.full else None
-    # at tiny sizes, minutes of compiling show nothing
-    for clock in ("even", "localizing") if settings.full else ():
-        path = settings.out / f"exported_{clock}.pt2"
-        model.export(path, clock=clock)
-        began = perf_counter()
-        exported = load_exported(path)
-        loading = perf_counter() - began
-        work = f"load_exported, {clock} clock"
-        yield Row(work, "s", loading, asked=settings.asked("most", 1.0), rounds=1)
-
-        def again(exported: Any = exported) -> Step:
-            exported.reset(start, frames)
-            return exported.step
-
-        name = f"exported, {clock} clock"
-        ways[name], asked[name] = again, settings.asked("most", 0.12)
-        yield from _in_cpp(path, name, situation, dt, ticks, settings)
+    if settings.full:  # at tiny sizes, minutes of compiling show nothing
+        path = settings.out / "estimate.pt2"
+        export_estimate(model.regression(), path)
+        yield from _in_cpp(path, situation, dt, ticks, settings)
         path.unlink()
     taken = _latencies(ways, dt, ticks, length - 1)
     base = float(np.median(taken[PLAIN]))
@@ -110,15 +98,11 @@ def measure(settings: Settings) -> Iterator[Row]:
     runs = {PLAIN: partial(whole, plain)}
     predicted = partial(model.predict, [situation], candidates=False)
     runs["predict"] = partial(seconds, predicted)
-    if settings.full:
-        runs["exported"] = partial(whole, ways["exported, even clock"])
     found = medians(in_turns(runs, settings.rounds(5), warm_up=settings.full))
-    # 0.65 and 0.2 s where a step takes 0.36 ms
-    limits = {"predict": 0.65, "exported": 0.2}
-    for name in runs.keys() - {PLAIN}:
-        most = Asked("times", limits[name] / (1482 * 0.36e-3)) if settings.full else None
-        work = f"one situation, {length} ticks, {name}"
-        yield Row(work, "s", found[name], f"{PLAIN} as often", found[PLAIN], asked=most)
+    # 0.65 s where a step takes 0.36 ms
+    most = Asked("times", 0.65 / (1482 * 0.36e-3)) if settings.full else None
+    work, name = f"one situation, {length} ticks, predict", f"{PLAIN} as often"
+    yield Row(work, "s", found["predict"], name, found[PLAIN], asked=most)
 
 
 def _latencies(
@@ -139,7 +123,7 @@ def _latencies(
 
 
 def _in_cpp(
-    package: Path, name: str, situation: Situation, dt: float, ticks: int, settings: Settings
+    package: Path, situation: Situation, dt: float, ticks: int, settings: Settings
 ) -> Iterator[Row]:
     """What the example in C++ says of itself, where it can be built."""
     folder = settings.out / "deployment_cpp"
@@ -154,15 +138,17 @@ def _in_cpp(
         for number in (*frame.position.tolist(), *frame.orientation.tolist())
     ]
     done = subprocess.run(
-        [folder / "control_loop", package, str(dt), str(ticks)],
+        [folder / "estimate_loop", package, str(dt), str(ticks)],
         input=" ".join(map(str, [*situation.joints.tolist(), *poses])),
         capture_output=True,
         text=True,
         check=True,
     )
-    found = re.search(r"a tick takes ([\d.]+) ms, 99 % of them less than ([\d.]+)", done.stderr)
+    found = re.search(
+        r"an estimate takes ([\d.]+) ms, 99 % of them less than ([\d.]+)", done.stderr
+    )
     assert found is not None, done.stderr
-    work, (middle, worst) = f"tick, {WORK}, {name}, C++", map(float, found.groups())
+    work, (middle, worst) = f"tick, {WORK}, exported estimate, C++", map(float, found.groups())
     yield Row(f"{work}: median", "ms", middle, asked=settings.asked("most", 0.1), rounds=ticks)
     limit = settings.asked("most", 1.0)
     yield Row(f"{work}: 99th percentile", "ms", worst, asked=limit, rounds=ticks)
