@@ -75,9 +75,7 @@ def test_what_is_none_is_refused(arguments):
         ViaPoint(*arguments)
 
 
-def test_a_step_and_an_export_know_no_via_points(tmp_path):
+def test_a_step_refuses_via_points():
     model = hands().with_via_points(["1:position:left=0,0,0"])
     with pytest.raises(DataError, match="controller"):
         model.step(0.5, torch.zeros(14))
-    with pytest.raises(DataError, match="controller"):
-        model.export(tmp_path / "controller.pt2")

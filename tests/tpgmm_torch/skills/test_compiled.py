@@ -186,7 +186,7 @@ def test_the_package_gives_the_estimate(package, plain):
     assert contents["frame_names"] == OBJECT
     assert (float(contents["begin"]), float(contents["end"])) == (plain.begin, plain.end)
     pose = torch.tensor([[*CUP, 2.0, 0.0, 0.0, 0.2]], dtype=torch.float64)
-    frames = {OBJECT: Frame(pose[0, :3], pose[0, 3:])}
+    frames = {OBJECT: Frame(pose[0, :3], pose[0, 3:] / pose[0, 3:].norm())}
     for time in (0.0, 0.31, 1.0):
         now, joints, _ = at(time)
         mean, covariance = estimate(now, joints, pose)
