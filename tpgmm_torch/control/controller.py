@@ -22,10 +22,9 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.impedance.stiffness import Impedance
-from tpgmm_torch.motion.follower import Follower
+from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.motion.trajectory_generator import Seconds
 from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.regression.conditioning import Conditioning

@@ -1,20 +1,4 @@
-"""How to get to what is wanted: references within bounds on speed, acceleration and jerk.
-
-What is wanted now and how to get there are two questions. A tick asks them in this order::
-
-    box = bounds.lower, bounds.upper
-    estimate = skill.estimate(time, follower.reference, frames, box)
-    following = None if search.active is not None else follower.take(estimate.joints, dt)
-    if following is None:  # a limit, a jump, or something out of reach
-        asked = ~follower.fits(estimate.joints, dt)
-        wanted, search = search.advance(
-            regression, time, follower.reference, frames, estimate, box, asked
-        )
-        following = follower.advance(wanted, dt)
-
-where ``search`` is a :class:`~tpgmm_torch.regression.posture.PostureSearch` and ``box`` the
-limits of position. ``take`` is all that an ordinary tick needs: the wanted posture becomes the
-reference as it is.
+"""References that follow wanted postures within bounds on speed, acceleration and jerk.
 
 Let ``w_k = (q_k - q_{k-1}) / dt`` be the mean velocity of a tick and
 ``a_k = (w_k - w_{k-1}) / dt`` the second difference of the references. The parabola through the
@@ -43,26 +27,21 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.motion.trajectory_generator import (
-    Motion,
-    Seconds,
-    first_part,
-    stopping_range,
-)
+from tpgmm_torch.motion.motion_bounds import ROUNDING, MotionBounds
+from tpgmm_torch.motion.trajectory_generator import first_part, stopping_range
 
-__all__ = ["Follower"]
+__all__ = ["Follower", "Seconds"]
 
 Mask = NDArray[np.bool_]
+#: A duration, of all robots or of each one [s].
+Seconds = float | Array
 
-#: What rounding may add to a bound, as a share of it.
-ROUNDING = 1e-9
 #: Seconds after which a posture that is not reached is expected to move on as it does.
 MEMORY = 0.05
-#: Of the speed limit, how much a wanted posture is believed to move on with.
+#: The share of the speed limit up to which a wanted posture is expected to move on.
 CRUISE = 0.9
-#: What is planned for is a multiple of ``1 / GRID`` [rad or m]: a plan enlarges a difference of
-#: rounding ten million times.
+#: Plans are for multiples of ``1 / GRID`` [rad or m]: they enlarge a difference of rounding ten
+#: million times.
 GRID = 2.0**20
 
 
@@ -70,7 +49,7 @@ GRID = 2.0**20
 class Follower:
     """References of a batch of robots that follow wanted postures within bounds; immutable.
 
-    Make one by :meth:`at`. Robots and joints do not depend on one another.
+    Made by :meth:`at`. Robots and joints do not depend on one another.
 
     Parameters
     ----------
@@ -88,7 +67,7 @@ class Follower:
 
     @classmethod
     def at(cls, bounds: MotionBounds, reference: Any, velocity: Any = None) -> Self:
-        """A follower that begins somewhere: where a robot is found.
+        """A follower that begins where a robot stands.
 
         Parameters
         ----------
@@ -109,10 +88,6 @@ class Follower:
             speed = _checked(bounds, velocity, "velocity").expand_as(start)
         return cls(bounds, start, Moment.moving(as_array(start), as_array(speed)))
 
-    def reset(self, reference: Any, velocity: Any = None) -> Self:
-        """The same follower somewhere else; see :meth:`at`."""
-        return type(self).at(self.bounds, reference, velocity)
-
     def put(self, joints: Tensor, reference: Tensor) -> Self:
         """The same follower, with some joints at rest somewhere else.
 
@@ -123,20 +98,34 @@ class Follower:
         reference : Tensor of shape (..., n_joints)
             Where they are then.
         """
-        moment = self.moment.put(joints.numpy(force=True), as_array(reference))
+        place = as_array(reference)
+        rest = Moment.moving(place, np.zeros_like(place))
+        moment = rest.choose(joints.numpy(force=True), self.moment)
         return replace(
-            self, reference=torch.where(joints, reference, self.reference), moment=moment
+            self,
+            reference=torch.where(joints, reference, self.reference),
+            moment=moment._replace(dt=self.moment.dt),
         )
+
+    def undone(self, robots: Tensor, before: Self) -> Self:
+        """The same follower, with some robots as they were.
+
+        Parameters
+        ----------
+        robots : Tensor of bool, of shape (...)
+            Which ones.
+        before : Follower
+            Of the same robots.
+        """
+        where = robots.unsqueeze(-1)
+        reference = torch.where(where, before.reference, self.reference)
+        moment = before.moment.choose(where.numpy(force=True), self.moment)
+        return replace(self, reference=reference, moment=moment)
 
     @property
     def velocity(self) -> Tensor:
-        """Of the reference [rad/s or m/s], shape (..., n_joints)."""
-        return torch.from_numpy(self.moment.motion.velocity).to(self.reference)
-
-    @property
-    def acceleration(self) -> Tensor:
-        """Of the reference [rad/s^2 or m/s^2], shape (..., n_joints)."""
-        return torch.from_numpy(self.moment.motion.acceleration).to(self.reference)
+        """Velocity of the reference [rad/s or m/s], shape (..., n_joints)."""
+        return torch.from_numpy(self.moment.motion[1]).to(self.reference)
 
     def take(self, wanted: Tensor, dt: Seconds) -> Self | None:
         """The wanted posture as the reference, where that is within bounds for all robots.
@@ -153,36 +142,30 @@ class Follower:
         Follower or None
             None if a joint of a robot cannot follow.
         """
-        moment, raw = self.moment, as_array(wanted)
-        exact = moment.taken(raw, _column(dt))
-        # bytes are sooner looked at than an array of bool
-        certain = (
-            moment.behind is None and b"\0" not in moment.measured(exact, self.bounds).tobytes()
+        exact = self.moment.taken(as_array(wanted), _column(dt))
+        return (
+            replace(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
         )
-        if not certain and not self._serves(raw, exact).all():
-            return None
-        return type(self)(self.bounds, wanted, exact)
 
     def fits(self, wanted: Tensor, dt: Seconds) -> Tensor:
-        """Which robots :meth:`take` would serve: bool of shape (...)."""
-        raw = as_array(wanted)
-        fits = self._serves(raw, self.moment.taken(raw, _column(dt))).all(-1)
+        """Robots that :meth:`take` would serve: bool of shape (...)."""
+        fits = self._fits(self.moment.taken(as_array(wanted), _column(dt))).all(-1)
         return torch.from_numpy(np.asarray(fits)).to(wanted.device)
 
-    def _serves(self, wanted: Array, exact: Moment) -> Mask:
-        """Which joints may be taken there: outside their limits they go back to them."""
-        limits = self.bounds.arrays
-        within = (wanted >= limits.lower) & (wanted <= limits.upper)
+    def _fits(self, exact: Moment) -> Mask:
+        """Joints of which that may be the next moment; no reference leaves the limits."""
+        limits, position = self.bounds.arrays, exact.motion[0]
+        within = (position >= limits.lower) & (position <= limits.upper)
         return within & self.moment.allows(exact, self.bounds)
 
     def advance(self, wanted: Tensor, dt: Seconds) -> Self:
-        """The next reference: what is wanted where it can be followed, else towards it.
+        """The next reference: the wanted posture where it can be followed, else towards it.
 
         Parameters
         ----------
         wanted : Tensor of shape (..., n_joints)
-            At the end of this tick. What lies beyond the limits of position is wanted at them;
-            a joint of which it is not finite comes to rest.
+            At the end of this tick, brought into the limits of position; a joint of which it is
+            not finite comes to rest.
         dt : float or ndarray of shape (...)
             Duration of the tick, for all robots or of each one [s].
 
@@ -194,31 +177,16 @@ class Follower:
         if not np.all((dt > 0) & (dt < np.inf)):
             raise DataError(f"a tick takes a positive number of seconds, got dt={dt}")
         moment, bounds, raw = self.moment, self.bounds, as_array(wanted)
-        known = np.where(np.isfinite(raw), raw, moment.motion.position)
+        known = np.where(np.isfinite(raw), raw, moment.motion[0])
         target = np.clip(known, bounds.arrays.lower, bounds.arrays.upper)
         exact = moment.taken(target, _column(dt))
         fits = moment.allows(exact, bounds)
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
         as_wanted = torch.from_numpy(fits & (raw == target)).to(wanted.device)
-        reached = torch.from_numpy(following.motion.position).to(wanted)
+        reached = torch.from_numpy(following.motion[0]).to(wanted)
         return replace(
             self, reference=torch.where(as_wanted, wanted, reached), moment=following
         )
-
-    def undone(self, robots: Tensor, before: Self) -> Self:
-        """The same follower, with some robots as they were.
-
-        Parameters
-        ----------
-        robots : Tensor of bool, of shape (...)
-            Which ones.
-        before : Follower
-            Of the same robots.
-        """
-        joints = robots.unsqueeze(-1)
-        reference = torch.where(joints, before.reference, self.reference)
-        moment = before.moment.choose(joints.numpy(force=True), self.moment)
-        return replace(self, reference=reference, moment=moment)
 
 
 class Moment(NamedTuple):
@@ -226,170 +194,126 @@ class Moment(NamedTuple):
 
     Parameters
     ----------
-    motion : Motion
-        At this instant, of the motion that goes through the references.
+    motion : ndarray of shape (3, ..., n_joints)
+        Position, velocity and acceleration of the motion that goes through the references.
     slope, bend : ndarray
         First and second difference of the references over time.
     wanted, drift : ndarray
         The posture that was wanted, and the velocity that it moves with.
-    behind : ndarray of bool, or None
-        Joints that are on their way to it; None if there are none.
+    behind : ndarray of bool
+        Joints that have not reached it.
     dt : float or ndarray of shape (..., 1)
         Duration of the tick [s]; 0 at the start.
     """
 
-    motion: Motion
+    motion: Array
     slope: Array
     bend: Array
     wanted: Array
     drift: Array
-    behind: Mask | None
+    behind: Mask
     dt: Seconds
 
     @classmethod
     def moving(cls, position: Array, velocity: Array) -> Self:
         """With a constant velocity."""
         zero = np.zeros_like(position)
-        motion = Motion(position, velocity, zero)
-        return cls(motion, velocity, zero, position, velocity, None, 0.0)
-
-    def put(self, joints: Mask, position: Array) -> Self:
-        """Some joints at rest somewhere else."""
-        rest = type(self).moving(position, np.zeros_like(position))
-        return rest.choose(joints, self)._replace(dt=self.dt)
+        motion = np.stack((position, velocity, zero))
+        return cls(motion, velocity, zero, position, velocity, zero.astype(bool), 0.0)
 
     def choose(self, where: Mask, other: Self) -> Self:
         """For some joints, or robots (..., 1), this moment, and another for the rest."""
-
-        def either(one: Array, rest: Array) -> Array:
-            return np.where(where, one, rest)
-
-        behind = None
-        if self.behind is not None or other.behind is not None:
-            none = np.zeros(self.slope.shape, dtype=bool)
-            one, rest = (none if x.behind is None else x.behind for x in (self, other))
-            behind = np.asarray(np.where(where, one, rest), dtype=bool)
-        slope, bend, wanted, drift = map(either, self[1:5], other[1:5])
-        return type(self)(
-            Motion(*map(either, self.motion, other.motion)),
-            slope,
-            bend,
-            wanted,
-            drift,
-            behind if behind is not None and behind.any() else None,
-            np.where(where, self.dt, other.dt) if where.shape[-1] == 1 else other.dt,
-        )
-
-    def ago(self, dt: Seconds) -> Seconds:
-        """How long the tick before took; as long as this one, if there was none [s]."""
-        if isinstance(self.dt, np.ndarray):
-            return np.where(self.dt > 0, self.dt, dt)
-        return self.dt or dt
+        return type(self)(*(np.where(where, *pair) for pair in zip(self, other, strict=True)))
 
     def taken(self, position: Array, dt: Seconds) -> Self:
         """The next moment if that is the next reference."""
-        slope = (position - self.motion.position) / dt
-        bend = (slope - self.slope) * (2 / (dt + self.ago(dt)))
-        velocity = slope + bend * (dt / 2)  # (F1)
-        drift = slope if self.behind is None else (position - self.wanted) / dt
-        motion = Motion(position, velocity, bend)
-        return type(self)(motion, slope, bend, position, drift, None, dt)
+        slope, bend = self._differences(position, dt)
+        motion = np.stack((position, slope + bend * (dt / 2), bend))  # (F1)
+        drift = slope
+        if self.behind.any():
+            drift = (position - self.wanted) / dt
+        return type(self)(motion, slope, bend, position, drift, np.zeros_like(self.behind), dt)
 
-    def measured(self, following: Self, bounds: MotionBounds) -> Mask:
-        """Which of five bounds a step keeps for certain: bool of shape (..., 5, n_joints)."""
-        limits, motion, bend = bounds.arrays, following.motion, following.bend
-        size = np.abs(bend)
-        rows = np.empty((*bend.shape[:-1], 5, bend.shape[-1]))
-        rows[..., 0, :] = size
-        between = (following.dt + 2 * self.ago(following.dt)) / 3
-        rows[..., 1, :] = np.abs(bend - self.bend) / between
-        # the speed may grow until the acceleration is gone
-        rows[..., 2, :] = peak = np.abs(motion.velocity) + size * size * limits.half_over_jerk
-        room = peak * limits.stopping_time + limits.stopping_distance
-        rows[..., 3, :] = motion.position + room
-        rows[..., 4, :] = room - motion.position
-        kept: Mask = rows <= limits.rows
-        return kept
+    def _differences(self, position: Array, dt: Seconds) -> tuple[Array, Array]:
+        slope = (position - self.motion[0]) / dt
+        return slope, (slope - self.slope) * (2 / (dt + self._last_dt(dt)))
+
+    def _last_dt(self, dt: Seconds) -> Array:
+        """Duration of the tick before; of this one if it was the first [s]."""
+        return np.where(np.asarray(self.dt) > 0, self.dt, dt)
 
     def allows(self, following: Self, bounds: MotionBounds) -> Mask:
-        """Which joints may make that step: differences within bounds, and it can be stopped."""
-        limits, kept = bounds.arrays, self.measured(following, bounds)
-        fits: Mask = kept[..., 0, :] & kept[..., 1, :]
-        if self.behind is not None:
-            # who catches up goes on only if it keeps up with what is wanted next
+        """Joints that may make that step: differences within bounds, and it can be stopped."""
+        limits = bounds.arrays
+        position, velocity, acceleration = following.motion
+        size = np.abs(acceleration)
+        between = (following.dt + 2 * self._last_dt(following.dt)) / 3
+        fits: Mask = size <= limits.acceleration
+        fits &= np.abs(acceleration - self.bend) / between <= limits.jerk
+        if self.behind.any():
+            # a joint that catches up goes on only if it keeps up with the next wanted posture
             joining = (following.drift - following.slope) / following.dt
             jerk = limits.jerk * following.dt
             keeps = np.abs(joining) <= np.minimum(limits.acceleration, jerk)
-            keeps &= np.abs(joining - following.bend) <= jerk
+            keeps &= np.abs(joining - acceleration) <= jerk
             fits &= keeps | ~self.behind
-        asked = fits & ~kept[..., 2:, :].all(-2)
+        # certain without a plan; the speed may grow until the acceleration is gone
+        peak = np.abs(velocity) + size * size * limits.half_over_jerk
+        room = peak * limits.stopping_time + limits.stopping_distance
+        stops = (peak <= limits.velocity) & (position + room <= limits.upper)
+        asked = fits & ~(stops & (room - position <= -limits.lower))
         if asked.any():
-            fits[asked] = self._stops(following.motion.select(asked), asked, bounds)
+            fits[asked] = self._stops(following.motion[:, asked], asked, bounds)
         return fits
 
     def generated(self, exact: Self, asked: Mask, bounds: MotionBounds) -> Self:
         """That step, with the joints that are asked on the fastest way to it."""
-        limits, dt = bounds.arrays, exact.dt
-        start = self.motion.select(asked)
-        speed, acceleration, jerk, low, high = (
-            np.broadcast_to(x, asked.shape)[asked]
-            for x in (
-                limits.velocity, limits.acceleration, limits.jerk, limits.lower, limits.upper,
-            )
-        )  # fmt: skip
+        limits, joint = bounds.arrays, np.nonzero(asked)[-1]
+        rates = np.stack((limits.velocity, limits.acceleration, limits.jerk))[:, joint]
         target, before = (
-            np.clip(np.rint(x[asked] * GRID) / GRID, low, high)
+            np.clip(np.rint(x[asked] * GRID) / GRID, limits.lower[joint], limits.upper[joint])
             for x in (exact.wanted, self.wanted)
         )
-        each = dt if isinstance(dt, float) else np.broadcast_to(dt, asked.shape)[asked]
-        drift, moved = self.drift[asked], (target - before) / each
-        # that it moves on is believed little by little, and that it does not at once: what has
-        # jumped is not expected further on
+        dt = np.broadcast_to(exact.dt, asked.shape)[asked]
+        drift, moved = self.drift[asked], (target - before) / dt
+        # a motion is expected to go on only after a while, and to stop at once: a posture that
+        # has jumped is not expected further on
         slower = np.where(drift * moved < 0, 0.0, moved)
-        rising = drift + np.minimum(1.0, each / MEMORY) * (moved - drift)
+        rising = drift + np.minimum(1.0, dt / MEMORY) * (moved - drift)
         drift = np.where(np.abs(slower) < np.abs(rising), slower, rising)
-        drift = np.clip(drift, -CRUISE * speed, CRUISE * speed)
-        part = first_part(start, target, drift, each, speed, acceleration, jerk)
+        drift = np.clip(drift, -CRUISE * rates[0], CRUISE * rates[0])
+        start = self.motion[:, asked]
+        part = first_part(start, target, drift, dt, rates)
         unsafe = ~self._stops(part, asked, bounds)
         if unsafe.any():  # towards a limit: as if the target stood still, which ends in time
-            still = np.zeros(unsafe.sum())
-            share = each if isinstance(each, float) else each[unsafe]
-            safe = first_part(
-                start.select(unsafe), target[unsafe], still, share,
-                speed[unsafe], acceleration[unsafe], jerk[unsafe],
-            )  # fmt: skip
-            part.put(unsafe, safe)
-        motion = Motion(*(field.copy() for field in exact.motion))
-        motion.put(asked, part)
-        slope = (motion.position - self.motion.position) / dt
-        bend = (slope - self.slope) * (2 / (dt + self.ago(dt)))
-        drifts = exact.drift.copy()
-        drifts[asked] = drift
-        return type(self)(motion, slope, bend, exact.wanted, drifts, asked, dt)
-
-    def _stops(self, motion: Motion, asked: Mask, bounds: MotionBounds) -> Mask:
-        """Which of the joints that are asked can be stopped within speed and position.
-
-        ``motion`` is theirs, one tick after this moment.
-        """
-        limits, here = bounds.arrays, self.motion.position
-        # what stands outside its limits may stay as far out as it is, and come back
-        low, high = np.minimum(limits.lower, here), np.maximum(limits.upper, here)
-        speed, acceleration, jerk, low, high, half = (
-            np.broadcast_to(x, asked.shape)[asked]
-            for x in (
-                limits.velocity, limits.acceleration, limits.jerk, low, high,
-                limits.half_over_jerk,
+            rest = np.zeros(unsafe.sum())
+            part[:, unsafe] = first_part(
+                start[:, unsafe], target[unsafe], rest, dt[unsafe], rates[:, unsafe]
             )
-        )  # fmt: skip
-        lowest, highest = stopping_range(motion, acceleration, jerk)
-        peak = motion.velocity + motion.acceleration * np.abs(motion.acceleration) * half
-        slow = np.maximum(np.abs(peak), np.abs(motion.velocity)) <= speed * (1 + ROUNDING)
-        return slow & (lowest >= low - ROUNDING) & (highest <= high + ROUNDING)
+        motion, drifts = exact.motion.copy(), exact.drift.copy()
+        motion[:, asked], drifts[asked] = part, drift
+        differences = self._differences(motion[0], exact.dt)
+        return type(self)(motion, *differences, exact.wanted, drifts, asked, exact.dt)
+
+    def _stops(self, motion: Array, asked: Mask, bounds: MotionBounds) -> Mask:
+        """Whether motions (3, N), one tick later, can be stopped within speed and position.
+
+        They are of the N joints that are asked.
+        """
+        limits, here, joint = bounds.arrays, self.motion[0][asked], np.nonzero(asked)[-1]
+        # a joint outside its limits may stay as far out as it is, and come back
+        low = np.minimum(limits.lower[joint], here) - ROUNDING
+        high = np.maximum(limits.upper[joint], here) + ROUNDING
+        lowest, highest = stopping_range(motion, limits.acceleration[joint], limits.jerk[joint])
+        _, velocity, acceleration = motion
+        peak = velocity + acceleration * np.abs(acceleration) * limits.half_over_jerk[joint]
+        fastest = np.maximum(np.abs(peak), np.abs(velocity))
+        slow = fastest <= limits.velocity[joint] * (1 + ROUNDING)
+        return slow & (lowest >= low) & (highest <= high)
 
 
 def _column(dt: Seconds) -> Seconds:
-    """For joints: of shape (..., 1), if each robot has a duration of its own."""
+    """Durations of robots for their joints, of shape (..., 1)."""
     return dt[..., None] if isinstance(dt, np.ndarray) else float(dt)
 
 

@@ -101,27 +101,25 @@ def follow_poses(
             f"each link needs the same number of poses, got {[tuple(n) for n in lengths]}"
         )
     length = int(next(iter(lengths))[0])
-    ways = None if posture is None else robot.joint_tensor(posture)
-    if ways is None or ways.ndim == 1:
-        solver = _Solver(robot, poses, start, posture, 1 / rate, orientations)
-        ways = None
-    elif len(ways) == length:
-        solver = _Solver(robot, poses, start, ways[0], 1 / rate, orientations, gain=1.0)
-    else:
-        raise ShapeError(f"{length} poses need as many postures, or one; got {len(ways)}")
+    postures = robot.joint_tensor(start if posture is None else posture)
+    each = posture is not None and postures.ndim > 1
+    if each and len(postures) != length:
+        raise ShapeError(f"{length} poses need as many postures, or one; got {len(postures)}")
+    # a gain of one period: one posture is sought slowly, not within one step
+    gain = 1.0 if each else min(1 / rate, 1.0)
+    solver = _Solver(robot, poses, start, 1 / rate, orientations, gain)
+    postures = postures if each else postures.expand(length, -1)
     joints = [solver.joints]
     for step in range(1, length):
-        if ways is not None:
-            solver.seek(ways[step])
-        joints.append(solver.step({link: frame[step] for link, frame in poses.items()}))
+        wanted = {link: frame[step] for link, frame in poses.items()}
+        joints.append(solver.step(wanted, postures[step]))
     found = torch.stack(joints)
-    left = _left(robot, found, poses, orientations)
-    if told := [
-        _told(link, *errors) for link, errors in left.items() if _worst(*errors) > tolerance
-    ]:
+    errors = _errors(robot, found, poses, orientations)
+    missed = {link: error for link, error in errors.items() if error.max() > tolerance}
+    if missed:
         warnings.warn(
-            f"the poses are missed: {', '.join(told)}. They are out of reach, faster than the "
-            "joints may move, or far from the start",
+            f"the poses are missed: {_described(missed)}. They are out of reach, faster than "
+            "the joints may move, or far from the start",
             PlausibilityWarning,
             stacklevel=2,
         )
@@ -163,46 +161,44 @@ def reach(
     for link, frame in poses.items():
         if frame.batch_shape:
             raise ShapeError(f"{link!r} needs one pose, got {tuple(frame.batch_shape)} of them")
-    solver = _Solver(robot, poses, start, posture, STEP, orientations)
+    rest = robot.joint_tensor(start if posture is None else posture)
+    solver = _Solver(robot, poses, start, STEP, orientations, STEP)
     for _ in range(MOST_STEPS):
-        left = _left(robot, solver.joints, poses, orientations)
-        if max(_worst(*errors) for errors in left.values()) <= tolerance:
-            break
-        solver.step(poses)
-    else:
-        told = [_told(link, *errors) for link, errors in left.items()]
-        raise DataError(
-            f"the poses are not reached from this start: {', '.join(told)}. Start nearer, ask "
-            "for positions alone (orientations=False), or for poses within reach"
-        )
-    return solver.joints
+        errors = _errors(robot, solver.joints, poses, orientations)
+        if all(bool(error.max() <= tolerance) for error in errors.values()):
+            return solver.joints
+        solver.step(poses, rest)
+    raise DataError(
+        f"the poses are not reached from this start: {_described(errors)}. Start nearer, ask "
+        "for positions alone (orientations=False), or for poses within reach"
+    )
 
 
-def _left(
+def _errors(
     robot: Robot, joints: Tensor, poses: Mapping[str, Frame], orientations: bool
-) -> dict[str, tuple[Tensor, Tensor]]:
-    """How far each link is from its poses [m and rad]."""
-    state, left = robot.state(joints), {}
+) -> dict[str, Tensor]:
+    """How far each link is from its poses: (N, 2), in metres and radians."""
+    state, errors = robot.state(joints), {}
     for link, pose in poses.items():
         away = (pose.position.to(joints) - state.position(link)).norm(dim=-1)
         turn = quaternions.product(
             pose.orientation.to(joints), quaternions.conjugate(state.orientation(link))
         )
-        angle = quaternions.log(turn).norm(dim=-1)
-        left[link] = away, angle if orientations else torch.zeros_like(angle)
-    return left
+        angle = quaternions.log(turn).norm(dim=-1) * float(orientations)
+        errors[link] = torch.stack((away, angle), -1).reshape(-1, 2)
+    return errors
 
 
-def _worst(away: Tensor, turn: Tensor) -> float:
-    return float(torch.maximum(away, turn).max())
-
-
-def _told(link: str, away: Tensor, turn: Tensor) -> str:
-    """How far a link is from its pose, or from the one of many that it misses by most."""
-    number = int(torch.maximum(away, turn).argmax())
-    of = f" from pose {number} of {len(away)}" if away.ndim else ""
-    far = 1e3 * float(away.flatten()[number]), math.degrees(float(turn.flatten()[number]))
-    return f"{link!r} is {far[0]:.1f} mm, {far[1]:.1f} deg away{of}"
+def _described(errors: Mapping[str, Tensor]) -> str:
+    """How far links are from the pose that each misses by most."""
+    texts = []
+    for link, error in errors.items():
+        worst = int(error.amax(-1).argmax())
+        which = f" from pose {worst} of {len(error)}" if len(error) > 1 else ""
+        away, angle = error[worst].tolist()
+        degrees = math.degrees(angle)
+        texts.append(f"{link!r} is {1e3 * away:.1f} mm, {degrees:.1f} deg away{which}")
+    return ", ".join(texts)
 
 
 class _Solver:
@@ -213,10 +209,9 @@ class _Solver:
         robot: Robot,
         poses: Mapping[str, Frame],
         start: Any,
-        posture: Any,
         period: float,
         orientations: bool,
-        gain: float | None = None,
+        gain: float,
     ) -> None:
         try:
             import mink
@@ -232,24 +227,17 @@ class _Solver:
         self.joints = robot.joint_tensor(start).cpu().double()
         if self.joints.ndim != 1:
             raise ShapeError(f"one start is needed, got {tuple(self.joints.shape)}")
-        rest = self.joints if posture is None else robot.joint_tensor(posture).cpu().double()
         self.configuration = mink.Configuration(model, self.joints[self.columns].numpy())
         cost = 1.0 if orientations else 0.0
         self.tasks = {link: mink.FrameTask(link, "body", 1.0, cost) for link in poses}
-        # a gain of one period: the posture is sought slowly, not within one step
-        gain = min(period, 1.0) if gain is None else gain
         self.posture = mink.PostureTask(model, POSTURE_COST, gain=gain)
-        self.seek(rest)
         speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
         limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]
 
-    def seek(self, posture: Tensor) -> None:
-        """Change what joints seek where the poses leave them free."""
+    def step(self, poses: Mapping[str, Frame], posture: Tensor) -> Tensor:
+        """The joints one period later, on the way to the poses and the posture."""
         self.posture.set_target(posture[self.columns].cpu().double().numpy())
-
-    def step(self, poses: Mapping[str, Frame]) -> Tensor:
-        """The joints one period later, on the way to the poses."""
         for link, pose in poses.items():
             orientation, position = pose.orientation.cpu().numpy(), pose.position.cpu().numpy()
             target = self.mink.SE3(np.concatenate((orientation, position)))

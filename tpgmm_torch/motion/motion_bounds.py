@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -29,32 +29,31 @@ __all__ = ["MotionBounds"]
 
 #: Accelerations and jerks may be this many times those that were demonstrated.
 MARGIN = 3.0
-#: Seconds in which every joint may reach its speed limit: those that demonstrations moved
-#: little, and those of which none tell.
-SLOW, UNTOLD = 0.25, 0.1
-#: Speeds to which arms are limited [rad/s]. Descriptions that name greater ones may mean motors
-#: without load, 37 rad/s, which is no reason to go there in a quarter of a second.
-BELIEVED = 4.0
+#: Seconds in which every joint may reach its speed limit, with and without demonstrations.
+RISE_TIME, RISE_TIME_ALONE = 0.25, 0.1
+#: Speed that an arm is taken to reach in that time at most [rad/s or m/s]. Descriptions that
+#: name greater limits may mean motors without load, 37 rad/s, which is no reason to go there in
+#: a quarter of a second.
+BELIEVABLE_SPEED = 4.0
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
-#: What rounding may add to a bound, as a share of it.
+#: Share of a bound that rounding may add to it.
 ROUNDING = 1e-9
 #: Seconds or metres that are longer than any motion.
 LONG = 1e6
 
 
-@dataclass(frozen=True, eq=False)
-class LimitArrays:
-    """The same as arrays, and what every tick asks of them.
+class LimitArrays(NamedTuple):
+    """Bounds as arrays of shape (n_joints,), and what every tick asks of them.
 
     Parameters
     ----------
-    lower, upper, velocity, acceleration, jerk : ndarray of shape (n_joints,)
+    lower, upper, velocity, acceleration, jerk : ndarray
         The bounds, with room for rounding in the acceleration and the jerk.
-    half_over_jerk : ndarray of shape (n_joints,)
+    half_over_jerk : ndarray
         ``1 / 2J``: an acceleration a that is given up as fast as can be adds ``a^2 / 2J`` to
         the speed.
-    stopping_time, stopping_distance : ndarray of shape (n_joints,)
+    stopping_time, stopping_distance : ndarray
         A motion that reaches the speed v at most is stopped within
         ``v * stopping_time + stopping_distance``.
     """
@@ -68,15 +67,10 @@ class LimitArrays:
     stopping_time: Array
     stopping_distance: Array
 
-    @cached_property
-    def rows(self) -> Array:
-        """Acceleration, jerk, velocity, upper and minus lower, (5, n_joints)."""
-        return np.stack([self.acceleration, self.jerk, self.velocity, self.upper, -self.lower])
-
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """What every tick of a motion keeps within; made by ``of``.
+    """Bounds on position, speed, acceleration and jerk of each joint; made by :meth:`of`.
 
     Parameters
     ----------
@@ -152,62 +146,44 @@ class MotionBounds:
             If the description of the robot lacks limits of position or speed that are not
             given either.
         """
-        names = kinematics.joint_names
-        known = {field.name for field in fields(cls)}
+        names = [field.name for field in fields(cls)]
         for name in given:
-            if name not in known:
-                raise UnknownNameError("bound", name, "the bounds of a motion", known)
-        endless = torch.full_like(kinematics.lower, torch.inf, dtype=torch.float64)
-        values = {name: getattr(kinematics, name) for name in sorted(known)}
-        own = {n: (endless if v is None else v).double() for n, v in values.items()}
-        bound = {
-            name: _tightened(name, value, given.get(name), names) for name, value in own.items()
-        }
-        named = [
-            bound[key].isfinite() for key in ("lower", "upper", "velocity") if key in given
-        ]
-        told = torch.stack(named).all(0) if named else endless.isfinite()
-        missing = [
-            name
-            for name, known in zip(names, told, strict=True)
-            if name in kinematics.without_limits and not known
-        ]
-        if missing:
-            warnings.warn(
-                "the description of the robot has no limits of position or speed, or none that "
-                f"fit together, of the joints {missing}: complete the URDF, or give lower, "
-                "upper and velocity",
-                MissingLimitsWarning,
-                stacklevel=2,
-            )
-        peaks = jerks = torch.zeros_like(endless)
+            if name not in names:
+                raise UnknownNameError("bound", name, "the bounds of a motion", names)
+        unlimited = torch.full_like(kinematics.lower, torch.inf, dtype=torch.float64)
+        bound = {}
+        for name in names:
+            own = getattr(kinematics, name)
+            own = unlimited if own is None else own.double()
+            bound[name] = _tightened(name, own, given.get(name), kinematics.joint_names)
+        _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
+        peaks = jerks = torch.zeros_like(unlimited)
         if demonstrated is not None:
-            peaks, jerks = (
-                as_tensor(x, "demonstrated peaks").to(endless) for x in demonstrated
-            )
+            peaks, jerks = (as_tensor(x, "demonstrated peaks") for x in demonstrated)
             for found in (peaks, jerks):
-                if found.shape != endless.shape:
+                if found.shape != unlimited.shape:
                     raise ShapeError(
-                        f"demonstrated peaks have shape ({len(names)},), got "
+                        f"demonstrated peaks have shape {tuple(unlimited.shape)}, got "
                         f"{tuple(found.shape)}"
                     )
-        seconds = UNTOLD if demonstrated is None else SLOW
-        quick = bound["velocity"] / seconds
-        most = max(BELIEVED / seconds, MARGIN * float(peaks.max()))
+            peaks, jerks = peaks.to(unlimited), jerks.to(unlimited)
+        seconds = RISE_TIME_ALONE if demonstrated is None else RISE_TIME
+        most = max(BELIEVABLE_SPEED / seconds, MARGIN * float(peaks.max()))
+        quick = (bound["velocity"] / seconds).clamp(max=most)
         # of a joint without limit of speed, what was demonstrated is all that is known
-        untold = torch.where(peaks > 0, 0.0, torch.inf)
-        quick = torch.where(quick.isinf(), untold, quick.clamp(max=most))
-        acceleration, jerk = torch.maximum(quick, MARGIN * peaks), MARGIN * jerks
-        told = torch.isfinite(bound["acceleration"])
-        bound["acceleration"] = torch.where(told, bound["acceleration"], acceleration)
-        jerk = torch.maximum(jerk, bound["acceleration"] / ONSET)
-        told = torch.isfinite(bound["jerk"])
-        bound["jerk"] = torch.where(told, bound["jerk"], jerk)
+        unknown = torch.where(peaks > 0, 0.0, torch.inf)
+        quick = torch.where(bound["velocity"].isinf(), unknown, quick)
+        acceleration, jerk = bound["acceleration"], bound["jerk"]
+        usual = torch.maximum(quick, MARGIN * peaks)
+        acceleration = torch.where(acceleration.isfinite(), acceleration, usual)
+        usual = torch.maximum(MARGIN * jerks, acceleration / ONSET)
+        jerk = torch.where(jerk.isfinite(), jerk, usual)
+        bound |= {"acceleration": acceleration, "jerk": jerk}
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
 
     @cached_property
     def arrays(self) -> LimitArrays:
-        """The same as arrays of numpy, and constants for a quick look."""
+        """The same as arrays, and constants of stopping."""
         values = (getattr(self, field.name) for field in fields(self))
         lower, upper, velocity, acceleration, jerk = map(as_array, values)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -227,6 +203,26 @@ class MotionBounds:
             lower, upper, velocity, acceleration * room, jerk * room, 0.5 / jerk, stopping,
             distance,
         )  # fmt: skip
+
+
+def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None:
+    """Warn of joints of which neither the robot nor the user gives position and speed."""
+    known = kinematics.lower.isfinite() & False
+    if given:
+        known = torch.stack([bound.isfinite() for bound in given]).all(0)
+    missing = [
+        name
+        for name, there in zip(kinematics.joint_names, known, strict=True)
+        if name in kinematics.without_limits and not there
+    ]
+    if missing:
+        warnings.warn(
+            "the description of the robot has no limits of position or speed, or none that fit "
+            f"together, of the joints {missing}: complete the URDF, or give lower, upper and "
+            "velocity",
+            MissingLimitsWarning,
+            stacklevel=3,
+        )
 
 
 def _tightened(name: str, own: Tensor, given: Any, joints: tuple[str, ...]) -> Tensor:

@@ -105,7 +105,6 @@ def test_a_posture_within_bounds_is_taken_as_it_is():
         assert bool(Follower.at(limits, wanted.detach()).fits(wanted, DT))
     slope = 0.3 * 1.5 * np.sin(1.5 * 49 * DT)
     np.testing.assert_allclose(follower.velocity.numpy(), slope, rtol=1e-3)
-    np.testing.assert_allclose(follower.acceleration.numpy(), 0.5, rtol=0.05)
 
 
 def test_who_can_follow_is_told_robot_by_robot():
@@ -155,7 +154,7 @@ def test_a_posture_that_stops_is_not_overshot(speed, acceleration, jerk, ticks):
 def test_a_start_outside_comes_back_and_stays(velocity):
     limits = bounds()
     start = torch.tensor([1.5, -1.2, 1.4], dtype=torch.float64)
-    follower = Follower.at(limits, [0.0, 0.0, 0.0]).reset(start, velocity)
+    follower = Follower.at(limits, start, velocity)
     wanted = torch.tensor([2.0, -3.0, 1.5], dtype=torch.float64)
     followers = follow(follower, [wanted] * 400, [DT] * 400)
     references = torch.stack([start, *(one.reference for one in followers)])
@@ -169,7 +168,7 @@ def test_a_start_outside_comes_back_and_stays(velocity):
 
 
 def test_what_is_no_number_brings_a_joint_to_rest():
-    follower = Follower.at(bounds(), [0.0, 0.0, 0.0]).reset([0.0, 0.0, 0.0], [1.0, 1.0, 0.5])
+    follower = Follower.at(bounds(), [0.0, 0.0, 0.0], [1.0, 1.0, 0.5])
     wanted = torch.tensor([torch.nan, torch.inf, 0.2], dtype=torch.float64)
     for _ in range(300):
         follower = follower.advance(wanted, DT)
