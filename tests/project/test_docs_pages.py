@@ -36,7 +36,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 TARGETS = re.findall(r"^([a-z]+):.*##", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE)
 PROJECTS = {
     project["name"]: project
-    for path in (ROOT / "pyproject.toml", ROOT / "policies" / "pyproject.toml")
+    for path in (ROOT / "pyproject.toml", *ROOT.glob("*/pyproject.toml"))
     for project in [tomllib.loads(path.read_text("utf-8"))["project"]]
 }
 
@@ -71,9 +71,10 @@ def check_options(program: str, arguments: list[str]) -> None:
     from lerobot.rollout.configs import RolloutConfig, RolloutStrategyConfig
     from lerobot.rollout.inference import InferenceEngineConfig
 
+    import lerobot_env_bimanual
     from lerobot_policy_tpgmm import TPGMMConfig
 
-    assert so_follower  # registers the robot that the page uses
+    assert so_follower and lerobot_env_bimanual  # they register what pages use
     options = dict(argument.removeprefix("--").split("=", 1) for argument in arguments)
     of_command = {
         "lerobot-eval": EvalPipelineConfig,
@@ -104,8 +105,9 @@ def run(command: str) -> None:
         assert asked <= set(TARGETS), f"no such target: {command}"
     elif program == "pip":
         for requirement in map(Requirement, arguments[1:]):
-            known = PROJECTS[requirement.name]["optional-dependencies"]
-            assert requirement.extras <= known.keys(), command
+            if requirement.name != "lerobot":
+                known = PROJECTS[requirement.name]["optional-dependencies"]
+                assert requirement.extras <= known.keys(), command
     elif program == "python":
         assert (ROOT / arguments[0]).is_file(), f"no such script: {command}"
     elif program == "torchrun":
