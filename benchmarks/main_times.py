@@ -1,0 +1,53 @@
+"""The main work of this library alone, in turns: what ``make regressions`` compares."""
+
+import copy
+from collections.abc import Iterator
+from functools import partial
+
+from benchmarks import mixtures
+from benchmarks.batched_step import tick
+from benchmarks.child import ask
+from benchmarks.points import Problem, motions
+from benchmarks.rows import Row
+from benchmarks.settings import Settings
+from benchmarks.skill import aligned, learned, model, skill
+from benchmarks.timing import in_turns, medians, per_call, per_iteration, seconds
+
+__all__ = ["measure"]
+
+#: The slow ones are measured so many times, if others are measured more often.
+FEW = 2
+
+
+def measure(settings: Settings) -> Iterator[Row]:
+    """Import, fit, EM, a step and whole skills; plain, and a compiled step."""
+    made, shown = learned(settings), aligned(settings)
+    given = skill(settings).situations(settings.size(50, 2), settings.seed + 1000)
+    problem = Problem.of(motions(settings.size(13_000, 650), seed=settings.seed), 10)
+    large = Problem.of(motions(settings.size(1_000_000, 1_300), seed=settings.seed), 10)
+    many, calls = settings.size(4096, 8), settings.size(300, 3)
+    compiled = copy.copy(made).compile("inductor" if settings.full else "aot_eager")
+    measurements = {
+        "import tpgmm_torch": lambda: ask("start_up", "tpgmm_torch")[0],
+        "import of the estimator": lambda: ask("start_up", "tpgmm_torch.estimator")[0],
+        "fit of the demo": partial(seconds, lambda: model(settings, 30).fit(shown)),
+        "EM iteration, 13k points": per_iteration(
+            mixtures.ours(problem), *settings.iterations(2, 12)
+        ),
+        "EM iteration, 1M points": per_iteration(
+            mixtures.ours(large), *settings.iterations(1, 3)
+        ),
+        "step, one robot": per_call(tick(made, settings, 1, False), calls),
+        "step, one robot, compiled": per_call(tick(compiled, settings, 1, False), calls),
+        f"step, {many} robots": per_call(tick(made, settings, many), 1),
+        "predict, one situation": partial(
+            seconds, partial(made.predict, given[:1], candidates=False)
+        ),
+        f"predict, {len(given)} situations": partial(
+            seconds, partial(made.predict, given, candidates=False)
+        ),
+    }
+    rounds = settings.rounds(5)
+    taken = in_turns(measurements, rounds, {"EM iteration, 1M points": FEW}, warm_up=True)
+    for name, figure in medians(taken).items():
+        yield Row(name, "s", figure, rounds=len(taken[name]))

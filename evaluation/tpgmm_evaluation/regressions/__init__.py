@@ -1,0 +1,1 @@
+"""Regression measurements: what must not get worse, measured and compared."""
