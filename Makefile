@@ -23,8 +23,10 @@ WORKERS ?= 2
 # Meta-World asks for another MuJoCo than the rest, and dm-control follows MuJoCo
 METAWORLD := .venv-metaworld
 BENCH := OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks
+MEASURE := HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m tpgmm_evaluation.regressions
+MEASURED := --workers $(WORKERS) $(if $(SMALL),--small) $(if $(ONLY),--only $(ONLY))
 
-.PHONY: help demo compare evidence conditions metaworld bench test oldest newest fuzz mutants lint types docs check dist constraints clean
+.PHONY: help demo compare evidence conditions metaworld bench baseline regressions test oldest newest fuzz mutants lint types docs check dist constraints clean
 .NOTPARALLEL:
 
 help: ## List the targets
@@ -47,6 +49,12 @@ conditions: $(VENV)/.installed-compare ## Try TP-GMM where things go wrong, besi
 
 bench: $(VENV)/.installed-bench ## Measure speed beside other libraries; BENCH_ARGS="--only step"; out/bench
 	$(BENCH) --out out/bench $(BENCH_ARGS)
+
+baseline: $(VENV)/.installed-evidence ## Measure what must not get worse, for hours; SMALL=1: minutes; ONLY=goldens,demo; out/baseline
+	$(MEASURE) baseline $(MEASURED)
+
+regressions: $(VENV)/.installed-evidence ## Measure again and compare; SMALL=1 ONLY=times; BASE=../checkout takes times in turns
+	$(MEASURE) compare --again $(MEASURED) $(if $(BASE),--base $(BASE))
 
 metaworld: ## Try all tasks of Meta-World; ARGS="--tasks reach-v3 --demonstrations 1,3"; out/metaworld
 	$(MAKE) $(METAWORLD)/.installed-metaworld VENV=$(METAWORLD)

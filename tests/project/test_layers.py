@@ -74,7 +74,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("jobs",),
         ("report",),
         ("compare", "metaworld"),
-        ("command",),
+        ("command", "regressions"),
     ),
 }
 #: A face hands names on; every other file counts.

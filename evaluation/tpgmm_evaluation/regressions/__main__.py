@@ -20,8 +20,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from tpgmm_evaluation.regressions.comparison import compared, table
-from tpgmm_evaluation.regressions.sections import SECTIONS, Plan, measure, timed
+
+from tpgmm_evaluation.regressions.comparison import compared, stored, table
+from tpgmm_evaluation.regressions.plan import Plan
+from tpgmm_evaluation.regressions.sections import SECTIONS, measure, timed
 from tpgmm_evaluation.regressions.sensitivity import sensitivity
 
 __all__ = ["main"]
@@ -42,7 +44,6 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--again", action="store_true", help="measure what was measured before")
     parser.add_argument("--base", type=Path, help="checkout to take times beside, in turns")
     parser.add_argument("--rounds", type=int, default=3, help="of times taken in turns")
-    parser.add_argument("--all", action="store_true", help="show what is as it was, too")
     given = parser.parse_args(arguments)
     if unknown := set(given.only.split(",")) - set(SECTIONS):
         parser.error(f"--only: no such section: {sorted(unknown)}; there are {list(SECTIONS)}")
@@ -65,16 +66,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.again:
         shutil.rmtree(plan.out, ignore_errors=True)
     sections = given.only.split(",")
-    beside = given.what == "compare" and given.base is not None
-    failures = measure(plan, [s for s in sections if not (beside and s == "times")])
+    beside = given.what == "compare" and given.base is not None and "times" in sections
+    if beside:
+        sections.remove("times")
+    failures = measure(plan, sections)
     if given.what == "baseline":
         return int(bool(failures))
-    turns = []
-    if beside and "times" in sections:
-        for _ in range(given.rounds):
-            turns.append((timed(given.base, given.small), timed(plan.root, given.small)))
-    rows = compared(before, plan.out, sections, turns)
-    print(*table(rows, given.all), sep="\n")
+    cells = list(stored(before, plan.out, sections))
+    for _ in range(given.rounds if beside else 0):
+        turn = timed(given.base, given.small), timed(plan.root, given.small)
+        cells.append(("times", *turn))
+    rows = compared(cells)
+    print(*table(rows), sep="\n")
     return int(bool(failures) or any(row.worse for row in rows))
 
 

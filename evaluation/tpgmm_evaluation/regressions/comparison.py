@@ -1,27 +1,29 @@
-"""Two folders of cells beside each other: what became worse, and whether that is chance."""
+"""Two measurements beside each other: what became worse, and whether that is chance."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import wilcoxon
 
-from lerobot_policy_tpgmm.evaluation.report.significance import LEVEL, holm, mcnemar
+from tpgmm_evaluation.regressions.plan import Measured
+from tpgmm_evaluation.report.significance import LEVEL, holm, mcnemar
 
-__all__ = ["Row", "compared", "table"]
+__all__ = ["Row", "compared", "stored", "table"]
 
-#: Rounding, relative to the largest value.
+#: Rounding, relative to the largest value or to 1.
 ROUNDING = 1e-9
-#: By which share a mean may be worse that no test calls so.
+#: By which share a mean may be worse though no test finds that significant.
 TOLERATED = 0.01
-#: By how much more time may be taken; less where an optimising compiler leaves no excuse.
+#: How many times the time may be taken; of a compiled step, which hardly varies.
 SLOWER, SLOWER_COMPILED = 1.25, 1.1
 
 Array = NDArray[np.float64]
+Pairs = Sequence[tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Row:
     ----------
     name : str
     before, now : float
-        Means; of times, medians.
+        Means; of times, medians; of golden references, the largest difference is ``now``.
     n : int
         Episodes, folds, situations or values.
     p : float
@@ -40,7 +42,7 @@ class Row:
     worse : str
         Why this is worse; empty if it is not.
     changed : bool
-        Whether anything differs beyond rounding.
+        Whether anything differs by more than rounding.
     """
 
     name: str
@@ -52,76 +54,55 @@ class Row:
     changed: bool = True
 
 
-def compared(
-    before: Path, now: Path, sections: Sequence[str], in_turns: Sequence[tuple[Cell, Cell]] = ()
-) -> list[Row]:
-    """Compare what both folders hold.
+def stored(
+    before: Path, now: Path, sections: Iterable[str]
+) -> Iterator[tuple[str, Measured, Measured]]:
+    """Cells of two folders, with the name of their group: the folder they are in.
 
     Parameters
     ----------
     before, now : Path
         As :func:`~tpgmm_evaluation.regressions.sections.measure` fills them.
-    sections : sequence of str
-    in_turns : sequence of pair of cell
-        Times of another checkout and of this one, taken in turns; they stand for the files'.
+    sections : iterable of str
+    """
+    for section in sections:
+        for path in sorted((before / section).rglob("*.npz")):
+            file, group = path.relative_to(before), path.parent.relative_to(before)
+            name = str(group if len(group.parts) > 1 else file.with_suffix(""))
+            yield name, np.load(path), np.load(now / file) if (now / file).exists() else {}
+
+
+def compared(cells: Iterable[tuple[str, Measured, Measured]]) -> list[Row]:
+    """Compare each quantity, over all cells of a group.
+
+    Parameters
+    ----------
+    cells : iterable of (str, mapping, mapping)
+        Group, what was measured before, and now.
 
     Returns
     -------
     list of Row
-        One for each quantity of each group of cells.
     """
-    pairs: dict[str, list[tuple[Array, Array]]] = {}
-    rows = []
-    for section in sections:
-        if section == "times" and in_turns:
-            for one, other in in_turns:
-                _enter(pairs, "times", one, other)
-            continue
-        for path in sorted((before / section).rglob("*.npz")):
-            other = now / path.relative_to(before)
-            group = path.parent if path.parent.name != section else path
-            name = str(group.relative_to(before).with_suffix(""))
-            if not other.exists():
-                rows.append(
-                    Row(f"{name}: {path.stem}", np.nan, np.nan, 0, worse="not measured")
-                )
-            else:
-                _enter(pairs, name, np.load(path), np.load(other))
-    return rows + _tested(pairs)
-
-
-Cell = Mapping[str, Array]
-
-
-def _enter(
-    pairs: dict[str, list[tuple[Array, Array]]], group: str, one: Cell, other: Cell
-) -> None:
-    for key in one:
-        kind, _, name = key.partition(":")
-        found = other[key] if key in other else np.array([])
-        pairs.setdefault(f"{kind}:{group}: {name}", []).append((one[key], found))
-
-
-def _tested(pairs: Mapping[str, Sequence[tuple[Array, Array]]]) -> list[Row]:
-    """Rows with p-values that are corrected for how many tests were made."""
-    names = [name for name, cells in pairs.items() for _ in cells]
-    p = holm([_p_value(name, *cell) for name, cells in pairs.items() for cell in cells])
-    return [
-        _row(name, cells, p[[i for i, other in enumerate(names) if other == name]])
-        for name, cells in pairs.items()
-    ]
+    pairs: dict[tuple[str, str], list[tuple[Array, Array]]] = {}
+    for group, before, now in cells:
+        for key in before:
+            kind, _, name = key.partition(":")
+            found = now[key] if key in now else np.array([])
+            pairs.setdefault((kind, f"{group}: {name}"), []).append((before[key], found))
+    p = iter(holm([_p_value(kind, *each) for (kind, _), of in pairs.items() for each in of]))
+    return [_row(*key, of, np.array([next(p) for _ in of])) for key, of in pairs.items()]
 
 
 def _gain(kind: str, before: Array, now: Array) -> Array:
-    """By how much each of a pair is better now; rounding, and what is infinite, is no gain."""
+    """By how much each of a pair is better now; what is infinite has no part in it."""
     gain = before - now if kind == "error" else now - before
     same = np.isclose(before, now, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
     return np.where(same | ~np.isfinite(gain), 0.0, gain)
 
 
-def _p_value(name: str, before: Array, now: Array) -> float:
-    """That one cell differs by chance; 1 where that is not asked."""
-    kind = name.partition(":")[0]
+def _p_value(kind: str, before: Array, now: Array) -> float:
+    """How likely one cell differs as much by chance; 1 where that is not asked."""
     if kind in ("same", "seconds") or before.shape != now.shape:
         return 1.0
     gain = _gain(kind, before, now)
@@ -130,54 +111,37 @@ def _p_value(name: str, before: Array, now: Array) -> float:
     return float(wilcoxon(gain[gain != 0]).pvalue) if gain.any() else 1.0
 
 
-def _row(name: str, cells: Sequence[tuple[Array, Array]], p: Array) -> Row:
-    kind, _, name = name.partition(":")
-    if any(one.shape != other.shape for one, other in cells):
-        return Row(name, np.nan, np.nan, 0, worse="of another shape, or gone")
-    before, now = (np.concatenate([cell[i].ravel() for cell in cells]) for i in (0, 1))
+def _row(kind: str, name: str, pairs: Pairs, p: Array) -> Row:
+    if any(one.shape != other.shape for one, other in pairs):
+        return Row(name, np.nan, np.nan, 0, worse="not measured, or of another shape")
+    before, now = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in (0, 1))
     if kind == "same":
-        return _same(name, before, now)
+        most = float(np.abs(before - now).max())
+        worse = most > ROUNDING * max(1.0, float(np.abs(before).max()))
+        return Row(name, 0.0, most, len(now), 1.0, "changed" if worse else "", most > 0)
     if kind == "seconds":
         one, other = float(np.median(before)), float(np.median(now))
-        most = SLOWER_COMPILED if "compiled" in name else SLOWER
-        slow = f"{other / one:.2f} x the time" if other > most * one else ""
-        return Row(name, one, other, len(before), worse=slow)
-    gain = _gain(kind, before, now)
-    both = np.isfinite(before) & np.isfinite(now)
-    row = Row(
-        name,
-        float(before[both].mean()) if both.any() else np.nan,
-        float(now[both].mean()) if both.any() else np.nan,
-        len(before),
-        float(p.min()),
-        changed=bool(gain.any()) or bool((np.isfinite(before) != np.isfinite(now)).any()),
-    )
-    lost = [_gain(kind, *cell).mean() < 0 for cell in cells]
-    if any(lost & (p < LEVEL)):
-        return replace(row, worse="significantly")
-    if gain.mean() < -TOLERATED * abs(row.before):
-        return replace(row, worse=f"on average by {abs(gain.mean() / row.before):.1%}")
-    return row
+        limit = SLOWER_COMPILED if "compiled" in name else SLOWER
+        slow = f"{other / one:.2f} times as long" if other > limit * one else ""
+        return Row(name, one, other, len(now), worse=slow)
+    gain, both = _gain(kind, before, now), np.isfinite(before) & np.isfinite(now)
+    one, other = (float(each[both].mean()) if both.any() else np.nan for each in (before, now))
+    lost = np.array([_gain(kind, *pair).mean() < 0 for pair in pairs])
+    why = "significantly" if (lost & (p < LEVEL)).any() else ""
+    if not why and gain.mean() < -TOLERATED * abs(one):
+        why = f"on average, by {abs(gain.mean() / one):.1%}"
+    changed = bool(gain.any() or (np.isfinite(before) != np.isfinite(now)).any())
+    return Row(name, one, other, len(now), float(p.min()), why, changed)
 
 
-def _same(name: str, before: Array, now: Array) -> Row:
-    apart = np.abs(before - now)
-    most = float(apart.max()) if len(apart) else 0.0
-    size = max(1.0, float(np.abs(before).max())) if len(before) else 1.0
-    changed = "" if most <= ROUNDING * size else f"changed by {most:.2g}"
-    return Row(name, 0.0, most, len(before), worse=changed, changed=most > 0)
-
-
-def table(rows: Sequence[Row], every: bool = False) -> Iterator[str]:
-    """Lines of a table: what changed, and how much is as it was.
+def table(rows: Sequence[Row]) -> Iterator[str]:
+    """Lines of a table: what changed, and how many quantities did not.
 
     Parameters
     ----------
     rows : sequence of Row
-    every : bool, default=False
-        Whether to show what is as it was.
     """
-    shown = [row for row in rows if row.changed or row.worse or every]
+    shown = [row for row in rows if row.changed or row.worse]
     width = max([4, *(len(row.name) for row in shown)])
     yield f"{'':{width}}{'before':>12}{'now':>12}{'n':>7}{'p':>9}"
     for row in shown:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from lerobot_policy_tpgmm.evaluation.benchmarks import benchmark
 from tpgmm_datasets.bottle.carrying import CarryAndPut
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_evaluation.benchmarks import benchmark
+from tpgmm_evaluation.regressions.plan import Measured, Plan
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -21,84 +21,46 @@ from tpgmm_torch import (
     Situation,
     Stack,
     TaskParameterizedGMM,
-    quaternions,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 
 __all__ = ["GOLDENS"]
 
 #: Situations to reproduce, and states for one batch of steps.
 SITUATIONS, STATES = 10, 64
 
-Measured = Mapping[str, NDArray[np.float64]]
 
-
-def _random_frame(rng: np.random.Generator, reach: float, turn: float) -> Frame:
-    turned = quaternions.exp(torch.from_numpy(rng.uniform(-turn, turn, 3)))
-    return Frame(rng.uniform(-reach, reach, 3), turned)
-
-
-def planted_demonstrations(n: int, seed: int, n_steps: int = 101) -> list[Demonstration]:
-    """A tracked hand that goes to a pose in frame ``a``, then to one in frame ``b``.
-
-    Parameters
-    ----------
-    n : int
-        Frames are drawn anew for each.
-    seed : int
-    n_steps : int, default=101
-        Over ten seconds.
-    """
-    rng, goals = np.random.default_rng(seed), np.random.default_rng(0)
-    poses = [_random_frame(goals, 0.1, 0.6) for _ in range(3)]  # in a, in b, at the start
-    time = torch.linspace(0, 10, n_steps, dtype=torch.float64)
-    found = []
-    for _ in range(n):
-        frames = {name: _random_frame(rng, 0.3, 0.5) for name in "ab"}
-        start = Frame(poses[2].position + 0.03 * rng.standard_normal(3), poses[2].orientation)
-        position = start.position.expand(n_steps, 3)
-        orientation = start.orientation.expand(n_steps, 4)
-        for name, goal, begin in (("a", poses[0], 0.0), ("b", poses[1], 5.0)):
-            wanted, share = frames[name].compose(goal), minimum_jerk((time - begin) / 4)
-            position = position + share[:, None] * (wanted.position - position)
-            orientation = quaternions.slerp(orientation, wanted.orientation, share)
-        noisy = position + 1e-3 * torch.from_numpy(rng.standard_normal((n_steps, 3)))
-        joints = Poses.joints({"hand": Frame(noisy, orientation)})
-        found.append(Demonstration(time, joints, frames, Poses(["hand"]).joint_names))
-    return found
-
-
-def planted(small: bool) -> Measured:
-    """Two frames that matter, and no robot."""
+def planted(plan: Plan) -> Measured:
+    """A tracked hand, two frames that matter, and no robot: the task that tests plant."""
+    task = plan.loaded("tests.support.planted").PlantedTask(3, 2)
     operators = [
         Stack(RelativePosition("hand", name), RelativeOrientation("hand", name))
-        for name in "ab"
+        for name in task.relevant
     ]
+    situations = [Situation.of(one) for one in task.demonstrations(SITUATIONS, 2)]
     model = TaskParameterizedGMM(8, operators, Poses(["hand"]))
-    situations = [Situation.of(one) for one in planted_demonstrations(SITUATIONS, 2)]
-    return _golden(model, planted_demonstrations(6, 1), situations)
+    return _golden(model, task.demonstrations(6, 1), situations)
 
 
-def bottle(small: bool) -> Measured:
+def bottle(plan: Plan) -> Measured:
     """The paper's skill as ``make demo`` learns it; a small one has a tenth of its instants."""
-    skill = BottleShaking(rate=10 if small else 100)
+    skill = BottleShaking(rate=10 if plan.small else 100)
     shown = skill.demonstrations(10, 0)
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(shown)
     model = TaskParameterizedGMM(30, bottle_operators(), skill.robot)
     return _golden(model, aligned, skill.situations(SITUATIONS, 1000))
 
 
-def carried(small: bool) -> Measured:
+def carried(plan: Plan) -> Measured:
     """A bottle that both hands take and put on a tray: it is held, and a thing of its own."""
-    task, skill = benchmark("carry_and_put"), CarryAndPut(rate=10 if small else 50)
+    task, skill = benchmark("carry_and_put"), CarryAndPut(rate=10 if plan.small else 50)
     aligned = DynamicTimeWarping(robot=skill.robot).fit_transform(skill.demonstrations(10, 0))
     model = TaskParameterizedGMM(20, task.operators(True), skill.robot)
     return _golden(model, aligned, skill.situations(SITUATIONS, 1000))
 
 
-#: Name of the skill -> what it gives, from whether it is the small form.
-GOLDENS: Mapping[str, Callable[[bool], Measured]] = {
+#: By the name of the skill.
+GOLDENS: Mapping[str, Callable[[Plan], Measured]] = {
     "planted": planted,
     "bottle": bottle,
     "carried": carried,

@@ -1,9 +1,4 @@
-"""What is measured: each section yields cells, which are measured once and kept in a file each.
-
-A cell holds arrays, named ``KIND:NAME``. The kind says how two of them are compared: ``same``
-to rounding; ``success`` (0 or 1), ``score`` (more is better) and ``error`` (less is better) in
-pairs, the same episode, fold or situation in both; ``seconds`` by their ratio.
-"""
+"""Sections of what is measured: each has cells, one file each."""
 
 from __future__ import annotations
 
@@ -13,78 +8,40 @@ import re
 import subprocess
 import sys
 import tempfile
-import types
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tpgmm_evaluation.regressions.goldens import GOLDENS, Measured
 
-from lerobot_policy_tpgmm.environments.disturbances import NOMINAL
-from lerobot_policy_tpgmm.evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
-from lerobot_policy_tpgmm.evaluation.cells import Results
-from lerobot_policy_tpgmm.evaluation.compare import compare
-from lerobot_policy_tpgmm.evaluation.settings import Settings
+from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_datasets.bottle.experiment import BottleExperiment
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
+from tpgmm_evaluation.cells import Results
+from tpgmm_evaluation.compare import compare
+from tpgmm_evaluation.regressions.goldens import GOLDENS
+from tpgmm_evaluation.regressions.plan import Measured, Plan
+from tpgmm_evaluation.settings import Settings
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import TPGMMError
 
-__all__ = ["SECTIONS", "Plan", "measure", "timed"]
+__all__ = ["SECTIONS", "measure", "timed"]
 
 #: Real recordings beside the checkout, and what ``examples/leave_one_out.py`` calls them.
 RECORDINGS = {"g1_bottle": "g1", "honeytea_bimanual": "honeytea", "so101_record": "so101"}
 ALOHA = ("aloha_state", "aloha_insertion")
-SUITE = tuple(set(BENCHMARKS) - set(ALOHA) - {n for t in OTHER_ROBOTS.values() for n in t})
+OTHERS = {*ALOHA, *(name for tasks in OTHER_ROBOTS.values() for name in tasks)}
+SUITE = tuple(name for name in BENCHMARKS if name not in OTHERS)
 #: Disturbances of the small form: one of the robot, one of the object, one of the sensor.
 FEW = ("stopped-3", "moved", "pose-noise")
 
 Work = Callable[[], Measured]
-Say = Callable[[str], None]
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to measure, and where.
-
-    Parameters
-    ----------
-    out : Path
-        Where cells are kept, as ``SECTION/NAME.npz``.
-    small : bool, default=False
-        Whether a few situations of each do, in minutes; the whole takes hours.
-    root : Path
-        The checkout, whose examples, tests and benchmarks are used.
-    data : Path
-        The folder of the recordings; they are left out where there is none.
-    workers : int, default=1
-        Processes for the rollouts.
-    tasks : sequence of str
-        Of the suite.
-    """
-
-    out: Path
-    small: bool = False
-    root: Path = Path()
-    data: Path = Path("../shared/data")
-    workers: int = 1
-    tasks: Sequence[str] = SUITE
-
-    def loaded(self, module: str) -> Any:
-        """A module of the checkout's examples or tests, which are in no package."""
-        parent = module.partition(".")[0]
-        if parent not in sys.modules or not hasattr(sys.modules[parent], "__path__"):
-            sys.modules[parent] = types.ModuleType(parent)
-        sys.modules[parent].__path__ = [str(self.root / parent)]
-        return import_module(module)
-
-
-def measure(plan: Plan, sections: Sequence[str], say: Say = print) -> list[str]:
+def measure(plan: Plan, sections: Sequence[str]) -> list[str]:
     """Measure what is not yet in the folder.
 
     Parameters
@@ -92,8 +49,6 @@ def measure(plan: Plan, sections: Sequence[str], say: Say = print) -> list[str]:
     plan : Plan
     sections : sequence of str
         Keys of ``SECTIONS``.
-    say : callable
-        Takes a line of progress.
 
     Returns
     -------
@@ -106,55 +61,48 @@ def measure(plan: Plan, sections: Sequence[str], say: Say = print) -> list[str]:
             for name, work in SECTIONS[section](plan):
                 path = plan.out / section / f"{name}.npz"
                 if not path.exists():
-                    say(f"{section}/{name} ...")
+                    print(f"{section}/{name} ...")
                     with warnings.catch_warnings(action="ignore"):
                         cell = work()
                     with replacing(path) as new, new.open("wb") as file:
-                        np.savez_compressed(file, **cell)
+                        np.savez_compressed(file, allow_pickle=False, **cell)
         except Exception as error:  # one that fails is no reason to lose the others
             failures.append(f"{section}: {type(error).__name__}: {error}")
-            say(f"FAILED {failures[-1]}")
+            print(f"FAILED {failures[-1]}")
     return failures
-
-
-def goldens(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Three skills, ten situations each."""
-    for name, golden in GOLDENS.items():
-        yield name, partial(golden, plan.small)
 
 
 def demo(plan: Plan) -> Iterator[tuple[str, Work]]:
     """The figures that ``make demo`` prints."""
 
     def work() -> Measured:
-        skill = BottleShaking(rate=20 if plan.small else 100)
+        n, rate = (10, 20) if plan.small else (50, 100)
         with tempfile.TemporaryDirectory() as folder:
-            run = BottleExperiment(Path(folder), n_situations=10 if plan.small else 50)
-            run.skill = skill
-            metrics = run.run()
-        return {
-            f"error:{row}, {measure}, {part}": np.array([value], dtype=np.float64)
-            for row, measures in metrics["rows"].items()
-            for measure, spread in measures.items()
-            for part, value in (
-                spread if isinstance(spread, Mapping) else {"worst": spread}
-            ).items()
-        }
+            experiment = BottleExperiment(Path(folder), n_situations=n)
+            experiment.skill = BottleShaking(rate=rate)
+            rows = experiment.run()["rows"]
+        found = {}
+        for row, measures in rows.items():
+            for name, values in measures.items():
+                parts = values if isinstance(values, dict) else {"worst": values}
+                for part, value in parts.items():
+                    found[f"error:{row}, {name}, {part}"] = np.array([value], float)
+        return found
 
     yield "figures", work
 
 
-def _rollouts(
-    plan: Plan, tasks: Sequence[str], policies: Sequence[str], conditions: Sequence[str] = ()
+def rollouts(
+    tasks: Sequence[str], policies: Sequence[str], disturbed: bool, plan: Plan
 ) -> Iterator[tuple[str, Work]]:
-    """Cells of ``tpgmm compare``, which goes on where it was: successes and errors."""
-    episodes, seeds = (6, (0,)) if plan.small else (34, (0, 1, 2))
-    counts = (10,) if conditions else (3, 10)
-    settings, out = [Settings(task, episodes=episodes) for task in tasks], plan.out / "rollouts"
-    done = compare(
-        settings, out, policies, counts, seeds, conditions or (NOMINAL,), plan.workers,
-        command="make baseline",
-    )  # fmt: skip
+    """Cells of ``tpgmm compare``, which resumes by itself: successes and errors of episodes."""
+    conditions = (FEW if plan.small else ("all",)) if disturbed else (NOMINAL,)
+    counts, seeds = ((10,), (0,)) if disturbed else ((3, 10), (0, 1, 2))
+    if plan.small:
+        policies, seeds = policies[:1], seeds[:1]
+    settings = [Settings(task, episodes=6 if plan.small else 34) for task in tasks]
+    out = plan.out / "rollouts"
+    done = compare(settings, out, policies, counts, seeds, conditions, plan.workers)
     if done.failures:
         raise TPGMMError(f"{len(done.failures)} cells failed: see {out}/TASK/failures")
     for task in settings:
@@ -162,31 +110,13 @@ def _rollouts(
         errors = [name for name, (low, high) in limits.items() if low == 0 < high < np.inf]
         for result in Results(out / task.env / "cells").read_all(print):
             cell, rows = result["cell"], result["episodes"]
-            if cell["policy"] in policies and (cell["condition"] != NOMINAL) == bool(
-                conditions
-            ):
+            if cell["policy"] in policies and disturbed == (cell["condition"] != NOMINAL):
                 found = {"success:success": np.array([row["success"] for row in rows], float)}
                 for key in errors:
                     found[f"error:{key}"] = np.array([row[key] for row in rows], float)
                 group = f"{cell['policy']}-n{cell['demonstrations']}"
                 name = f"{cell['env']}-s{cell['seed']}-{cell['condition']}"
-                yield f"{group}/{name}", lambda found=found: found
-
-
-def suite(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Seven tasks of two hands, with operators as named, and found."""
-    policies = ("tpgmm",) if plan.small else ("tpgmm", "tpgmm-auto")
-    return _rollouts(plan, plan.tasks, policies)
-
-
-def disturbed(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """The same where something goes wrong, from ten demonstrations."""
-    return _rollouts(plan, plan.tasks, ("tpgmm",), FEW if plan.small else ("all",))
-
-
-def aloha(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """Both tasks of gym-aloha."""
-    return _rollouts(plan, ALOHA[: 1 if plan.small else None], ("tpgmm",))
+                yield f"{group}/{name}", partial(dict, found)
 
 
 def reach(plan: Plan) -> Iterator[tuple[str, Work]]:
@@ -278,15 +208,15 @@ def timed(root: Path, small: bool) -> Measured:
     return {f"seconds:{row['work']}": np.array([row["ours"]]) for row in rows}
 
 
-def times(plan: Plan) -> Iterator[tuple[str, Work]]:
-    """``make bench``'s main figures."""
-    yield "main", partial(timed, plan.root, plan.small)
-
-
 #: In the order in which they are measured: the quick ones first.
 SECTIONS: Mapping[str, Callable[[Plan], Iterator[tuple[str, Work]]]] = {
-    each.__name__: each
-    for each in (
-        goldens, mistakes, demo, times, recordings, reach, suite, aloha, disturbed,
-    )
-}  # fmt: skip
+    "goldens": lambda plan: ((name, partial(work, plan)) for name, work in GOLDENS.items()),
+    "mistakes": mistakes,
+    "demo": demo,
+    "times": lambda plan: iter([("main", partial(timed, plan.root, plan.small))]),
+    "recordings": recordings,
+    "reach": reach,
+    "suite": partial(rollouts, SUITE, ("tpgmm", "tpgmm-auto"), False),
+    "aloha": partial(rollouts, ALOHA, ("tpgmm",), False),
+    "disturbed": partial(rollouts, SUITE, ("tpgmm",), True),
+}

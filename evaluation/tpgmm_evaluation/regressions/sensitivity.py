@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from importlib import import_module
 
 import numpy as np
-from tpgmm_evaluation.regressions.goldens import Measured
-from tpgmm_evaluation.regressions.sections import SECTIONS, Plan
 
+from tpgmm_evaluation.regressions.plan import Measured, Plan
+from tpgmm_evaluation.regressions.sections import SECTIONS
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["sensitivity"]

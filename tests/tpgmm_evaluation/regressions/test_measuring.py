@@ -1,0 +1,101 @@
+"""Measurements are kept, go on where they were stopped, and say the same twice."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.support.comparison import result
+from tpgmm_evaluation.cells import Cell, Results
+from tpgmm_evaluation.compare import Comparison
+from tpgmm_evaluation.regressions import sections
+from tpgmm_evaluation.regressions import sensitivity as changing
+from tpgmm_evaluation.regressions.__main__ import main
+from tpgmm_evaluation.regressions.goldens import GOLDENS
+from tpgmm_evaluation.regressions.plan import Plan
+from tpgmm_evaluation.regressions.sections import SECTIONS, measure
+from tpgmm_torch.exceptions import DataError
+
+ROOT = Path(__file__).parents[3]
+#: Of the section that stands for all.
+VALUE = 3.0
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Names of the cells that were measured, of a section that the others are replaced by."""
+    taken = []
+
+    def cell(name):
+        taken.append(name)
+        if name == "broken":
+            raise DataError("no such thing")
+        return {"score:value": np.full(8, VALUE), "seconds:time": np.ones(1)}
+
+    names = {"good": ("a", "b"), "bad": ("c", "broken")}
+    for section in list(SECTIONS):
+        monkeypatch.delitem(SECTIONS, section)
+    for section, cells in names.items():
+        each = lambda plan, cells=cells: ((name, partial(cell, name)) for name in cells)  # noqa: E731
+        monkeypatch.setitem(SECTIONS, section, each)
+    return taken
+
+
+def test_cells_are_measured_once_and_failures_are_reported(calls, tmp_path):
+    plan = Plan(tmp_path)
+    assert measure(plan, ["bad", "good"]) == ["bad: DataError: no such thing"]
+    assert calls == ["c", "broken", "a", "b"]
+    measure(plan, ["bad", "good"])
+    assert calls[4:] == ["broken"]
+    assert np.load(tmp_path / "good" / "a.npz")["score:value"].shape == (8,)
+
+
+def test_the_command_compares_what_it_measured(calls, tmp_path, monkeypatch, capsys):
+    command = ["--small", "--out", str(tmp_path)]
+    assert main(["baseline", *command, "--only", "good"]) == 0
+    assert main(["compare", *command, "--only", "good"]) == 0
+    monkeypatch.setitem(globals(), "VALUE", 2.0)
+    assert main(["compare", *command, "--only", "good"]) == 0  # kept
+    assert main(["compare", *command, "--only", "good", "--again"]) == 1
+    assert "good/a: value" in capsys.readouterr().out
+    assert main(["baseline", *command]) == 1
+    with pytest.raises(SystemExit):
+        main(["compare", "--only", "nothing"])
+
+
+def test_golden_references_say_the_same_twice(tmp_path):
+    plan = Plan(tmp_path, small=True, root=ROOT)
+    once, again = (GOLDENS["planted"](plan) for _ in range(2))
+    assert all(np.array_equal(once[name], again[name]) for name in once)
+    assert once["same:references"].shape[0] == 10
+
+
+def test_rollouts_are_compared_episode_by_episode(tmp_path, monkeypatch):
+    def compare(settings, out, policies, counts, *_):
+        for n in counts:
+            for cell in (("tpgmm", "nominal"), ("knn", "nominal"), ("tpgmm", "moved")):
+                found = result(cell[0], n, n, cell[1])
+                Results(out / "bottle_shaking" / "cells").write(Cell(**found["cell"]), found)
+        return Comparison(2, {})
+
+    monkeypatch.setattr(sections, "compare", compare)
+    plan = Plan(tmp_path, small=True)
+    cells = dict(sections.rollouts(("bottle_shaking",), ("tpgmm",), False, plan))
+    assert sorted(cells) == [f"tpgmm-n{n}/bottle_shaking-s0-nominal" for n in (10, 3)]
+    for n in (3, 10):
+        measured = cells[f"tpgmm-n{n}/bottle_shaking-s0-nominal"]()
+        assert measured["success:success"].sum() == n
+        assert "error:grasp_mm" in measured and "error:lift_mm" not in measured
+
+
+def test_a_constant_is_tried_at_half_and_at_twice_its_value(calls, tmp_path, monkeypatch):
+    monkeypatch.setattr(changing, "LENGTH", 4.0, raising=False)
+    constant = f"{changing.__name__}:LENGTH"
+    section = lambda plan: iter([("a", lambda: {"error:e": np.array([changing.LENGTH])})])  # noqa: E731
+    monkeypatch.setitem(SECTIONS, "length", section)
+    heading, row = changing.sensitivity(constant, Plan(tmp_path), ("length",))
+    assert row.split()[-3:] == ["4", "2", "8"] and constant in heading
+    assert changing.LENGTH == 4.0
+    with pytest.raises(DataError, match="MODULE:NAME"):
+        list(changing.sensitivity(f"{changing.__name__}:sensitivity", Plan(tmp_path)))
