@@ -29,9 +29,10 @@ from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from tpgmm_evaluation.benchmarks import BottleBenchmark, CarryBenchmark
 from tpgmm_tools.plotting import BLUE, VERMILION
-from tpgmm_torch import Frame, Impedance, TaskParameterizedGMM
+from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.command import Command, Status
+from tpgmm_torch.impedance.stiffness import Impedance
 
 #: File, task, condition of the environment, what happens.
 EPISODES = {

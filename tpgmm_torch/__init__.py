@@ -22,10 +22,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Candidate, Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.impedance.linear_quadratic import LinearDynamics, TrackingPlan
-    from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-    from tpgmm_torch.motion.follower import Follower
     from tpgmm_torch.motion.motion_bounds import MotionBounds
     from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
     from tpgmm_torch.operators import (
@@ -44,7 +41,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.robots.tracked_poses import Poses
-    from tpgmm_torch.sensing.pose_filter import OneEuro
     from tpgmm_torch.sensing.trust import Trust
     from tpgmm_torch.structure.mode_selection import ModeSelection
     from tpgmm_torch.structure.operator_selection import OperatorSelection
@@ -66,19 +62,15 @@ __all__ = [
     "Demonstration",
     "Estimate",
     "EvenClock",
-    "Follower",
     "Frame",
     "Hold",
-    "Impedance",
     "Kinematics",
-    "LinearDynamics",
     "Linearization",
     "LocalizingClock",
     "ModeChoice",
     "ModeSelection",
     "MotionBounds",
     "MultimodalTaskParameterizedGMM",
-    "OneEuro",
     "Operator",
     "OperatorSelection",
     "Poses",
@@ -90,10 +82,8 @@ __all__ = [
     "Situation",
     "Stack",
     "Status",
-    "Stiffness",
     "TaskParameterizedGMM",
     "TaskParameters",
-    "TrackingPlan",
     "Trajectory",
     "Trust",
     "ViaPoint",
@@ -106,8 +96,6 @@ _HOMES = {
     "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
-    "impedance.linear_quadratic": ("LinearDynamics", "TrackingPlan"),
-    "impedance.stiffness": ("Impedance", "Stiffness"),
     "data.affine": ("Affine",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
@@ -115,7 +103,6 @@ _HOMES = {
     "data.holds": ("Hold",),
     "robots.kinematics": ("Kinematics", "RobotState"),
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
-    "motion.follower": ("Follower",),
     "motion.motion_bounds": ("MotionBounds",),
     "multimodal": ("ModeChoice", "MultimodalTaskParameterizedGMM"),
     "operators": (
@@ -133,7 +120,6 @@ _HOMES = {
     "regression.estimate": ("Estimate",),
     "regression.via_points": ("ViaPoint",),
     "robots.robot": ("Robot",),
-    "sensing.pose_filter": ("OneEuro",),
     "sensing.trust": ("Trust",),
     "structure.mode_selection": ("ModeSelection",),
     "structure.operator_selection": ("OperatorSelection",),

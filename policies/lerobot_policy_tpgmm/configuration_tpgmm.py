@@ -19,7 +19,6 @@ from tpgmm_torch import (
     Hold,
     Kinematics,
     MultimodalTaskParameterizedGMM,
-    OneEuro,
     Operator,
     Robot,
     TaskParameterizedGMM,
@@ -34,6 +33,7 @@ from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.plausibility import Shown
+from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.structure.parts import parse_parts
 
 __all__ = [

@@ -248,6 +248,39 @@ def test_the_model_hits_more_softly_than_position_control():
     assert 0 < soft < 0.5 * stiff
 
 
+def test_a_tracker_takes_the_controls_of_least_cost():
+    """Those of scipy's least squares over the controls of all ticks at once."""
+    from scipy.linalg import solve_discrete_are
+    from scipy.optimize import minimize
+
+    example = runpy.run_path(str(FOLDER / "linear_quadratic_tracking.py"))
+    rng, dt, effort = np.random.default_rng(0), 0.1, 10.0
+    joints, roots = rng.normal(size=(6, 2)), 0.1 * rng.normal(size=(6, 2, 3))
+    covariance = roots @ roots.transpose(0, 2, 1)
+    gains, feedforward = example["track"](joints, covariance, dt, effort)
+    a, b = example["double_integrator"](2, dt)
+    precision = np.zeros((6, 4, 4))
+    precision[:, :2, :2] = np.linalg.inv(covariance)
+    targets = np.hstack((joints, np.diff(joints, axis=0, append=joints[-1:]) / dt))
+    after = solve_discrete_are(a, b, precision[-1], np.eye(2) / effort**2)
+    start = rng.normal(size=4)
+
+    def cost(controls):
+        state, total = start, 0.0
+        for q, target, control in zip(precision, targets, controls.reshape(6, 2), strict=True):
+            total += (state - target) @ q @ (state - target) + control @ control / effort**2
+            state = a @ state + b @ control
+        return total + (state - targets[-1]) @ after @ (state - targets[-1])
+
+    state, controls = start, []
+    for gain, constant in zip(gains, feedforward, strict=True):
+        controls.append(constant - gain @ state)
+        state = a @ state + b @ controls[-1]
+    best = minimize(cost, np.zeros(12), method="BFGS", options={"gtol": 1e-9})
+    np.testing.assert_allclose(cost(np.ravel(controls)), best.fun, rtol=1e-7)
+    np.testing.assert_allclose(np.ravel(controls), best.x, rtol=1e-2, atol=1e-2)
+
+
 def test_a_humanoid_takes_a_box_that_it_has_not_seen(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["g1", str(G1_PATH), "--demonstrations", "4"])
     runpy.run_path(str(FOLDER / "g1_upper_body.py"), run_name="__main__")

@@ -1,21 +1,23 @@
 """Bottle shaking with torque motors: gravity, gains, dynamics, and what stands in the way."""
 
 import math
+import runpy
 import warnings
+from pathlib import Path
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs import env_to_policy_features, make_env, make_env_config
 
 import lerobot_env_bimanual  # noqa: F401  registers the environment
 from lerobot_env_bimanual.bottle.torque import CONTROLS
-from tpgmm_torch import Demonstration, TrackingPlan
+from tpgmm_torch import Demonstration
 from tpgmm_torch.exceptions import DataError, ShapeError
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 N = 17
 SOFT = np.concatenate((np.full(N, 20.0), np.full(N, 2.0)))
 STIFF = np.concatenate((np.full(N, 1000.0), np.full(N, 30.0)))
@@ -102,13 +104,14 @@ def test_the_linear_quadratic_tracker_follows_by_torques():
     env = made(control="torque", fps=200)
     observation, info = env.reset(seed=3)
     joints = path(env, 2.5)
-    covariance = torch.eye(N, dtype=torch.float64).mul(0.01**2).expand(len(joints), N, N)
-    plan = TrackingPlan.along(torch.from_numpy(joints), covariance, 1 / env.fps, effort=5.0)
+    example = runpy.run_path(str(EXAMPLES / "linear_quadratic_tracking.py"))
+    covariance = np.broadcast_to(0.01**2 * np.eye(N), (len(joints), N, N))
+    gains, feedforward = example["track"](joints, covariance, 1 / env.fps, effort=5.0)
     state = np.concatenate((observation["agent_pos"] + 0.0, info["velocity"]))
     errors = []
     for step in range(len(joints)):
         inertia, bias = env.dynamics()
-        control = plan.control(step, torch.from_numpy(state)).numpy()
+        control = feedforward[step] - gains[step] @ state
         friction = env._scene._friction * state[N:]
         observation, *_, info = env.step(inertia @ control + bias + friction)
         state = np.concatenate((observation["agent_pos"], info["velocity"]))

@@ -10,7 +10,8 @@ import torch
 
 from tests.support import skills
 from tpgmm_tools.viewing.curves import Mark, as_html, motion_marks, motion_panels
-from tpgmm_torch import Hold, Impedance, Robot, Situation, TaskParameterizedGMM
+from tpgmm_torch import Hold, Robot, Situation, TaskParameterizedGMM
+from tpgmm_torch.impedance.stiffness import Impedance
 
 #: The joints of :func:`skills.waves`, of which the first slides.
 SLIDING_ARM = (
