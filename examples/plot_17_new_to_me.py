@@ -139,7 +139,7 @@ grid = Frame(np.stack((x, y, 0 * x), axis=-1))
 image = plane.contourf(
     x,
     y,
-    model.shown_.novelty.ratio(REST, {"object": grid}),
+    model.summary_.novelty(REST, {"object": grid}),
     np.arange(0, 3.1, 0.25),
     cmap="Blues",
     extend="max",

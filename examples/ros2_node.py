@@ -47,7 +47,7 @@ class SkillNode(Node):
         self._model = TaskParameterizedGMM.load(folder, device="cpu")
         self._names = self._model.kinematics_.joint_names
         # of a frame that follows from the start posture nobody has to tell
-        shown = self._model.shown_
+        shown = self._model.summary_
         given = {} if shown is None else shown.frames
         self._required = [
             name

@@ -19,10 +19,15 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from tpgmm_torch import gaussians
+from tpgmm_torch.checks.report import PLAUSIBILITY, Finding, Report
+from tpgmm_torch.checks.situations import check_situations
+from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.checks.training import EpisodeSummary, check, summarize, unit_findings
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
+from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -48,23 +53,6 @@ from tpgmm_torch.operators import Canonical, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.persistence import MODEL, MODES, decode, encode
-from tpgmm_torch.plausibility.check import (
-    episodes_report,
-    learning_report,
-    summarize,
-    summarized,
-)
-from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Finding, Report
-from tpgmm_torch.plausibility.likeness import check_carried_things
-from tpgmm_torch.plausibility.outlying_demonstrations import (
-    Outlying,
-    left_out,
-    outlying_demonstrations,
-    outlying_rows,
-)
-from tpgmm_torch.plausibility.shown import Shown
-from tpgmm_torch.plausibility.situations import situations_report, tick_report
-from tpgmm_torch.plausibility.summaries import EpisodeSummary
 from tpgmm_torch.regression.conditionals import Conditionals, TimeMarginals
 from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
@@ -104,6 +92,12 @@ from tpgmm_torch.training.mixture_settings import (
     fused_samples,
     kinematics_for,
     regularization,
+)
+from tpgmm_torch.training.outlying_demonstrations import (
+    Outlying,
+    left_out,
+    outlying_demonstrations,
+    outlying_rows,
 )
 from tpgmm_torch.training.training_rows import (
     LearningRows,
@@ -284,7 +278,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         Those that the skill passes through, see :meth:`with_via_points`.
     via_fade_ : float
         For how long before and after them it is another [s].
-    shown_ : Shown or None
+    summary_ : TrainingSummary or None
         What the demonstrations showed: ranges of start postures and frames. None for a model
         that was made from parameters.
 
@@ -349,7 +343,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     time_: Tensor
     holds_: tuple[Hold, ...]
     via_fade_: float
-    shown_: Shown | None
+    summary_: TrainingSummary | None
     demonstration_weights_: Tensor | None
     operator_selection_: OperatorSelection | tuple[OperatorSelection, ...] | None
     operator_weights_: Tensor | None
@@ -540,7 +534,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 self._learn(gathered, operators, kinematics, checkpoint, holds, number)
             if self.operator_weights == "held-out":
                 self._weigh(self._held_out(known, given, kinematics, holds))
-            self.shown_, self.demonstration_weights_ = shown, weights
+            self.summary_, self.demonstration_weights_ = shown, weights
             self.segmentation_, self.component_selection_ = segmentation, components
             self.operator_selection_ = selections
             self._kept = KeptRows.of(
@@ -569,13 +563,18 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         episodes: list[EpisodeSummary] = []
         outlying: list[Outlying] = []
 
+        def remember(batches: Iterable[Sequence[Demonstration]]) -> Iterator[Any]:
+            for batch in batches:
+                episodes.extend(summarize(batch, kinematics))
+                yield batch
+
         def leave_out(data: Tensor, time: Tensor) -> set[int]:
             outlying.extend(outlying_rows(data, time, operators, kinematics))
             return {one.episode for one in outlying}
 
         with RowFile() as file:
             gathered = gather_rows(
-                summarized(seen.watch(chain([head], walk)), kinematics, episodes),
+                remember(seen.watch(chain([head], walk))),
                 operators, kinematics, file, processes,
                 responsibilities=self.responsibilities, holds=holds,
                 leave_out=leave_out if self.robust else None,
@@ -585,7 +584,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 everyone, outlying, operators, kinematics, holds, processes.rank
             )
             self._learn(gathered, operators, kinematics, checkpoint, holds)
-            self.shown_, self.demonstration_weights_ = examined
+            self.summary_, self.demonstration_weights_ = examined
         return self._set_peaks(*seen.result(processes))
 
     def partial_fit(
@@ -631,7 +630,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """
         self._check_fitted()
         kept, weights = self._kept, self.demonstration_weights_
-        if kept is None or weights is None or self.shown_ is None:
+        if kept is None or weights is None or self.summary_ is None:
             raise DataError(
                 "the model does not have the demonstrations that it was learned from: fit it "
                 "in one process, without batches, and save it with demonstrations=True "
@@ -643,14 +642,16 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         peaks = None
         if self.acceleration_ is not None and self.jerk_ is not None:
             peaks = self.acceleration_, self.jerk_
-        seen, via, weights = self.shown_, (self.via_points_, self.via_fade_), weights.clone()
+        seen, via, weights = self.summary_, (self.via_points_, self.via_fade_), weights.clone()
         begun, counted = len(weights), self.operator_weights_
         if added:
             for operator in operators:
                 operator.check(kinematics, added[0].frames)
             episodes = summarize(added, kinematics)
-            episodes_report(episodes, kinematics).act(self.plausibility)
-            seen = seen.and_also(Shown.of(episodes, kinematics))
+            Report.of(unit_findings(episodes, kinematics), "the demonstrations").act(
+                self.plausibility
+            )
+            seen = replace(seen, n_demonstrations=seen.n_demonstrations + len(episodes))
             placed = [
                 on_grid(d, self.time_, kinematics) if kept.n_instants else (d, 0) for d in added
             ]
@@ -673,7 +674,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._learn_again(kept, unseen=bool(added))
         if counted is not None:
             self._weigh(counted)
-        self.shown_, self.demonstration_weights_, self._kept = seen, weights, kept
+        self.summary_, self.demonstration_weights_, self._kept = seen, weights, kept
         self.via_points_, self.via_fade_ = via
         operators = (*operators, *(point.operator for point in self.via_points_))
         self.frame_names_ = frame_names(operators, kinematics)
@@ -753,9 +754,20 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         given = [X] if isinstance(X, Situation | Demonstration) else list(X)
         situations = [self._situation(item) for item in given]
         bounds = self.motion_bounds() if self.keep_limits and self._limited else None
-        situations_report(situations, self.shown_, self.time_, self.kinematics_).act(
-            self.plausibility
-        )
+        if situations:
+            firsts = [_first(situation) for situation in situations]
+            check_situations(
+                torch.stack([situation.joints for situation in situations]),
+                {
+                    name: Frame.stack([first[name] for first in firsts])
+                    for name, frame in firsts[0].items()
+                    if not isinstance(frame, Affine)
+                },
+                torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
+                self.kinematics_,
+                self.time_,
+                self.summary_,
+            ).act(self.plausibility)
         via = self._conditioning()
         trajectories = rollout(
             self.regression(),
@@ -769,11 +781,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         )
         if via is not None:
             self._missed(via, situations, trajectories).act(self.plausibility)
-        if self.shown_ is None or self.shown_.novelty is None:
+        if self.summary_ is None:
             return trajectories
-        novelty = self.shown_.novelty
+        summary = self.summary_
         return [
-            replace(one, novelty=float(novelty.ratio(situation.joints, _first(situation))))
+            replace(one, novelty=float(summary.novelty(situation.joints, _first(situation))))
             for one, situation in zip(trajectories, situations, strict=True)
         ]
 
@@ -908,7 +920,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             feedback=feedback,
             impedance=impedance or Impedance(self.kinematics_),
             holds=self.holds_,
-            novelty=None if self.shown_ is None else self.shown_.novelty,
+            novelty=self.summary_,
             via=self._conditioning(),
         )
 
@@ -981,7 +993,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         findings = [
             Finding(
                 "via-points",
-                "unlikely",
                 f"situation {n}: {point} is missed by {miss:.3g} m or rad",
                 "Can the robot reach it, in so short a time? A longer fade asks for less "
                 "speed, and keep_limits=False for what no robot has to follow",
@@ -1098,8 +1109,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         """Times (T,), number of samples and log-densities (T,) of each demonstration."""
         rows, regression = self._rows(X), self.regression()
         n_samples = None
-        if self.shown_ is not None and self.covariance_shrinkage != 0:
-            n_samples = self.shown_.n_demonstrations
+        if self.summary_ is not None and self.covariance_shrinkage != 0:
+            n_samples = self.summary_.n_demonstrations
         widths = block_widths(self.operators_, self.kinematics_)
         for row in rows:
             blocks = torch.from_numpy(row).to(self.means_[0]).split(list(widths), 1)
@@ -1119,7 +1130,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     def regression(self) -> Regression:
         """The fitted mixture conditioned on time, prepared once: what every tick asks."""
         self._check_fitted()
-        shown = None if self.shown_ is None else self.shown_.n_demonstrations
+        shown = None if self.summary_ is None else self.summary_.n_demonstrations
         n_samples = fused_samples(self.covariance_shrinkage, shown)
         limited = self.keep_limits and self._limited
         key = (
@@ -1159,7 +1170,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 end=float(self.time_[-1]),
                 holds=tuple(self.holds_),
                 motion_bounds=self.motion_bounds() if limited else None,
-                novelty=None if self.shown_ is None else self.shown_.novelty,
+                summary=self.summary_,
             )
             self._prepared = prepared = (key, self.means_, regression)
         return prepared[2]
@@ -1311,7 +1322,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
         self.n_components_ = len(self.weights_)
-        self.shown_ = self.demonstration_weights_ = self._kept = None
+        self.summary_ = self.demonstration_weights_ = self._kept = None
         self.operator_selection_ = self.component_selection_ = self.operator_weights_ = None
         self.parts_, self.segmentation_ = (), None
         self.via_points_, self.via_fade_ = (), 1.0
@@ -1415,7 +1426,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             "n_iter": self.n_iter_,
             "converged": bool(self.converged_),
             "lower_bound": None if math.isnan(self.lower_bound_) else float(self.lower_bound_),
-            "shown": None if self.shown_ is None else self.shown_.config(),
+            "summary": None if self.summary_ is None else self.summary_.config(),
         }
         if self.operator_weights_ is not None:
             config["operator_weights"] = self.operator_weights_.tolist()
@@ -1522,8 +1533,10 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             if config.get("operator_weights") is not None:
                 counted = as_tensor(config["operator_weights"], "operator_weights")
                 model.operator_weights_ = counted.to(model.weights_)
-            if config.get("shown") is not None:
-                model.shown_ = Shown.from_config(config["shown"])
+            if config.get("summary") is not None:
+                model.summary_ = TrainingSummary.from_config(
+                    config["summary"], model.kinematics_
+                )
             if kept is not None:
                 first, numbers, n_instants = kept
                 rows = tuple(tensors[f"rows.{m}"].numpy() for m in range(len(first)))
@@ -1764,7 +1777,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             segmentation.set_params(robot=self.robot)
         segmentation.fit(demonstrations)
         times = np.median(segmentation.boundaries_, axis=0).tolist()
-        segmentation.out_of_step(demonstrations).act(self.plausibility, stacklevel=3)
+        segmentation.out_of_step(demonstrations).act(self.plausibility)
         return segmentation, list(zip(times, segmentation.reasons_, strict=True))
 
     def _operators(
@@ -1817,27 +1830,27 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         demonstrations: Sequence[Demonstration],
         operators: Sequence[Operator],
         kinematics: Kinematics,
-    ) -> tuple[Tensor, Shown, tuple[Hold, ...] | None]:
+    ) -> tuple[Tensor, TrainingSummary, tuple[Hold, ...] | None]:
         """Act on what is implausible; weights (M,) of demonstrations, and what these showed.
 
         And what is held in them, if that was looked for and none is left out.
         """
         episodes = summarize(demonstrations, kinematics)
-        family = self.covariance_type, self.covariance_shrinkage
-        report = learning_report(episodes, operators, kinematics, *family)
+        report = check(episodes, kinematics)
         weights, holds = torch.ones(len(demonstrations), dtype=torch.float64), None
         if not report.errors() or self.plausibility == "ignore":
             holds = holds_for(self.holds, demonstrations, operators, kinematics)
-            report = report.and_also(*check_carried_things(operators, kinematics, holds))
+            correlated = self._correlated
+            report = check(episodes, kinematics, operators, holds, correlated=correlated)
             outlying = self.robust and outlying_demonstrations(
                 demonstrations, operators, kinematics, holds
             )
             if outlying:
-                report = report.and_also(left_out(outlying, len(demonstrations)))
+                report = Report.of([*report, left_out(outlying, len(weights))], report.subject)
                 weights[[one.episode for one in outlying]], holds = 0.0, None
-        report.act(self.plausibility, stacklevel=3)
+        report.act(self.plausibility)
         kept = [each for each, weight in zip(episodes, weights, strict=True) if weight > 0]
-        return weights, Shown.of(kept, kinematics), holds
+        return weights, TrainingSummary.of(kept, kinematics), holds
 
     def _examine(
         self,
@@ -1847,27 +1860,30 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         kinematics: Kinematics,
         holds: Sequence[Hold],
         rank: int,
-    ) -> tuple[Shown, Tensor]:
+    ) -> tuple[TrainingSummary, Tensor]:
         """The same of demonstrations in batches: what they showed, and their weights (M,)."""
-        report = learning_report(
-            episodes, operators, kinematics, self.covariance_type, self.covariance_shrinkage
-        )
-        report = report.and_also(*check_carried_things(operators, kinematics, holds))
+        correlated = self._correlated
+        report = check(episodes, kinematics, operators, holds, correlated=correlated)
         weights = torch.ones(len(episodes), dtype=torch.float64)
         if outlying:
-            report = report.and_also(left_out(outlying, len(episodes)))
+            report = Report.of([*report, left_out(outlying, len(weights))], report.subject)
             weights[[one.episode for one in outlying]] = 0.0
         if rank == 0 or report.errors() or self.plausibility == "error":
-            report.act(self.plausibility, stacklevel=3)
+            report.act(self.plausibility)
         kept = [each for each, weight in zip(episodes, weights, strict=True) if weight > 0]
-        return Shown.of(kept, kinematics), weights
+        return TrainingSummary.of(kept, kinematics), weights
+
+    @property
+    def _correlated(self) -> bool:
+        """Whether correlations are learned without shrinkage."""
+        return self.covariance_type in ("full", "tied") and self.covariance_shrinkage == 0
 
     def _examine_tick(self, now: Tensor, joints: Any, frames: Mapping[str, Frame]) -> None:
         """Act on what is implausible about a control tick, on behalf of who asks for it."""
         joints = self.kinematics_.joint_tensor(joints)
         known = {name: frame for name, frame in frames.items() if name in self.frame_names_}
-        tick_report(now, joints, known, self.shown_, self.time_, self.kinematics_).act(
-            self.plausibility, stacklevel=3
+        check_situations(joints, known, now, self.kinematics_, self.time_, self.summary_).act(
+            self.plausibility
         )
 
     def _kinematics_for(
@@ -1922,9 +1938,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             If one that the model needs is missing all the same.
         """
         complete = dict(frames)
-        if self.shown_ is not None:
+        if self.summary_ is not None:
             start = self.kinematics_.joint_tensor(joints)
-            complete |= self.shown_.start_frames(start, self.kinematics_, frames)
+            complete |= self.summary_.start_frames(start, self.kinematics_, frames)
         for name in self.frame_names_:
             if name not in complete:
                 where = "the situation, which has to tell it (the event of one is yet to be)"

@@ -19,17 +19,17 @@ from sklearn.base import clone
 from sklearn.metrics import check_scoring
 from sklearn.model_selection import check_cv
 
+from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.checks.training import check, summarize
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.metrics import reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import fit_subsets
-from tpgmm_torch.plausibility.check import learning_report, summarize
-from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
-from tpgmm_torch.plausibility.shown import Shown
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.training.training_rows import rows_in_memory, share_one_grid, typical_time
 
 __all__ = ["cross_validate", "fit_folds"]
@@ -155,7 +155,8 @@ def fit_folds(
         return [model.fit(own) for model, own in zip(models, shown, strict=True)]
     episodes = summarize(demonstrations, kinematics)
     family = estimator.covariance_type, estimator.covariance_shrinkage
-    report = learning_report(episodes, operators, kinematics, *family)
+    correlated = family[0] in ("full", "tied") and family[1] == 0
+    report = check(episodes, kinematics, operators, correlated=correlated)
     report.act(estimator.plausibility)
     [held] = holds
     learning = rows_in_memory(
@@ -184,7 +185,7 @@ def fit_folds(
     for model, mixture, own, fold in zip(models, mixtures, shown, chosen, strict=True):
         time = typical_time(own).to(learning.time)
         model.set_mixture(mixture, operators, kinematics, time, held)
-        model.shown_ = Shown.of([episodes[index] for index in fold], kinematics)
+        model.summary_ = TrainingSummary.of([episodes[index] for index in fold], kinematics)
         model.demonstration_weights_ = torch.ones(len(fold), dtype=torch.float64)
     return models
 

@@ -18,6 +18,8 @@ from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import consistent, replacing
+from tpgmm_torch.checks.situations import START
+from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clocks import Clock, parse_clock
 from tpgmm_torch.control.command import Command
@@ -28,9 +30,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
-from tpgmm_torch.novelty import ALIKE
 from tpgmm_torch.persistence import MODES
-from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.storage import Folder
 from tpgmm_torch.structure.mode_selection import ModeSelection
 from tpgmm_torch.structure.operator_selection import OperatorSelection
@@ -58,7 +58,7 @@ class ModeChoice:
         ``p_k ~ weight_k exp(-novelty_k^2 / 2 - misfit_k)``.
     novelty : array of shape (n_modes,)
         Of the situation to each mode; 1 is that of its least usual demonstration
-        (:class:`~tpgmm_torch.novelty.Novelty`).
+        (:class:`~tpgmm_torch.checks.TrainingSummary`).
     misfit : array of shape (n_modes,)
         By how much less likely the mode's reproduction is, in its worst moment, than any of
         its demonstrations ever was [nats]: large where the arm does not reach, or stands at
@@ -877,13 +877,13 @@ def _novelty(model: TaskParameterizedGMM, situation: Situation, midway: bool = F
 
     Who begins in the middle of the skill stands where nobody starts, which says nothing.
     """
-    if model.shown_ is None or model.shown_.novelty is None:
+    if model.summary_ is None:
         return 0.0
     situation = situation.reordered(model.kinematics_.joint_names)
     complete = model._completed(situation.joints, situation.frames)
     first = {n: f[0] if f.batch_shape else f for n, f in complete.items()}
     joints = torch.full_like(situation.joints, torch.nan) if midway else situation.joints
-    return float(model.shown_.novelty.ratio(joints, first))
+    return float(model.summary_.novelty(joints, first))
 
 
 def _recorded(situation: Situation, time: Tensor) -> Tensor | None:

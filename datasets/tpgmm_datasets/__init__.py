@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 # what needs pandas and PyTorch is loaded when it is first asked for, so that the commands
 # here are quick to look up
 if TYPE_CHECKING:
+    from tpgmm_datasets.checks.check import check
     from tpgmm_datasets.conversion.poses import FramePose, LinkPose
     from tpgmm_datasets.conversion.timing import resample, trim
     from tpgmm_datasets.description import DatasetInfo, describe_lerobot
@@ -29,6 +30,7 @@ __all__ = [
     "LinkPose",
     "MotorMap",
     "Scale",
+    "check",
     "describe_lerobot",
     "estimate_motor_map",
     "iter_lerobot",
@@ -39,6 +41,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "checks.check": ("check",),
     "conversion.poses": ("FramePose", "LinkPose"),
     "conversion.timing": ("resample", "trim"),
     "description": ("DatasetInfo", "describe_lerobot"),

@@ -20,7 +20,8 @@ class EpisodeBatches:
     """The episodes of a LeRobot data set in batches, for ``TaskParameterizedGMM.fit``.
 
     Each ``iter()`` reads from the first on. The metadata are checked when it is made, the
-    rows of an episode when it comes.
+    rows of an episode when it comes, and what is implausible about all of them after the first
+    reading.
 
     Parameters
     ----------
@@ -66,6 +67,7 @@ class EpisodeBatches:
             raise DatasetError(f"a batch holds at least one episode, got size={size}")
         recording = open_recording(path, **options)
         episodes = tuple(processes.share(recording.episodes))
+        self._checked = False
         self.size, self._recording = size, replace(recording, episodes=episodes)
 
     def __len__(self) -> int:
@@ -74,4 +76,6 @@ class EpisodeBatches:
 
     def __iter__(self) -> Iterator[list[Demonstration]]:
         """Read all episodes from the first on."""
-        return map(list, batched(self._recording.demonstrations(), self.size))
+        demonstrations = self._recording.demonstrations(check=not self._checked)
+        self._checked = True
+        return map(list, batched(demonstrations, self.size))

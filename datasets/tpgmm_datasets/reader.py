@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
+from tpgmm_datasets.checks.check import PACKAGE, check_summaries
+from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.conversion.assembly import (
     Assembly,
     EventSource,
@@ -26,10 +28,9 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Unit, Units
+from tpgmm_torch.checks.report import PLAUSIBILITY, Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
 from tpgmm_torch.events.detection import doubtful_events
-from tpgmm_torch.plausibility.check import episodes_report, summarize
-from tpgmm_torch.plausibility.findings import PLAUSIBILITY, Report
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
@@ -56,37 +57,36 @@ class Recording:
     relax: Collection[str]
     plausibility: str = "warn"
 
-    def demonstrations(self, tell: bool = True) -> Iterator[Demonstration]:
+    def demonstrations(self, check: bool = True) -> Iterator[Demonstration]:
         """Read the wanted episodes, one when it is asked for.
 
         Parameters
         ----------
-        tell : bool, default=True
-            Whether to act on events that were not found, after the last episode;
-            :meth:`examine` tells of them too.
+        check : bool, default=True
+            Whether to act on what is implausible about them, after the last.
 
         Raises
         ------
         DatasetError
             As :func:`load_lerobot`; also if every episode was left out.
         PlausibilityError
-            If events were not found, and that is an error.
+            As :func:`load_lerobot`.
         """
         layout, features = self.assembly.layout, self.assembly.features
-        policy, read = Relaxed(self.relax), 0
-        lost: list[DatasetError] = []  # all that have not the event that a frame is at
+        policy, summaries = Relaxed(self.relax), list[RecordingSummary]()
+        read = 0
+        lost: list[DatasetError] = []  # all without the event that a frame is at
         self.assembly.doubtful.clear()
         try:
             for rows in read_episodes(layout, self.episodes, features, policy):
                 try:
                     demonstration = self.assembly.demonstration(rows)
                 except DatasetError as problem:
-                    if problem.check == "events":
-                        lost.append(problem)
-                    else:
-                        policy(problem)
+                    (lost.append if problem.check == "events" else policy)(problem)
                     continue
                 read += 1
+                if check:
+                    summaries.append(RecordingSummary.of(demonstration))
                 yield demonstration
             if lost:
                 policy(DatasetError("; ".join(summed_up(lost)), check="events"))
@@ -96,29 +96,29 @@ class Recording:
                     f"none of the {len(self.episodes)} episodes is left by the checks that "
                     f"are relaxed, {sorted(self.relax)}: {reasons}"
                 )
-            if tell:
-                doubts = doubtful_events(self.assembly.doubtful, "episode")
-                Report.of(doubts, f"{read} episodes").act(self.plausibility)
+            if check:
+                self._report(summaries).act(self.plausibility, (PACKAGE,))
         finally:
             policy.warn()
 
-    def examine(self, demonstrations: Iterable[Demonstration]) -> Report:
-        """What is implausible about them; values that were declared raw may have any unit.
+    def check(self) -> Report:
+        """Read all episodes, and report what is implausible about them.
 
-        Parameters
-        ----------
-        demonstrations : iterable of Demonstration
-            Of this recording, at least one, read to the last; none is kept.
+        Raises
+        ------
+        DatasetError
+            As :func:`load_lerobot`.
         """
-        robot = self.assembly.robot
-        known = robot if isinstance(robot, Kinematics) else None
-        episodes = [episode for d in demonstrations for episode in summarize([d], known)]
-        report = episodes_report(episodes, known)
-        doubtful = doubtful_events(self.assembly.doubtful, "episode")
-        joints = self.assembly.joints
+        summaries = [RecordingSummary.of(one) for one in self.demonstrations(check=False)]
+        return self._report(summaries)
+
+    def _report(self, summaries: Sequence[RecordingSummary]) -> Report:
+        """Findings and doubtful events; values that were declared raw may have any unit."""
+        robot, joints = self.assembly.robot, self.assembly.joints
+        report = check_summaries(summaries, robot if isinstance(robot, Kinematics) else None)
         raw = {n for n, u in zip(joints.names or (), joints.units, strict=False) if u == "raw"}
-        units = [f for f in report if f.check == "units" and set(f.names) <= raw]
-        findings = [f for f in report if f not in units]
+        findings = [f for f in report if f.check != "units" or not set(f.names) <= raw]
+        doubtful = doubtful_events(self.assembly.doubtful, "episode")
         return Report.of([*findings, *doubtful], report.subject)
 
 
@@ -330,7 +330,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         left out with a :class:`DatasetWarning`, those for one reason together.
     plausibility : {"warn", "error", "ignore"}, default="warn"
         What is done about recordings that are unlikely to be what they are taken for
-        (``tpgmm_torch.plausibility.check.check``): one warning, an error, or nothing.
+        (:func:`tpgmm_datasets.check`): one warning, an error, or nothing.
         What cannot be is an error unless ignored.
 
     Returns
@@ -357,10 +357,7 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     >>> again.joint_names, again.joints[:, 0].tolist()
     (('elbow',), [0.0, 0.5, 1.0])
     """
-    demonstrations = list(recording.demonstrations(tell=False))
-    if demonstrations and recording.plausibility != "ignore":
-        recording.examine(demonstrations).act(recording.plausibility, stacklevel=3)
-    return demonstrations
+    return list(recording.demonstrations())
 
 
 @opened_by(open_recording)
@@ -376,7 +373,7 @@ def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
     rate, trim, relax
         As for :func:`load_lerobot`.
     plausibility : {"warn", "error", "ignore"}, default="warn"
-        Of no effect here: ``fit`` looks at the episodes as they come.
+        As for :func:`load_lerobot`; acted on after the last episode.
 
     Yields
     ------

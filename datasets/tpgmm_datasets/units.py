@@ -13,9 +13,9 @@ from tpgmm_datasets.errors import DatasetError, UnknownUnitsError
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.pose_names import is_gripper
-from tpgmm_torch.plausibility.joints import LARGEST_ANGLE
 
 __all__ = [
+    "LARGEST_ANGLE",
     "POSE_UNITS",
     "Scale",
     "Unit",
@@ -110,6 +110,8 @@ POSE_UNITS = ("m", "m", "m", "1", "1", "1", "1")
 Unit = str | Scale
 Units = Unit | Mapping[str, Unit]
 
+#: A joint is hardly turned further [rad], nor is a recording in degrees smaller.
+LARGEST_ANGLE = 4 * math.pi
 #: Values that are normalised end at 100 up to this.
 ROUNDING = 0.5
 

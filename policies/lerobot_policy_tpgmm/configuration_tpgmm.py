@@ -27,12 +27,12 @@ from tpgmm_torch import (
     parse_clock,
 )
 from tpgmm_torch.alignment.text import METHODS
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
-from tpgmm_torch.plausibility import Shown
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.structure.parts import parse_parts
 
@@ -186,7 +186,7 @@ class TPGMMConfig(StatePolicyConfig):
     n_steps : int, default=0
         T, the length of the time grid that was learned; 0 before a fit.
     shown : dict, optional
-        What the demonstrations showed: a :class:`tpgmm_torch.plausibility.Shown` as JSON.
+        The summary of the demonstrations, :class:`tpgmm_torch.checks.TrainingSummary`, as JSON.
     peaks : list of two lists of float, optional
         Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
         the bounds of what neither the robot nor the user bounds.
@@ -514,7 +514,7 @@ class TPGMMConfig(StatePolicyConfig):
     def recall(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
         """The inverse of :meth:`note`, for a model made of a mixture; it is changed."""
         if self.shown is not None:
-            model.shown_ = Shown.from_config(self.shown)
+            model.summary_ = TrainingSummary.from_config(self.shown, model.kinematics_)
         if self.peaks is not None:
             like = model.kinematics_.lower
             model.acceleration_, model.jerk_ = (like.new_tensor(peak) for peak in self.peaks)
@@ -594,7 +594,7 @@ def _noted(model: TaskParameterizedGMM) -> dict[str, Any]:
         "holds": list(map(str, model.holds_)),
         "via_points": via_points or None,
         "via_fade": model.via_fade_,
-        "shown": None if model.shown_ is None else model.shown_.config(),
+        "shown": None if model.summary_ is None else model.summary_.config(),
         "peaks": peaks,
     }
 

@@ -18,8 +18,8 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.names import match_names, pose_groups
 from tpgmm_datasets.units import Scale, as_scale
 from tpgmm_torch import Frame
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
-from tpgmm_torch.plausibility import Shown
 
 __all__ = ["FrameFeatures", "JointFeatures", "observed_frames", "poses_named"]
 
@@ -249,7 +249,7 @@ def observed_frames(config: TPGMMConfig, required: Sequence[str]) -> list[str]:
     """
     start = {name for name, pose in config.link_poses().items() if pose.event == "start"}
     if config.shown is not None:
-        frames = Shown.from_config(config.shown).frames
+        frames = TrainingSummary.from_config(config.shown).frames
         start |= {name for name, shown in frames.items() if shown.link is not None}
     placed = {*(config.frames or ()), *poses_named(config.environment_names)}
     placed |= {*poses_named(config.state_names)}

@@ -42,7 +42,7 @@ def test_a_model_comes_back_equal(covariance_type):
         assert (error <= 1e-12 * torch.linalg.matrix_norm(covariance)).all()
     assert torch.equal(back.time_, model.time_)
     assert back.frame_names_ == model.frame_names_ and back.kinematics_ == model.kinematics_
-    back.shown_ = model.shown_  # which a policy has in its configuration
+    back.summary_ = model.summary_  # which a policy has in its configuration
     assert back.score(handlings()) == pytest.approx(model.score(handlings()), rel=1e-9)
     [one], [other] = (m.predict([situation()[0]]) for m in (back, model))
     # the last digit of a covariance, times its condition number

@@ -18,10 +18,9 @@ from tests.support import lerobot_sets as sets
 from tests.support.robot_zoo import G1_PATH
 from tests.support.skills import bottle_demonstrations, bottle_model, thinned
 from tests.support.worlds import upper_body
-from tpgmm_datasets import FramePose, LinkPose, Scale, load_lerobot, save_lerobot
+from tpgmm_datasets import FramePose, LinkPose, Scale, check, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import (
-    Canonical,
     Demonstration,
     Frame,
     Poses,
@@ -37,7 +36,6 @@ from tpgmm_torch.data.tables import (
     demonstrations_to_frame,
     read_table,
 )
-from tpgmm_torch.plausibility import check
 
 __all__ = ["MISTAKES", "Mistake"]
 
@@ -91,6 +89,11 @@ def learn(demonstrations, operators=None, robot=None, **options):
     operators = bottle_operators() if operators is None else operators
     model = TaskParameterizedGMM(2, operators, robot, tol=1e6, **options)
     return model.fit(demonstrations)
+
+
+def lint(demonstrations, robot=None):
+    """Check recordings before anybody learns from them."""
+    check(demonstrations, upper_body() if robot is None else robot).act()
 
 
 @cache
@@ -185,7 +188,7 @@ def one_joint_in_degrees(_):
 
 @mistake("units", r"units: .*hardly are.*degrees")
 def degrees_without_a_robot(_):
-    TaskParameterizedGMM(2, [Canonical()], tol=1e6).fit(each(joints(DEGREES)))
+    check(each(joints(DEGREES))).act()
 
 
 @mistake("units", r"units: .*cannot be")
@@ -218,12 +221,12 @@ def hands_in_millimetres(_):
         turn = np.tile([1.0, 0, 0, 0], (40, 1))
         frame = {"cup": Frame([0.3, 0.1 * n, 0.1])}
         items.append(Demonstration(time, np.hstack((path, turn)), frame, poses.joint_names))
-    learn(items, [RelativePosition("hand", "cup")], poses)
+    lint(items, poses)
 
 
 @mistake("units", r"limits: .*beyond")
 def offsets_of_six_radians(_):
-    learn(each(joints(add=4.0, columns=4)))
+    lint(each(joints(add=4.0, columns=4)))
 
 
 @mistake("units", r"units: .*start posture.*degrees")
@@ -231,12 +234,12 @@ def start_posture_in_degrees(_):
     predict(replace(usual(), joints=usual().joints * DEGREES))
 
 
-@mistake("units", r"place: bottle: x = \d+\.?\d* m, shown")
+@mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
 def new_bottle_in_millimetres(_):
     predict(scaled(1000.0)(usual()))
 
 
-@mistake("units", r"place: bottle: x = \d+\.?\d* m, shown")
+@mistake("units", r"place: bottle: x = \d+\.?\d*, shown")
 def new_bottle_in_centimetres(_):
     predict(scaled(100.0)(usual()))
 
@@ -297,12 +300,12 @@ def frame_numbers_for_time(_):
 
 @mistake("time", r"time: .*another unit")
 def time_in_days(_):
-    learn(each(lambda item: replace(item, time=item.time / 86400, events={}), fine()))
+    lint(each(lambda item: replace(item, time=item.time / 86400, events={}), fine()))
 
 
 @mistake("time", r"speed: .*faster than the robot")
 def time_in_minutes(_):
-    learn(each(timed(lambda time: time / 60)))
+    lint(each(timed(lambda time: time / 60)))
 
 
 @mistake("time", r"(time|durations|alignment): ")
@@ -331,7 +334,7 @@ def a_hole_in_a_recording(_):
         keep = torch.cat((torch.arange(20), torch.arange(120, len(item))))
         return replace(item, time=item.time[keep], joints=item.joints[keep])
 
-    learn(one(cut, demonstrations=fine()))
+    lint(one(cut, demonstrations=fine()))
 
 
 @mistake("time", r"(time|place|.*)references are wanted")
@@ -370,12 +373,12 @@ def two_demonstrations(_):
 
 @mistake("lengths", r"copies: .*demonstration 1 is a copy of 0")
 def copies_of_one_demonstration(_):
-    learn([shown()[0], *shown()])
+    lint([shown()[0], *shown()])
 
 
 @mistake("lengths", r"durations: .*demonstration 2")
 def a_recording_that_ran_on(_):
-    learn(one(timed(lambda time: 4 * time)))
+    lint(one(timed(lambda time: 4 * time)))
 
 
 @mistake("lengths", r"joints has shape \(T, n_joints\) with T")
@@ -404,19 +407,19 @@ def a_demonstration_that_is_no_list(_):
 @mistake("order", r"order: the joints are unnamed.*limits")
 def unnamed_joints_arms_exchanged(_):
     order = [0, 1, 2, *range(10, 17), *range(3, 10)]
-    learn(each(unnamed(order)))
+    lint(each(unnamed(order)))
 
 
 @mistake("order", r"(order|limits): .*limits")
 def unnamed_joints_reversed(_):
-    learn(each(unnamed(list(range(16, -1, -1)))))
+    lint(each(unnamed(list(range(16, -1, -1)))))
 
 
 @mistake("order", r"(order|limits|episodes): ")
 def two_columns_exchanged_in_one_demonstration(_):
     order = list(range(17))
     order[4], order[6] = 6, 4
-    learn(one(lambda d: replace(d, joints=d.joints[:, order])))
+    lint(one(lambda d: replace(d, joints=d.joints[:, order])))
 
 
 @mistake("order", r"(order|limits|start): ")
@@ -432,7 +435,7 @@ def joints_transposed(_):
 @mistake("order", r"frames: frame 'bottle'.*demonstration 2")
 def x_and_z_exchanged_in_one_demonstration(_):
     flip = bottles(lambda f: Frame(f.position.flip(0) + f.position.new_tensor([0, 0, 0]), None))
-    learn(one(lambda d: flip(moved(0.0, 0.0, 0.0)(scaled(3.0)(d)))))
+    lint(one(lambda d: flip(moved(0.0, 0.0, 0.0)(scaled(3.0)(d)))))
 
 
 @mistake("order", r"place: bottle")
@@ -452,7 +455,7 @@ def frames_exchanged_in_one_demonstration(_):
     items = list(two_frame_demonstrations())
     frames = items[3].frames
     items[3] = replace(items[3], frames={"cup": frames["plate"], "plate": frames["cup"]})
-    learn(items, FROM_TWO_FRAMES, Poses(("hand",)))
+    lint(items, Poses(("hand",)))
 
 
 FROM_TWO_FRAMES = [RelativePosition("hand", "cup"), RelativePosition("hand", "plate")]
@@ -530,12 +533,12 @@ def a_frame_at_an_event_that_is_not_there(folder):
 
 @mistake("quaternions", r"quaternions: .*\(x, y, z, w\)")
 def quaternions_with_w_last(_):
-    learn(each(bottles(as_xyzw)))
+    lint(each(bottles(as_xyzw)))
 
 
 @mistake("quaternions", r"frames: .*turned.*demonstration 2.*\(w, x, y, z\)")
 def quaternions_with_w_last_in_one_demonstration(_):
-    learn(one(bottles(as_xyzw)))
+    lint(one(bottles(as_xyzw)))
 
 
 @mistake("quaternions", r"turn: bottle: .*Read as \(x, y, z, w\)")
@@ -582,12 +585,12 @@ def columns_of_a_pose_one_off(folder):
 
 @mistake("frames", r"frames: .*demonstration 2 \(0, 0, 0\)")
 def a_tracker_that_lost_the_bottle(_):
-    learn(one(scaled(0.0)))
+    lint(one(scaled(0.0)))
 
 
 @mistake("frames", r"frames: .*demonstration 2")
 def another_base_in_one_demonstration(_):
-    learn(one(moved(0.0, 0.8, 0.0)))
+    lint(one(moved(0.0, 0.8, 0.0)))
 
 
 @mistake("frames", r"frames: frame 'bottle' jumps .*demonstration 2")
@@ -598,10 +601,10 @@ def a_tracker_that_jumps(_):
         position[100:103] += 0.5
         return replace(item, frames={"bottle": Frame(position, frame.orientation)})
 
-    learn(one(jumping, demonstrations=fine()))
+    lint(one(jumping, demonstrations=fine()))
 
 
-@mistake("frames", r"place: bottle: z = 0\.35 m, shown 0\.1")
+@mistake("frames", r"place: bottle: z = 0\.35, shown 0\.1")
 def a_bottle_far_above_those_shown(_):
     position = [*usual().frames["bottle"].position[:2].tolist(), 0.35]
     predict(bottles(lambda f: Frame(position, f.orientation))(usual()))
@@ -634,7 +637,7 @@ def angles_that_wrap(_):
         values[120:, 3] -= math.tau
         return replace(item, joints=values)
 
-    learn(one(wrap, demonstrations=fine()))
+    lint(one(wrap, demonstrations=fine()))
 
 
 @mistake("values", r"jumps: .*demonstration 2")
@@ -644,7 +647,7 @@ def a_value_that_was_lost(_):
         values[130, 5] += 0.6
         return replace(item, joints=values)
 
-    learn(one(spoil, demonstrations=fine()))
+    lint(one(spoil, demonstrations=fine()))
 
 
 @mistake("values", r"clipped: .*stop dead")
@@ -656,12 +659,12 @@ def values_that_were_clipped(_):
             values[:, joint] = values[:, joint].clamp(max=float(high))
         return replace(item, joints=values)
 
-    learn(each(clip, fine()))
+    lint(each(clip, fine()))
 
 
 @mistake("values", r"stuck: .*demonstration 2")
 def a_sensor_that_is_stuck(_):
-    learn(one(lambda d: joints(0.0, 3, float(d.joints[0, 3]))(d), demonstrations=fine()))
+    lint(one(lambda d: joints(0.0, 3, float(d.joints[0, 3]))(d), demonstrations=fine()))
 
 
 @mistake("values", r"stuck: .*demonstration 2")
@@ -671,12 +674,12 @@ def a_sensor_that_freezes_half_way(_):
         values[80:200, 3] = values[80, 3]
         return replace(item, joints=values)
 
-    learn(one(freeze, demonstrations=fine()))
+    lint(one(freeze, demonstrations=fine()))
 
 
 @mistake("values", r"episodes: .*demonstration 2")
 def another_skill_among_them(_):
-    learn(one(lambda d: replace(d, joints=d.joints.flip(0) + 0.9 * torch.sin(d.time)[:, None])))
+    lint(one(lambda d: replace(d, joints=d.joints.flip(0) + 0.9 * torch.sin(d.time)[:, None])))
 
 
 @mistake("values", r"start: start posture: .*shown")
@@ -694,25 +697,25 @@ def a_posture_that_is_not_a_number(_):
 @mistake("values", r"events: .*'grasp' at 0%.*demonstration")
 def events_at_the_beginning(_):
     items = [replace(d, events={"grasp": 4.0 + 0.1 * n}) for n, d in enumerate(shown())]
-    learn(one(lambda d: replace(d, events={"grasp": float(d.time[0])}), demonstrations=items))
+    lint(one(lambda d: replace(d, events={"grasp": float(d.time[0])}), demonstrations=items))
 
 
 @mistake("values", r"events: .*'grasp' at .*demonstration 2, usually")
 def an_event_that_is_not_like_the_others(_):
     items = [replace(d, events={"grasp": 4.0 + 0.1 * n}) for n, d in enumerate(shown())]
-    learn(one(lambda d: replace(d, events={"grasp": 11.0}), demonstrations=items))
+    lint(one(lambda d: replace(d, events={"grasp": 11.0}), demonstrations=items))
 
 
 @mistake("values", r"events: .*'grasp' comes before 'lift'.*2")
 def events_in_another_order(_):
     items = [replace(d, events={"grasp": 4.0, "lift": 4.5}) for d in shown()]
-    learn(one(lambda d: replace(d, events={"grasp": 4.5, "lift": 4.0}), demonstrations=items))
+    lint(one(lambda d: replace(d, events={"grasp": 4.5, "lift": 4.0}), demonstrations=items))
 
 
 @mistake("values", r"events: .*'grasp' missing in 2")
 def an_event_that_is_missing(_):
     items = [replace(d, events={"grasp": 4.0}) for d in shown()]
-    learn(one(lambda d: replace(d, events={}), demonstrations=items))
+    lint(one(lambda d: replace(d, events={}), demonstrations=items))
 
 
 # -- shapes --------------------------------------------------------------------------------

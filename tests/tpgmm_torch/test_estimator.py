@@ -664,7 +664,7 @@ def test_a_model_of_known_parameters_takes_arrays():
         blend=0.0,
     )
     assert torch.equal(known.predict(shown)[0].joints, model.predict(shown)[0].joints)
-    assert known.shown_ is None  # nor how many demonstrations there were
+    assert known.summary_ is None  # nor how many demonstrations there were
     normal = copy.copy(model).set_params(covariance_shrinkage=0)
     assert known.score([shown]) == normal.score([shown])
     assert (known.n_iter_, known.n_components) == (0, 6)
@@ -1272,7 +1272,7 @@ def starting():
 
 def test_where_a_link_starts_follows_from_the_start_posture(starting, tmp_path):
     model, shown = starting
-    assert {name: f.link for name, f in model.shown_.frames.items()} == {
+    assert {name: f.link for name, f in model.summary_.frames.items()} == {
         "bottle": None,
         "start": "l_hand",
     }
@@ -1325,4 +1325,4 @@ def test_batches_know_where_links_start_too(starting):
     model, _ = starting
     shown = [started(one) for one in few_bottles()]
     again = clone(model).fit([shown[:2], shown[2:]])
-    assert again.shown_.frames["start"].link == "l_hand"
+    assert again.summary_.frames["start"].link == "l_hand"

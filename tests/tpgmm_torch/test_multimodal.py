@@ -105,14 +105,14 @@ def test_the_mode_is_one_that_was_shown_in_situations_like_this():
     for mode in (0, 1):
         moved = copy.copy(model)
         moved.models_ = [copy.copy(one) for one in model.models_]
-        shown_by_it = moved.models_[mode].shown_
+        shown_by_it = moved.models_[mode].summary_
         novelty = shown_by_it.novelty
         elsewhere = {
             name: replace(place, mean=[x + 5 for x in place.mean])
             for name, place in novelty.places.items()
         }
         novelty = replace(novelty, places=elsewhere)
-        moved.models_[mode].shown_ = replace(shown_by_it, novelty=novelty)
+        moved.models_[mode].summary_ = replace(shown_by_it, novelty=novelty)
         assert moved.choose(situation)[0].mode == 1 - mode
 
 

@@ -96,7 +96,7 @@ def test_texts_are_short(shown, model):
     state = HANDS.state(shown[0].joints)
     things = (
         shown[0], situation, trajectory, trajectory.candidates[0], command, command.estimate,
-        state, model.shown_,
+        state, model.summary_,
     )  # fmt: skip
     for thing in things:
         assert repr(thing).startswith(type(thing).__name__) and len(repr(thing)) < 200

@@ -64,9 +64,9 @@ def test_links_and_frames_go_on_too():
     went_on = hands_model(**options).fit(shown[:4]).partial_fit(shown[4:])
     whole = hands_model(**options, warm_start=True).fit(shown[:4]).fit(shown)
     assert_equal(went_on, whole, 1e-8)
-    assert went_on.shown_.n_demonstrations == 5
-    for name, pose in whole.shown_.frames.items():
-        found = went_on.shown_.frames[name]
+    assert went_on.summary_.n_demonstrations == 5
+    for name, pose in whole.summary_.frames.items():
+        found = went_on.summary_.frames[name]
         np.testing.assert_allclose(found.low, pose.low)
         np.testing.assert_allclose(found.high, pose.high)
         np.testing.assert_allclose(found.mean, pose.mean)

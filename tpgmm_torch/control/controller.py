@@ -14,6 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.checks.situations import START
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Progress
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
@@ -25,8 +27,6 @@ from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.novelty import Novelty
-from tpgmm_torch.plausibility.situations import START
 from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
@@ -131,7 +131,7 @@ class Controller:
         What q_{t-1} is: the last reference, or the measured posture.
     impedance : Impedance, optional
         What stiffness and damping are made with.
-    novelty : Novelty, optional
+    novelty : TrainingSummary, optional
         What tells how new the situation is.
     via : Conditioning, optional
         Via-points through which the robots pass.
@@ -173,7 +173,7 @@ class Controller:
         at_rest: bool = True,
         feedback: str = "reference",
         impedance: Impedance | None = None,
-        novelty: Novelty | None = None,
+        novelty: TrainingSummary | None = None,
         via: Conditioning | None = None,
     ) -> None:
         if feedback not in ("reference", "measured"):
@@ -723,15 +723,19 @@ def _durations(dt: Tensor) -> tuple[Seconds, Tensor | None]:
 
 
 def _ratio(
-    novelty: Novelty,
+    summary: TrainingSummary,
     start: Tensor,
     frames: Mapping[str, Frame],
     at_first: Mapping[str, Frame],
 ) -> Tensor:
     """Novelty of each robot (...) of a batch of start postures."""
-    moving = {name: at_first[name] for name in novelty.moving if name in at_first}
+    moving = {
+        name: at_first[name]
+        for name in at_first
+        if name in summary.frames and summary.frames[name].moves
+    }
     frames = {**frames, **moving}
-    return torch.as_tensor(novelty.ratio(start, frames)).to(start).expand(start.shape[:-1])
+    return torch.as_tensor(summary.novelty(start, frames)).to(start).expand(start.shape[:-1])
 
 
 def _choose(where: Tensor, one: Estimate, other: Estimate) -> Estimate:

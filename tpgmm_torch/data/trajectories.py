@@ -66,7 +66,7 @@ class Trajectory(Tabular):
     novelty : float, optional
         How new the situation is to the model: 1 is as far from the demonstrations as the one
         of these that is furthest from the others
-        (:class:`~tpgmm_torch.novelty.Novelty`). None where the model does not know its
+        (:class:`~tpgmm_torch.checks.TrainingSummary`). None where the model does not know its
         demonstrations.
     """
 

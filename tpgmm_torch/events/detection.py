@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.plausibility.findings import Finding, Report
 
 __all__ = [
     "LEAST_CONFIDENCE",
@@ -148,7 +148,6 @@ def doubtful_events(
         findings.append(
             Finding(
                 "events",
-                "unlikely",
                 f"{name!r} is not found with confidence {LEAST_CONFIDENCE} in {among}s "
                 f"{numbers} (there {lowest:.3f} to {highest:.3f})",
                 "Leave them out, look for it in other signals, or say when it is",

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.operators import Canonical, Linearization, Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
@@ -117,7 +117,7 @@ class Regression:
         Intervals in which a link holds an object.
     motion_bounds : MotionBounds, optional
         Of position, speed, acceleration and jerk.
-    novelty : Novelty, optional
+    summary : TrainingSummary, optional
         Distance of a situation from the demonstrations.
     """
 
@@ -136,7 +136,7 @@ class Regression:
     end: float = math.inf
     holds: tuple[Hold, ...] = ()
     motion_bounds: MotionBounds | None = None
-    novelty: Novelty | None = None
+    summary: TrainingSummary | None = None
 
     def step(
         self,

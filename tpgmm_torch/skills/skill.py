@@ -8,10 +8,10 @@ from typing import Protocol
 
 from torch import Tensor
 
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -96,7 +96,7 @@ class Skill(Protocol):
         return None
 
     @property
-    def novelty(self) -> Novelty | None:
+    def summary(self) -> TrainingSummary | None:
         """Distance of a situation from the demonstrations; None if that is not known."""
         return None
 

@@ -20,18 +20,19 @@ from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.plausibility.likeness import SMALLEST_RANGE
-from tpgmm_torch.plausibility.outlying_demonstrations import comparable_coordinates
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.operator_selection import candidate_operators
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.outlying_demonstrations import comparable_coordinates
 from tpgmm_torch.training.training_rows import at_phases, typical_time
 
 __all__ = ["ModeSelection"]
 
+#: Joints that hardly move are compared by this range [rad or m].
+SMALLEST_RANGE = 0.2
 #: A way that was shown once is an exception, and has no variance.
 FEWEST = 2
 #: Stretches of the skill of which each is looked at by itself,

@@ -29,11 +29,11 @@ from tpgmm_torch.operators import (
     Stack,
 )
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.evidence import Evidence, gather_evidence
 from tpgmm_torch.training.hold_detection import holds_for
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
 __all__ = ["Judgement", "OperatorSelection", "arranged", "candidate_operators"]
 

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 
 from tpgmm_torch.alignment.piecewise_linear import EventAlignment, LinearTimeNormalization
+from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.events.boundaries import find_boundaries
 from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.notebook import in_columns
-from tpgmm_torch.plausibility.findings import Finding, Report
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.operator_selection import FEWEST, OperatorSelection
 
@@ -224,7 +224,6 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             findings.append(
                 Finding(
                     "parts",
-                    "unlikely",
                     f"the beginnings of parts {[number + 2 for number in late]} are up to "
                     f"{most:.2g} s from where they are in most demonstrations",
                     "Align at them: EventAlignment(['part *']) of what Segmentation gives, or "

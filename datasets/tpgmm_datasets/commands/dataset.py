@@ -96,7 +96,7 @@ def check(
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", DatasetWarning)
-            report = recording.examine(recording.demonstrations(tell=False))
+            report = recording.check()
     except UnknownUnitsError as error:  # no fault of the set
         typer.echo(f"cannot say whether it is plausible: {error}")
         raise typer.Exit(1 if strict else 0) from error
@@ -107,7 +107,7 @@ def check(
     for problem in bad:
         typer.echo(f"error: {problem}")
     for finding in report:
-        typer.echo(f"{finding.severity}: {finding}")
+        typer.echo(f"{'error' if finding.impossible else 'unlikely'}: {finding}")
     if bad or report.errors() or (strict and len(report)):
         raise typer.Exit(1)
 

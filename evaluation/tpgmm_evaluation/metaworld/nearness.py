@@ -123,6 +123,6 @@ class Nearness:
         prior = TaskParameterizedGMM.from_parameters(
             model.weights_, model.means_, covariances, model.time_, **settings
         )
-        prior.shown_ = model.shown_
+        prior.summary_ = model.summary_
         prior.acceleration_, prior.jerk_ = model.acceleration_, model.jerk_
         return prior

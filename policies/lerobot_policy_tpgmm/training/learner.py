@@ -55,10 +55,10 @@ from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.events.detection import Detector, find_events
 from tpgmm_torch.exceptions import DataError, NotFittedError
-from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
+from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
 __all__ = ["Learner"]
 

@@ -27,10 +27,10 @@ def test_the_skill_and_its_limits_are_those_of_the_model():
     assert skill["Gaussians"] == str(model.n_components_)
     assert skill["joints"] == ", ".join(model.kinematics_.joint_names)
     [bottle] = [row for row in rows(card, "Where it fails") if row[0] == "bottle"]
-    shown = model.shown_.frames["bottle"]
+    shown = model.summary_.frames["bottle"]
     assert bottle[1] == f"{shown.low[0]:.3f} to {shown.high[0]:.3f}"
     learned = dict(row for row in rows(card, "How it was learned"))
-    assert learned["demonstrations"] == str(model.shown_.n_demonstrations)
+    assert learned["demonstrations"] == str(model.summary_.n_demonstrations)
     assert learned["converged"] == ("yes" if model.converged_ else "no")
 
 
@@ -43,7 +43,7 @@ def test_what_matters_changes_from_the_object_to_the_joints():
     joints = heading.index("`canonical`") - 1
     assert shares[:, joints].argmin() < shares[:, joints].argmax()
     # the same as the shares of a reproduction where the objects are in the middle
-    shown = model.shown_
+    shown = model.summary_
     middle = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
     bottle = Frame(shown.frames["bottle"].mean, shown.frames["bottle"].orientation)
     [trajectory] = model.predict([Situation(joints=middle, frames={"bottle": bottle})])
@@ -54,7 +54,7 @@ def test_what_matters_changes_from_the_object_to_the_joints():
 
 def test_nothing_is_made_up_where_nothing_is_known():
     model = TaskParameterizedGMM(3).fit(waves())
-    model.shown_ = None
+    model.summary_ = None
     card = model_card(model, "lab/wave", notes="One more thing.")
     assert "What was shown is not known." in card
     assert "Not known: it depends on the situation" in card

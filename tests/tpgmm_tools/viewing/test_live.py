@@ -16,7 +16,7 @@ from tpgmm_torch import Frame, Situation
 
 def test_live_a_frame_that_is_moved_is_reproduced_for_anew(capsys):
     model = copy.copy(skills.hands())
-    model.shown_ = replace(model.shown_, events={"touch": 0.5})
+    model.summary_ = replace(model.summary_, events={"touch": 0.5})
     situation, other = (skills.new_handling(seed=s)[0] for s in (7, 8))
     with LiveView(model, [situation, other], skills.handlings(), port=0) as view:
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+", view.url)

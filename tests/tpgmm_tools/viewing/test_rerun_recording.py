@@ -18,7 +18,7 @@ from tpgmm_torch.exceptions import DependencyError
 
 def with_an_event():
     model = copy.copy(skills.small_bottle())
-    model.shown_ = replace(model.shown_, events={"grasp": 0.4})
+    model.summary_ = replace(model.summary_, events={"grasp": 0.4})
     return model
 
 

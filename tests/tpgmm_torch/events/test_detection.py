@@ -5,11 +5,11 @@ import warnings
 import numpy as np
 import pytest
 
+from tpgmm_datasets import check
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.events.detection import Detection, find_events, hysteresis
 from tpgmm_torch.events.signals import SignalEvent
 from tpgmm_torch.exceptions import DataError, PlausibilityError, PlausibilityWarning
-from tpgmm_torch.plausibility import examine
 
 TIME = np.arange(0, 10, 0.05)
 CLOSE = {"close": SignalEvent(("gripper",))}
@@ -69,13 +69,13 @@ def test_events_that_were_spoilt_in_a_fifth_of_the_episodes_are_named():
     rng = np.random.default_rng(0)
     shown = [gripping(at, seed=n) for n, at in enumerate(rng.uniform(3, 4, size=20))]
     found = find_events(shown, CLOSE)
-    assert len(examine(found)) == 0
+    assert len(check(found)) == 0
     spoilt = [2, 7, 11, 18]
     for n, at in zip(spoilt, [0.0, 0.0, 9.8, 0.0], strict=True):
         found[n] = Demonstration(
             TIME, found[n].joints, joint_names=found[n].joint_names, events={"close": at}
         )
-    [finding] = [f for f in examine(found) if f.check == "events"]
+    [finding] = [f for f in check(found) if f.check == "events"]
     assert finding.episodes == tuple(spoilt)
     # or the signal itself is: closed from the start, and the only closing comes too late
     late = [gripping(at, seed=n) for n, at in enumerate(rng.uniform(3, 4, size=20))]
@@ -89,7 +89,7 @@ def test_events_that_were_spoilt_in_a_fifth_of_the_episodes_are_named():
             np.stack([late[n].joints[:, 0], opening], axis=1),
             joint_names=late[n].joint_names,
         )
-    [finding] = [f for f in examine(find_events(late, CLOSE)) if f.check == "events"]
+    [finding] = [f for f in check(find_events(late, CLOSE)) if f.check == "events"]
     assert finding.episodes == tuple(spoilt)
 
 

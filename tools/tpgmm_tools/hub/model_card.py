@@ -143,7 +143,7 @@ def _influence(model: Any) -> str:
 
 def _middle(model: Any) -> Situation | None:
     """The situation amid those shown; None where they are not known."""
-    shown = model.shown_
+    shown = model.summary_
     if shown is None or not set(model.frame_names_) <= shown.frames.keys():
         return None
     joints = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
@@ -153,7 +153,7 @@ def _middle(model: Any) -> Situation | None:
             return None
         joints[start : start + 4] = quaternions.normalize(as_tensor(quaternion, "orientation"))
     frames = {
-        name: Frame(shown.frames[name].mean, shown.frames[name].orientation)
+        name: Frame(shown.frames[name].place.mean, shown.frames[name].orientation)
         for name in model.frame_names_
     }
     return Situation(joints=joints, frames=frames, joint_names=shown.joint_names)
@@ -165,7 +165,7 @@ def _limits(model: Any) -> str:
         "limits. It does not see: it has to be told where the frames are. It knows nothing of "
         "collisions."
     )
-    shown = model.shown_
+    shown = model.summary_
     if shown is None:
         return f"{text} What was shown is not known."
     parts = [f"{text} `novelty` above 1 is further than any demonstration from the others."]
@@ -187,7 +187,7 @@ def _limits(model: Any) -> str:
 
 
 def _learning(model: Any) -> str:
-    weights, shown = model.demonstration_weights_, model.shown_
+    weights, shown = model.demonstration_weights_, model.summary_
     rows: list[tuple[str, object]] = []
     if shown is not None:
         rows.append(("demonstrations", shown.n_demonstrations))

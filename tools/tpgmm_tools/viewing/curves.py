@@ -115,7 +115,7 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
         What it reproduced.
     """
     begin, end = float(model.time_[0]), float(model.time_[-1])
-    shown = {} if model.shown_ is None else model.shown_.events
+    shown = {} if model.summary_ is None else model.summary_.events
     events = {name: begin + share * (end - begin) for name, share in shown.items()}
     named = []
     for number, part in enumerate(model.parts_[1:], start=2):

@@ -4,11 +4,11 @@ import warnings
 
 import pytest
 
+from tpgmm_torch.checks.report import Finding, Report, listed
 from tpgmm_torch.exceptions import DataError, PlausibilityError, PlausibilityWarning
-from tpgmm_torch.plausibility.findings import Finding, Report, listed
 
-SLOW = Finding("time", "unlikely", "a step is 30 s", "Is it in milliseconds?", ("t",), (1,), 30)
-DEGREES = Finding("units", "error", "q = 90 cannot be", "Convert it", ("q",), (), 88.0)
+SLOW = Finding("time", "a step is 30 s", "Is it in milliseconds?", ("t",), (1,), 30)
+DEGREES = Finding("units", "q = 90 cannot be", "Convert it", ("q",), value=88, impossible=True)
 
 
 def report(*findings):
@@ -26,26 +26,21 @@ def test_errors_come_first_and_everything_is_numbered():
     assert str(report()) == "4 demonstrations: nothing implausible"
 
 
-def test_what_is_unlikely_is_one_warning_at_the_line_that_asked():
+def test_an_unlikely_thing_is_one_warning_at_the_line_that_asked():
     with pytest.warns(PlausibilityWarning) as caught:
-        report(SLOW, SLOW).act(stacklevel=1)
+        report(SLOW, SLOW).act()
     assert len(caught) == 1 and caught[0].filename == __file__
-
-
-@pytest.mark.parametrize(
-    ("findings", "plausibility"), [((DEGREES, SLOW), "warn"), ((SLOW,), "error")]
-)
-def test_what_cannot_be_or_must_not_be_is_an_error(findings, plausibility):
-    with pytest.raises(PlausibilityError, match="time: a step is 30 s") as caught:
-        report(*findings).act(plausibility)
-    assert isinstance(caught.value, DataError)
-
-
-def test_nothing_is_said_of_nothing_or_when_it_is_ignored():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert len(report().act("error")) == 0
-        assert len(report(SLOW, DEGREES).act("ignore")) == 2
+        assert len(report().act()) == 0
+        with pytest.raises(PlausibilityWarning):
+            report(SLOW).act()
+
+
+def test_an_impossible_thing_is_an_error():
+    with pytest.raises(PlausibilityError, match="time: a step is 30 s") as caught:
+        report(DEGREES, SLOW).act()
+    assert isinstance(caught.value, DataError)
 
 
 def test_long_reports_are_cut_in_the_message_alone():

@@ -1,4 +1,4 @@
-"""Which of a few numbers are not like the others."""
+"""Outliers among a few numbers."""
 
 from __future__ import annotations
 
@@ -8,25 +8,24 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["FEWEST", "outliers", "set_apart"]
+__all__ = ["CONSISTENT", "FEWEST", "outliers", "set_apart"]
 
-#: Fewer numbers say nothing about what is usual.
+#: Fewer numbers do not show what is usual.
 FEWEST = 4
-#: So many robust standard deviations from the median is not like the others.
+#: Outliers are so many robust standard deviations from the median.
 FAR = 6.0
 #: Of a normal law, the standard deviation per median absolute deviation.
 CONSISTENT = 1.4826
-#: Fewer places than this do not show how far they scatter.
-FEWEST_PLACES = 5
-#: Places that are set apart are so many times farther away than the farthest of the others.
-APART = 4.0
+#: Places that are set apart are so many times farther away than the farthest of the others, of
+#: five places or more.
+APART, FEWEST_PLACES = 4.0, 5
 
 
-def outliers(values: Sequence[float] | Array, floor: float, far: float = FAR) -> list[int]:
+def outliers(values: Sequence[float] | Array, floor: float) -> list[int]:
     """Indices of the values far from the median, the farthest first.
 
-    A value is far if it is ``far`` times 1.4826 median absolute deviations (Hampel's
-    identifier [1]_) and more than ``floor`` away.
+    A value is far if it is six times 1.4826 median absolute deviations (Hampel's identifier
+    [1]_) and more than ``floor`` away.
 
     Parameters
     ----------
@@ -34,7 +33,6 @@ def outliers(values: Sequence[float] | Array, floor: float, far: float = FAR) ->
         One per demonstration; fewer than four have no outliers.
     floor : float
         What is nearer is like the others, in the unit of the values.
-    far : float, default=6
 
     References
     ----------
@@ -46,11 +44,10 @@ def outliers(values: Sequence[float] | Array, floor: float, far: float = FAR) ->
     >>> outliers([1.0, 1.1, 0.9, 1.0, 7.0], floor=0.5)
     [4]
     """
-    numbers = np.asarray(values, dtype=np.float64)
-    if len(numbers) < FEWEST:
+    if len(values) < FEWEST:
         return []
-    distances = np.abs(numbers - np.median(numbers))
-    limit = max(floor, far * CONSISTENT * float(np.median(distances)))
+    distances = np.abs(np.asarray(values) - np.median(values))
+    limit = max(floor, FAR * CONSISTENT * float(np.median(distances)))
     order = np.argsort(-distances, kind="stable")
     return [int(i) for i in order if distances[i] > limit]
 
@@ -75,9 +72,8 @@ def set_apart(distances: Array, floor: float) -> list[int]:
     [2]
     """
     order = np.argsort(-distances, kind="stable")
-    if len(distances) < FEWEST_PLACES:
-        return []
-    for count in range(len(distances) // 3, 0, -1):
+    most = len(distances) // 3 if len(distances) >= FEWEST_PLACES else 0
+    for count in range(most, 0, -1):
         near, far = distances[order[count]], distances[order[count - 1]]
         if far > max(floor, APART * near):
             return sorted(int(i) for i in order[:count])

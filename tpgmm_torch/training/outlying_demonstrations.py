@@ -13,13 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tpgmm_torch.checks.report import Finding, listed
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.plausibility.findings import Finding, listed
-from tpgmm_torch.plausibility.outliers import CONSISTENT
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.training_rows import at_phases, typical_time
@@ -38,6 +37,8 @@ FEWEST = 5
 NEAR = 0.005
 #: and an angle [rad].
 NEAR_ANGLE = 0.05
+#: Of a normal law, the standard deviation per median absolute deviation.
+CONSISTENT = 1.4826
 #: So many robust standard deviations from the median are unlike the others, where they last for
 #: so long [s]. On real recordings: at most 6.1 of those who are not, at least 11.6 of those
 #: whose frame was taken at a wrong instant, 5 to 15 cm beside the right one.
@@ -76,10 +77,9 @@ def outlying_demonstrations(
     """Demonstrations far from the median of all, at instants at which the others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
-    as for single numbers (:func:`~tpgmm_torch.plausibility.outliers.outliers`), more than eight
-    times 1.4826 times the median distance from the median, for half a second in all. Where the
-    others agree to less than 0.5 % of the range of an operator's coordinates, or 0.05 rad, that
-    counts as their distance.
+    more than eight times 1.4826 times the median distance from the median, for half a second
+    in all. Where the others agree to less than 0.5 % of the range of an operator's coordinates,
+    or 0.05 rad, that counts as their distance.
 
     Parameters
     ----------
@@ -204,7 +204,6 @@ def left_out(outlying: Sequence[Outlying], count: int) -> Finding:
     ]
     return Finding(
         "left out",
-        "unlikely",
         f"{len(outlying)} of {count} are unlike the others and were not learned from: "
         f"{listed(places)}",
         "Is the frame right, and the event's time? robust=False learns from all",

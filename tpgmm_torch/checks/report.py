@@ -1,10 +1,11 @@
-"""What a check of plausibility found: named, with its number, and said once."""
+"""Findings of a check, each with its number and a remedy, and the one warning made of them."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
@@ -12,23 +13,20 @@ __all__ = ["PLAUSIBILITY", "Finding", "Report", "listed"]
 
 #: What can be done about findings.
 PLAUSIBILITY = ("warn", "error", "ignore")
-
-#: So many examples of one finding are spelled out.
-MOST_EXAMPLES = 3
-#: So many findings are spelled out in one warning; a report has them all.
-MOST_FINDINGS = 8
+#: So many examples of one finding, and so many findings, are spelled out in a message; a
+#: report has them all.
+MOST_EXAMPLES, MOST_FINDINGS = 3, 8
+PACKAGE = str(Path(__file__).parents[1])
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is not as it should be.
+    """One thing that cannot be, or is unlikely.
 
     Parameters
     ----------
     check : str
-        Which check found it, for example ``"units"``, ``"speed"``, ``"frames"``.
-    severity : {"error", "unlikely"}
-        Whether it cannot be, or is only unlikely.
+        Name of the check, for example ``"units"``, ``"speed"``, ``"frames"``.
     message : str
         What was found, with the number and what was expected.
     remedy : str
@@ -36,18 +34,20 @@ class Finding:
     names : tuple of str
         The joints, frames or events it is about.
     episodes : tuple of int
-        The demonstrations (or situations) it is about; none where it is about all.
+        The demonstrations (or situations) it is about; empty where it is about all.
     value : float
         The number that stands out most.
+    impossible : bool
+        Whether it cannot be, or is only unlikely.
     """
 
     check: str
-    severity: str
     message: str
     remedy: str
     names: tuple[str, ...] = ()
     episodes: tuple[int, ...] = ()
     value: float = float("nan")
+    impossible: bool = False
 
     def __str__(self) -> str:
         return f"{self.check}: {self.message}. {self.remedy}"
@@ -60,31 +60,25 @@ class Report:
     Parameters
     ----------
     findings : tuple of Finding
-        What cannot be comes first.
+        Errors first.
     subject : str
-        What was looked at, for example ``"10 demonstrations"``.
+        What was checked, for example ``"10 demonstrations"``.
 
     Examples
     --------
-    >>> from tpgmm_torch import Demonstration
-    >>> from tpgmm_torch.plausibility.check import examine
-    >>> degrees = [Demonstration([0.0, 0.1, 0.2], [[30.0 + n], [60], [90]]) for n in range(2)]
-    >>> report = examine(degrees)
-    >>> [finding.check for finding in report]
-    ['units']
+    >>> found = Finding("time", "a step of time is 30 s", "Is it in milliseconds?")
+    >>> report = Report.of([found], "4 demonstrations")
+    >>> print(report)
+    4 demonstrations: one thing is implausible: (1) time: a step of time is 30 s. Is it ...
     """
 
     findings: tuple[Finding, ...]
     subject: str
 
     @classmethod
-    def of(cls, findings: Sequence[Finding], subject: str) -> Report:
+    def of(cls, findings: Iterable[Finding], subject: str) -> Report:
         """The report with errors first."""
-        return cls(tuple(sorted(findings, key=lambda f: f.severity != "error")), subject)
-
-    def and_also(self, *findings: Finding) -> Report:
-        """The report with more findings."""
-        return Report.of([*self.findings, *findings], self.subject)
+        return cls(tuple(sorted(findings, key=lambda f: not f.impossible)), subject)
 
     def __iter__(self) -> Iterator[Finding]:
         """One finding after the other."""
@@ -93,10 +87,6 @@ class Report:
     def __len__(self) -> int:
         """Number of findings."""
         return len(self.findings)
-
-    def errors(self) -> tuple[Finding, ...]:
-        """What cannot be."""
-        return tuple(finding for finding in self if finding.severity == "error")
 
     def __str__(self) -> str:
         if not self.findings:
@@ -109,15 +99,20 @@ class Report:
         worst = "impossible" if self.errors() else "implausible"
         return f"{self.subject}: {one} {worst}: {items}"
 
-    def act(self, plausibility: str = "warn", stacklevel: int = 2) -> Report:
-        """Raise what cannot be, warn once of what is unlikely.
+    def errors(self) -> tuple[Finding, ...]:
+        """What cannot be."""
+        return tuple(finding for finding in self if finding.impossible)
+
+    def act(self, plausibility: str = "warn", packages: tuple[str, ...] = ()) -> Report:
+        """Raise an error if something cannot be, warn once of what is unlikely.
 
         Parameters
         ----------
         plausibility : {"warn", "error", "ignore"}, default="warn"
             "error" raises what is unlikely too; "ignore" does nothing.
-        stacklevel : int, default=2
-            As of ``warnings.warn``: whose line the warning names.
+        packages : tuple of str, default=()
+            Folders of code, beside this package, that the warning does not point at: it names
+            the line that called them.
 
         Returns
         -------
@@ -127,11 +122,21 @@ class Report:
         ------
         PlausibilityError
             With all findings.
+
+        Warns
+        -----
+        PlausibilityWarning
+            Once, with all findings.
         """
         if self.findings and plausibility != "ignore":
             if plausibility == "error" or self.errors():
                 raise PlausibilityError(str(self))
-            warnings.warn(str(self), PlausibilityWarning, stacklevel + 1)
+            warnings.warn(
+                str(self),
+                PlausibilityWarning,
+                stacklevel=2,
+                skip_file_prefixes=(PACKAGE, *packages),
+            )
         return self
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tpgmm_torch.plausibility.outliers import FEWEST, outliers
+from tpgmm_datasets.checks.outliers import FEWEST, outliers
 
 
 @pytest.mark.parametrize("law", ["standard_normal", "random"])

@@ -11,9 +11,9 @@ from tests.support.skills import HANDLING, HANDS, canonical, handlings, hands_mo
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 from tpgmm_torch.model_selection import fit_folds
-from tpgmm_torch.plausibility.outlying_demonstrations import outlying_demonstrations
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training import training_rows
+from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
 
 def misplaced(demonstration, shift=0.3):
@@ -104,7 +104,7 @@ def test_they_are_left_out_with_one_warning_that_says_where():
         warnings.simplefilter("error")
         rest = hands_model().fit([*shown[:5], *shown[6:]])
     same(model, rest, 1e-12)
-    assert model.shown_ == rest.shown_
+    assert model.summary_ == rest.summary_
 
 
 def test_all_are_learned_from_if_asked():
@@ -139,7 +139,7 @@ def test_batches_are_looked_at_together(wrong, longer):
     good = [one for one, weight in zip(shown, weights, strict=True) if weight]
     rest = hands_model(robust=False, plausibility="ignore").fit([good[:4], good[4:]])
     same(model, rest, 1e-9)
-    assert model.shown_ == rest.shown_
+    assert model.summary_ == rest.summary_
 
 
 def test_many_demonstrations_are_thinned_out(monkeypatch):

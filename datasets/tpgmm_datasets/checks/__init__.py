@@ -1,0 +1,1 @@
+"""Checks of recordings: units, order, clocks, joints, frames, episodes unlike the others."""

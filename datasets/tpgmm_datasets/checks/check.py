@@ -1,0 +1,231 @@
+"""Check of recordings: whether they can be what they are taken for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
+from tpgmm_datasets.checks.outliers import FEWEST, outliers
+from tpgmm_datasets.checks.poses import pose_findings
+from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_torch import quaternions
+from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.training import in_order, unit_findings
+from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations, check_robot
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["PACKAGE", "check", "check_summaries"]
+
+#: Warnings name the line that called this package.
+PACKAGE = str(Path(__file__).parents[1])
+#: No robot is recorded more often [s].
+QUICKEST_STEP = 1e-5
+#: Steps of time of one recording may differ from the others' by this factor.
+OTHER_RATE = 20.0
+#: Nothing is missing between steps of less than this [s], or so many usual ones, or this share
+#: of the recording.
+GAP, GAP_STEPS, GAP_SHARE = 0.25, 10.0, 0.02
+#: Durations within this factor, and events within this share of the duration, are alike.
+SAME_DURATION, SAME_PHASE = 1.6, 0.15
+#: Paths that differ by less of the joints' ranges, on average, are alike; ranges are at least
+#: this [rad or m].
+SAME_PATH, SMALLEST_RANGE = 0.5, 0.2
+#: Fewer recordings do not show what a usual path is.
+FEWEST_PATHS = 5
+BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
+
+
+def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = None) -> Report:
+    """Check whether recordings can be what they are taken for; nothing is changed.
+
+    Checked are units, limits of position and speed, the order of unnamed joints, wraps, jumps,
+    clipped and stuck values; steps of time, gaps, durations and events; positions, orientations
+    and quaternion order of frames; copies, and episodes unlike the others. What is not found is
+    not thereby right.
+
+    Parameters
+    ----------
+    demonstrations : iterable of Demonstration
+        Before or after alignment.
+    robot : Kinematics, optional
+        Its limits and links tell more.
+
+    Returns
+    -------
+    Report
+        Its findings, each with a name, a number and a remedy. ``.act()`` raises a
+        ``PlausibilityError`` of what cannot be, and warns once of what is unlikely.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If demonstrations do not fit together, or with the robot.
+
+    Examples
+    --------
+    >>> time = np.linspace(0, 2, 40)
+    >>> shown = [Demonstration(time, np.sin(time + n / 9)[:, None]) for n in range(3)]
+    >>> print(check(shown))
+    3 demonstrations: nothing implausible
+    >>> [found] = check([Demonstration(1000 * one.time, one.joints) for one in shown])
+    >>> found.check, found.remedy
+    ('time', 'Is it in milliseconds, or numbers of frames? Convert it')
+    """
+    check_robot(robot)
+    ordered = in_order(check_demonstrations(demonstrations), robot)
+    return check_summaries([RecordingSummary.of(one) for one in ordered], robot)
+
+
+def check_summaries(
+    episodes: Sequence[RecordingSummary], robot: Kinematics | None = None
+) -> Report:
+    """The report of :func:`check` on recordings that were summarised as they were read.
+
+    Parameters
+    ----------
+    episodes : sequence of RecordingSummary
+        With the joints in the robot's order.
+    robot : Kinematics, optional
+    """
+    units = list(unit_findings(episodes, robot))
+    findings = [
+        *units,
+        *_time(episodes),
+        *_events(episodes),
+        *joint_findings(episodes, robot),
+        *pose_findings(episodes, {name for found in units for name in found.names}),
+        *_copies(episodes),
+        *_paths(episodes, robot),
+    ]
+    count = len(episodes)
+    return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
+
+
+def _time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Steps, gaps and durations unlike the others."""
+    steps = np.array([episode.step for episode in episodes])
+    usual = float(np.median(steps))
+    if 0 < usual < QUICKEST_STEP:
+        message = f"time is in seconds, and a typical step of it is {usual:.3g} s"
+        yield Finding("time", message, "Is it in another unit? Convert it", value=usual)
+    odd = [
+        i for i, s in enumerate(steps) if s and not 1 / OTHER_RATE <= s / usual <= OTHER_RATE
+    ]
+    if odd:
+        places = listed([f"{steps[i]:.3g} s in demonstration {i}" for i in odd])
+        message = f"steps of time are {usual:.3g} s, but {places}"
+        yield Finding("time", message, "Is its time in milliseconds?", (), tuple(odd))
+    gaps = {
+        i: one.gap
+        for i, one in enumerate(episodes)
+        if one.gap[0] > max(GAP_STEPS * one.step, GAP, GAP_SHARE * one.duration)
+    }
+    if gaps:
+        spans = [
+            f"{g:.3g} s after {at:.4g} s of demonstration {i}" for i, (g, at) in gaps.items()
+        ]
+        message = f"nothing was recorded for {listed(spans)}"
+        yield Finding("gaps", message, "Leave the episode out, or cut it", (), tuple(gaps))
+    durations = np.array([max(episode.duration, 1e-9) for episode in episodes])
+    if odd := outliers(np.log(durations), floor=np.log(SAME_DURATION)):
+        places = listed([f"{durations[i]:.4g} s in demonstration {i}" for i in odd])
+        message = f"demonstrations last about {np.median(durations):.4g} s, but {places}"
+        remedy = "Is it the same skill, whole, and at the same rate?"
+        yield Finding("durations", message, remedy, (), tuple(odd), float(durations[odd[0]]))
+
+
+def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Events at another phase than usual, missing, or in another order."""
+    names = list(dict.fromkeys(name for one in episodes for name in one.events))
+    places: list[str] = []
+    about: dict[int, None] = {}
+    for name in names:
+        phases = {i: one.events[name] for i, one in enumerate(episodes) if name in one.events}
+        there, values = list(phases), np.array(list(phases.values()))
+        usual = float(np.median(values))
+        inside = len(there) >= FEWEST and 0.05 < usual < 0.95
+        ends = [i for i, at in phases.items() if inside and min(at, 1 - at) < 0.005]
+        for i in sorted({*ends, *(there[i] for i in outliers(values, floor=SAME_PHASE))}):
+            places.append(
+                f"{name!r} at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}"
+            )
+            about[i] = None
+        lost = [i for i in range(len(episodes)) if i not in phases]
+        if lost and len(lost) < len(there):
+            places.append(f"{name!r} missing in {listed([str(i) for i in lost])}")
+            about |= dict.fromkeys(lost)
+    if places:
+        message = f"events are not where they usually are: {listed(places)}"
+        yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
+    for first, second in combinations(names, 2):
+        both = {
+            i: e.events
+            for i, e in enumerate(episodes)
+            if first in e.events and second in e.events
+        }
+        ahead = [i for i, at in both.items() if at[first] > at[second]]
+        order = first, second
+        if 2 * len(ahead) > len(both):
+            ahead, order = [i for i in both if i not in ahead], (second, first)
+        if 0 < len(ahead) <= len(both) / 4:
+            message = (
+                f"{order[0]!r} comes before {order[1]!r}, but not in demonstration "
+                f"{listed([str(i) for i in ahead])}"
+            )
+            yield Finding("events", message, BY_HAND, order, tuple(ahead))
+
+
+def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    first: dict[str, int] = {}
+    pairs = [
+        (i, first[one.digest])
+        for i, one in enumerate(episodes)
+        if i != first.setdefault(one.digest, i) and np.ptp(one.path) > 0
+    ]
+    if pairs:
+        places = listed([f"demonstration {b} is a copy of {a}" for b, a in pairs])
+        message = f"some were recorded once and counted twice: {places}"
+        remedy = "Leave the copies out: they make the model more certain than it may be"
+        yield Finding("copies", message, remedy, (), tuple(b for b, _ in pairs))
+
+
+def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Iterator[Finding]:
+    """Episodes whose path is far from the median path."""
+    if len(episodes) < FEWEST_PATHS:
+        return
+    paths = _aligned_signs(episodes, robot)
+    scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
+    squares = ((paths - np.median(paths, axis=0)) / scale) ** 2
+    distances, joints = np.sqrt(squares.mean(axis=(1, 2))), squares.mean(axis=1)
+    usual = float(np.median(distances))
+    odd = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > usual]
+    if odd:
+        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
+        most = {i: names[int(joints[i].argmax())] for i in odd}
+        places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
+        yield Finding(
+            "episodes",
+            "paths differ from the median path, in ranges of the joints, by about "
+            f"{usual:.2g}, but {listed(places)}",
+            "Is it the same skill, with the columns in the same order and unit? Leave it out",
+            tuple(dict.fromkeys(most.values())),
+            tuple(odd),
+            float(distances[odd[0]]),
+        )
+
+
+def _aligned_signs(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:
+    """Paths (E, P, n_joints), quaternions among them each on the side of their mean."""
+    paths = np.stack([episode.path for episode in episodes])
+    for columns in quaternion_columns(episodes[0].joint_names, robot):
+        turns = quaternions.continuous(torch.from_numpy(paths[..., columns]))
+        mean = quaternions.continuous(quaternions.mean(turns.movedim(0, 1)))
+        along = (turns * mean).sum((1, 2))[:, None, None]
+        paths[..., columns] = (turns * quaternions.hemisphere_sign(along)).numpy()
+    return paths

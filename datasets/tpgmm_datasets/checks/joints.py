@@ -1,0 +1,233 @@
+"""Findings about joints: order, limits, speeds, wraps, jumps, clipped and stuck values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_datasets.units import LARGEST_ANGLE
+from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.training import FAR, IMPOSSIBLE
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.pose_names import is_gripper, quaternion_groups
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.tracked_poses import Poses
+
+__all__ = ["joint_findings", "quaternion_columns"]
+
+#: Limits and calibrations are not exact: values may be beyond by this share of the range, and
+#: at most by this [rad or m].
+BEYOND_SHARE, BEYOND = 0.1, 0.1
+#: Differences of noisy positions are larger than speeds: by so much the 98 % quantile and the
+#: largest may be.
+FAST, FASTEST = 1.2, 3.0
+#: Joints that usually move by this [rad or m] are stuck if they keep one value for this share
+#: of an episode, and usually less than for the second.
+MOVING, STUCK, USUALLY_STILL = 0.1, 0.4, 0.1
+
+
+def quaternion_columns(
+    names: Sequence[str] | None, robot: Kinematics | None
+) -> list[list[int]]:
+    """Columns of the quaternions among joints, known by names or by the robot."""
+    starts = robot.quaternion_starts if robot is not None else ()
+    groups = {tuple(range(start, start + 4)) for start in starts} | {*quaternion_groups(names)}
+    return [list(group) for group in sorted(groups)]
+
+
+def joint_findings(
+    episodes: Sequence[RecordingSummary], robot: Kinematics | None
+) -> Iterator[Finding]:
+    """Order, limits, units without limits, speeds, wraps, jumps, clipped and stuck values.
+
+    Parameters
+    ----------
+    episodes : sequence of RecordingSummary
+        With their joints in the robot's order.
+    robot : Kinematics, optional
+        Whose limits hold.
+    """
+    low = np.min([episode.low for episode in episodes], axis=0)
+    high = np.max([episode.high for episode in episodes], axis=0)
+    given = episodes[0].joint_names
+    names = (robot.joint_names if robot is not None else given) or tuple(
+        f"joint {i}" for i in range(len(low))
+    )
+    quaternion = {i for group in quaternion_columns(names, robot) for i in group}
+    angles = [i for i, name in enumerate(names) if i not in quaternion and not is_gripper(name)]
+    largest = np.maximum(-low, high)
+    limits: Array = np.full((2, len(low)), [[-np.inf], [np.inf]])
+    if robot is not None:
+        limits = np.stack((as_array(robot.lower), as_array(robot.upper)))
+    excess = np.maximum(limits[0] - low, high - limits[1])
+    if np.isfinite(limits).any():
+        yield from _limits(names, low, high, limits, given is None)
+    else:
+        yield from _units(
+            names, low, high, angles, FAR if isinstance(robot, Poses) else LARGEST_ANGLE
+        )
+    if robot is not None and excess.max(initial=0) <= IMPOSSIBLE:  # else speeds are wrong too
+        yield from _speeds(episodes, names, as_array(robot.velocity))
+    yield from _steps(episodes, names, [i for i in angles if largest[i] <= LARGEST_ANGLE])
+    yield from _clipped(episodes, names, angles)
+    yield from _stuck(episodes, names)
+
+
+def _limits(
+    names: Sequence[str], low: Array, high: Array, limits: Array, unnamed: bool
+) -> Iterator[Finding]:
+    """Positions beyond the limits: another order, or another robot."""
+    allowed = np.minimum(BEYOND_SHARE * (limits[1] - limits[0]), BEYOND)
+    excess = np.maximum(limits[0] - low, high - limits[1])
+    beyond = [int(j) for j in np.argsort(-excess) if excess[j] > allowed[j]]
+    if not beyond or excess[beyond[0]] > IMPOSSIBLE:  # which is of units
+        return
+    places = listed(
+        [
+            f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}, limits {limits[0, j]:.4g} to "
+            f"{limits[1, j]:.4g}"
+            for j in beyond
+        ]
+    )
+    about, worst = tuple(names[j] for j in beyond), float(excess[beyond[0]])
+    # columns for the joints of the robot, in its order, such that all are within their limits
+    cost = np.maximum(limits[0][:, None] - low, high - limits[1][:, None]) - allowed[:, None]
+    rows, columns = linear_sum_assignment(cost.clip(min=0))
+    if unnamed and (cost[rows, columns] <= 0).all():
+        message = (
+            f"the joints are unnamed, and their order does not fit the limits: {places}; the "
+            f"columns {columns.tolist()} would fit the joints of the robot"
+        )
+        remedy = "Name the columns: Demonstration(..., joint_names=[...])"
+        yield Finding("order", message, remedy, about, value=worst)
+        return
+    yield Finding(
+        "limits",
+        f"joints are beyond the robot's limits: {places}",
+        "Check their zeros, units and order"
+        + (", and name them (joint_names=[...])" if unnamed else "")
+        + ", or that it is this robot; references will stay within the limits",
+        about,
+        value=worst,
+    )
+
+
+def _units(
+    names: Sequence[str], low: Array, high: Array, angles: Sequence[int], limit: float
+) -> Iterator[Finding]:
+    """Values that are hardly radians, or metres of tracked links, where no limits are known."""
+    largest = np.maximum(-low, high)
+    odd = sorted((i for i in angles if largest[i] > limit), key=lambda i: -largest[i])
+    if odd:
+        places = listed([f"{names[i]!r} from {low[i]:.4g} to {high[i]:.4g}" for i in odd])
+        yield Finding(
+            "units",
+            f"joints are in radians (metres, where they slide), these hardly are: {places}",
+            "Are they in degrees, ticks or millimetres? If one joint is, all are: convert the "
+            "whole joint vector, and positions of frames",
+            tuple(names[i] for i in odd),
+            value=float(largest[odd[0]]),
+        )
+
+
+def _speeds(
+    episodes: Sequence[RecordingSummary], names: Sequence[str], velocity: Array
+) -> Iterator[Finding]:
+    fastest = np.stack([one.fastest for one in episodes])
+    over = np.stack([one.speed for one in episodes]) > FAST * velocity
+    over |= fastest > FASTEST * velocity
+    odd, about = np.flatnonzero(over.any(axis=0)), np.flatnonzero(over.any(axis=1))
+    if len(odd):
+        most = fastest.max(axis=0)
+        places = listed([f"{names[j]!r} {most[j]:.3g}, limit {velocity[j]:.3g}" for j in odd])
+        yield Finding(
+            "speed",
+            f"joints move faster than the robot can, up to [rad/s or m/s]: {places} "
+            f"(demonstrations {listed([str(i) for i in about])})",
+            "Is time in seconds, are values lost, or did warping squeeze a motion?",
+            tuple(names[j] for j in odd),
+            tuple(about.tolist()),
+            float((most[odd] / velocity[odd]).max()),
+        )
+
+
+def _steps(
+    episodes: Sequence[RecordingSummary], names: Sequence[str], angles: Sequence[int]
+) -> Iterator[Finding]:
+    """Wraps and jumps."""
+    kinds = {
+        "wraps": ("by a whole turn", "Unwrap the joints (np.unwrap(joints, axis=0))"),
+        "jumps": (
+            "like no other of that joint",
+            "Were values lost, or the recording stopped? Repair or leave out the episode",
+        ),
+    }
+    for check, (what, remedy) in kinds.items():
+        found = [
+            (i, names[j], at, size)
+            for i, episode in enumerate(episodes)
+            for j, at, size in getattr(episode, check)
+            if j in angles
+        ]
+        if found:
+            places = [
+                f"{name!r} by {size:.3g} at {at:.4g} s of demonstration {i}"
+                for i, name, at, size in found
+            ]
+            yield Finding(
+                check,
+                f"there are steps {what}: {listed(places)}",
+                remedy,
+                tuple(dict.fromkeys(name for _, name, _, _ in found)),
+                tuple(dict.fromkeys(i for i, *_ in found)),
+                max(size for *_, size in found),
+            )
+
+
+def _clipped(
+    episodes: Sequence[RecordingSummary], names: Sequence[str], angles: Sequence[int]
+) -> Iterator[Finding]:
+    """The same end of a range, run into and left at full speed more than once."""
+    ends: dict[tuple[str, float], list[int]] = {}
+    for index, episode in enumerate(episodes):
+        for joint, value, _ in episode.plateaus:
+            if joint in angles:
+                ends.setdefault((names[joint], value), []).append(index)
+    odd = {end: indices for end, indices in ends.items() if len(indices) > 1}
+    if odd:
+        places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
+        yield Finding(
+            "clipped",
+            f"motions stop dead at one value and go on from it: {listed(places)}",
+            "Was the recording cut off at a limit, or a sensor saturated?",
+            tuple(dict.fromkeys(name for name, _ in odd)),
+            tuple(sorted({index for indices in odd.values() for index in indices})),
+        )
+
+
+def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterator[Finding]:
+    """A joint that keeps one value in one episode and moves in the others."""
+    if len(episodes) < 3:
+        return
+    ranges = np.stack([one.high - one.low for one in episodes])
+    still = np.where(ranges <= 1e-9, 1.0, np.stack([one.still for one in episodes]))
+    usual = np.median(ranges, axis=0)
+    stuck = (still > STUCK) & (np.median(still, axis=0) < USUALLY_STILL) & (usual > MOVING)
+    odd = [(int(e), int(j)) for e, j in np.argwhere(stuck)]
+    if odd:
+        places = [
+            f"{names[j]!r} of demonstration {e} for {still[e, j]:.0%} of it, usually it moves "
+            f"by {usual[j]:.2g}"
+            for e, j in odd
+        ]
+        yield Finding(
+            "stuck",
+            f"joints keep one value while the others move: {listed(places)}",
+            "Was a sensor or a motor off? Leave the episode out",
+            tuple(dict.fromkeys(names[j] for _, j in odd)),
+            tuple(dict.fromkeys(e for e, _ in odd)),
+            float(max(still[e, j] for e, j in odd)),
+        )

@@ -1,0 +1,134 @@
+"""Findings about frames: quaternion order, lost trackers, jumps, places unlike the others."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+
+import numpy as np
+import torch
+
+from tpgmm_datasets.checks.outliers import set_apart
+from tpgmm_datasets.checks.recording_summaries import RecordingSummary
+from tpgmm_torch import quaternions
+from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.data.arrays import Array, as_array
+
+__all__ = ["pose_findings"]
+
+#: Objects within this distance [m] or angle [rad] of the usual place are where others are.
+NEAR, ALIKE = 0.15, float(np.deg2rad(60.0))
+#: A tracker that jumps does so by this [m], at this speed [m/s], so many times its usual steps.
+JUMP, JUMP_SPEED, JUMP_STEPS = 0.1, 5.0, 10.0
+#: Of this many orientations the one that is nearest to the others is the usual one.
+MOST_COMPARED = 500
+
+
+def pose_findings(
+    episodes: Sequence[RecordingSummary], other_units: Collection[str]
+) -> Iterator[Finding]:
+    """Quaternion order, lost trackers, jumps, and places unlike the others.
+
+    Parameters
+    ----------
+    episodes : sequence of RecordingSummary
+    other_units : collection of str
+        Frames whose positions are not in metres: these say nothing more.
+    """
+    for name in episodes[0].frames:
+        if name not in other_units:
+            yield from _places(name, episodes)
+            yield from _angles(name, episodes)
+            yield from _jumps(name, episodes)
+        yield from _quaternion_order(name, episodes)
+
+
+def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Episodes in which the object is where it never is otherwise."""
+    first = np.stack([episode.frames[name].position for episode in episodes])
+    usual = np.median(first, axis=0)
+    distances = np.linalg.norm(first - usual, axis=1)
+    lost = np.flatnonzero((first == 0).all(axis=1))
+    odd = {*set_apart(distances, NEAR), *(lost.tolist() if len(lost) < len(first) / 2 else ())}
+    if odd:
+        within = float(np.delete(distances, [*odd]).max())
+        places = [
+            f"{distances[i]:.3g} m away in demonstration {i} "
+            f"({', '.join(f'{x:.3g}' for x in first[i])})"
+            for i in sorted(odd)
+        ]
+        yield Finding(
+            "frames",
+            f"frame {name!r} is usually within {within:.2g} m of "
+            f"({', '.join(f'{x:.3g}' for x in usual)}), but {listed(places)}",
+            "Was the object tracked, and in the same base frame? Leave the episode out",
+            (name,),
+            tuple(sorted(odd)),
+            float(distances[[*odd]].max()),
+        )
+
+
+def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Episodes in which the object is turned as it never is otherwise."""
+    turns = np.stack([episode.frames[name].orientation for episode in episodes])
+    some = turns[:MOST_COMPARED]
+    angles = 2 * np.arccos(np.abs(turns @ some.T).clip(max=1))
+    angles = angles[:, np.median(angles[: len(some)], axis=0).argmin()]
+    if odd := set_apart(angles, ALIKE):
+        places = [f"by {np.rad2deg(angles[i]):.0f} deg in demonstration {i}" for i in odd]
+        yield Finding(
+            "frames",
+            f"frame {name!r} is turned unlike in the others, {listed(places)}, usually within "
+            f"{np.rad2deg(np.delete(angles, odd).max()):.0f} deg",
+            "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out",
+            (name,),
+            tuple(odd),
+            float(angles[odd].max()),
+        )
+
+
+def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    leaps = {i: (*episode.leaps[name], episode.step) for i, episode in enumerate(episodes)}
+    odd = {
+        i: (size, at)
+        for i, (size, usual, at, step) in leaps.items()
+        if size > max(JUMP, JUMP_STEPS * usual, JUMP_SPEED * step)
+    }
+    if odd:
+        places = [
+            f"by {s:.3g} m at {at:.4g} s of demonstration {i}" for i, (s, at) in odd.items()
+        ]
+        yield Finding(
+            "frames",
+            f"frame {name!r} jumps {listed(places)}",
+            "Did the tracker lose it? Leave the episode out, or give one pose for all of it",
+            (name,),
+            tuple(odd),
+            max(size for size, _ in odd.values()),
+        )
+
+
+def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
+    """Half-turns that would be turns about the vertical, were w the last number."""
+    given = np.concatenate([episode.turns[name] for episode in episodes])
+    upright, spread = _upright(given)
+    meant, _ = _upright(np.roll(given, 1, axis=-1))
+    half_turns = np.median(np.abs(given[:, 0])) < 0.2
+    if spread > np.deg2rad(2) and meant > 0.97 and upright < 0.5 and half_turns:
+        yield Finding(
+            "quaternions",
+            f"frame {name!r} is turned by half turns about ever other axes; read as "
+            "(x, y, z, w), its quaternions are turns about the vertical",
+            "Quaternions are (w, x, y, z): give q[..., [3, 0, 1, 2]] "
+            "(load_lerobot: FramePose(..., rotation='xyzw'))",
+            (name,),
+            value=float(np.rad2deg(spread)),
+        )
+
+
+def _upright(orientations: Array) -> tuple[float, float]:
+    """Share of the scatter of orientations about the vertical axis, and its size [rad]."""
+    given = torch.from_numpy(orientations)
+    back = quaternions.conjugate(quaternions.mean(given))
+    squares = as_array(quaternions.log(quaternions.product(given, back))) ** 2
+    total = max(float(squares.sum()), 1e-12)
+    return float(squares[:, 2].sum() / total), float(np.sqrt(total / len(given)))

@@ -1,0 +1,84 @@
+"""Units, order, limits and speeds of joint vectors, with the names and numbers in messages."""
+
+import numpy as np
+import pytest
+import torch
+
+from tpgmm_datasets import check
+from tpgmm_torch import Demonstration, Poses
+from tpgmm_torch.robots.joint_space import JointSpace
+
+TIME = np.arange(100) / 50
+
+
+def bounded(*limits, velocity=3.0):
+    """Joints alone, with these limits."""
+    robot = JointSpace(tuple(f"j{i}" for i in range(len(limits))))
+    robot.lower, robot.upper = torch.tensor(limits, dtype=torch.float64).T
+    robot.velocity = torch.full((len(limits),), velocity, dtype=torch.float64)
+    return robot
+
+
+def found(robot, *scales, names=None):
+    path = np.sin(np.pi * TIME / 2)[:, None] * np.array(scales)
+    return list(
+        check([Demonstration(TIME, path + 0.01 * n, {}, names) for n in range(4)], robot)
+    )
+
+
+def test_joints_within_their_limits_are_plausible():
+    assert found(bounded((-1, 1), (-0.1, 2)), 0.9, 1.5) == []
+    assert found(None, 0.9, 12.0) == []
+
+
+def test_one_joint_in_degrees_is_an_error_for_all():
+    [finding] = found(bounded((-1, 1), (-1, 1)), 50.0, 0.5)
+    assert (finding.check, finding.impossible, finding.names) == ("units", True, ("j0",))
+    assert finding.value == pytest.approx(49, abs=0.1)
+    assert "whole joint vector" in finding.remedy
+
+
+def test_joints_beyond_their_limits_are_named():
+    robot = bounded((-1, 1), (-1, 1))
+    assert found(robot, 0.99, 0.5) == []
+    [finding] = found(robot, 1.4, 0.5)
+    assert finding.check == "limits" and not finding.impossible
+    assert "'j0' from 0 to 1.43, limits -1 to 1" in finding.message
+
+
+def test_an_order_that_fits_is_named_only_for_joints_without_names():
+    robot = bounded((-0.1, 0.5), (-0.1, 2.0))
+    [finding] = found(robot, 1.5, 0.3)
+    assert finding.check == "order" and "the columns [1, 0]" in finding.message
+    [finding] = found(robot, 1.5, 0.3, names=robot.joint_names)
+    assert finding.check == "limits"
+
+
+def test_speeds_beyond_the_robot_are_named_with_the_limit():
+    [finding] = found(bounded((-2, 2), velocity=0.5), 1.5)
+    assert finding.check == "speed" and finding.episodes == (0, 1, 2, 3)
+    assert finding.value == pytest.approx(1.5 * np.pi / 2 / 0.5, rel=1e-2)
+
+
+def test_grippers_may_be_in_any_unit():
+    assert found(None, 0.9, 100.0, names=("elbow", "gripper.pos")) == []
+    [finding] = found(None, 0.9, 100.0, names=("elbow", "wrist.pos"))
+    assert finding.check == "units" and finding.names == ("wrist.pos",)
+
+
+def test_tracked_hands_are_in_metres():
+    hand = Poses(("hand",), orientation=False)
+    assert found(hand, 0.5, 0.2, 0.1) == []
+    [finding] = found(hand, 11.0, 0.2, 0.1)
+    assert finding.check == "units" and finding.names == ("hand.x",)
+
+
+def test_a_stuck_joint_needs_others_that_move():
+    path = np.sin(TIME)[:, None]
+    items = [
+        Demonstration(TIME, np.hstack((path, path * (n != 2))) + 0.01 * n) for n in range(5)
+    ]
+    [finding] = (one for one in check(items) if one.check == "stuck")
+    assert (finding.episodes, finding.names) == ((2,), ("joint 1",))
+    idle = [Demonstration(TIME, np.hstack((path, 0 * path)) + 0.01 * n) for n in range(5)]
+    assert list(check(idle)) == []

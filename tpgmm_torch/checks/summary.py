@@ -1,0 +1,473 @@
+"""Summary of the demonstrations of a model, and the distance of a situation from them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.checks.report import Finding, listed
+from tpgmm_torch.checks.training import EpisodeSummary
+from tpgmm_torch.data.affine import Affine
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.pose_names import quaternion_groups
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = ["ALIKE", "FrameSummary", "Region", "TrainingSummary"]
+
+#: Situations that differ by less are the same: [rad or m], [m], [rad].
+ALIKE = {"start": 0.02, "place": 0.01, "turn": 0.05}
+#: Of fewer demonstrations the spread is not known, and taken for this standard deviation.
+FEWEST, SPREAD = 3, {"start": 0.2, "place": 0.05, "turn": float(np.deg2rad(20.0))}
+#: The distance of the furthest of demonstrations that hardly differ is at least this (1 is the
+#: edge of their region).
+SMALLEST_LIMIT = 0.5
+#: So many demonstrations, evenly chosen, are left out one at a time: more take long.
+MOST_LEFT_OUT = 200
+#: A situation is unlikely beyond this novelty: of generated situations like the demonstrations,
+#: 2 % are with 3 to 6 demonstrations, and less than 0.1 % with 8 or more.
+UNLIKELY = 1.5
+#: A frame is at a link if it differs by less, the rounding of float32 [m, 1].
+ROUNDING = 1e-5
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where new vectors like those of the demonstrations are expected.
+
+    Parameters
+    ----------
+    mean : sequence of float
+        Of shape (D,).
+    covariance : sequence of sequence of float
+        Of a new vector (D, D).
+    """
+
+    mean: Sequence[float]
+    covariance: Sequence[Sequence[float]]
+
+    @classmethod
+    def of(cls, vectors: Array, kind: str, fewest: int = FEWEST) -> Self:
+        """Estimate the region of vectors (N, D), of start postures, places or turns.
+
+        The covariance S of N - 1 degrees of freedom is joined with D of a round one of the same
+        size, so that directions in which few demonstrations do not differ are not taken for
+        certain: ``(1 + 1/N) ((D s^2 I + (N - 1) S) / (D + N - 1) + a^2 I)``,
+        ``s^2 = tr(S) / D``, a from ``ALIKE``. Of less than ``fewest`` vectors it is ``SPREAD``.
+        """
+        n, d = vectors.shape
+        mean = vectors.mean(axis=0)
+        if n < fewest:
+            return cls(mean.tolist(), (SPREAD[kind] ** 2 * np.eye(d)).tolist())
+        scatter = (vectors - mean).T @ (vectors - mean)  # (N - 1) S
+        size = np.trace(scatter) / (n - 1)  # D s^2
+        covariance = (size * np.eye(d) + scatter) / (d + n - 1) + ALIKE[kind] ** 2 * np.eye(d)
+        return cls(mean.tolist(), ((1 + 1 / n) * covariance).tolist())
+
+    def distance(self, vectors: Array) -> Array:
+        """Mahalanobis distance of vectors (..., D), about 1 at the edge of the likely.
+
+        ``sqrt(d^2 / (D + 2 sqrt(2 D)))``: d^2 of D numbers has about the mean D, and the
+        standard deviation sqrt(2 D).
+        """
+        d = len(self.mean)
+        offset = vectors - np.array(self.mean)
+        precision = np.linalg.inv(np.array(self.covariance).reshape(d, d))
+        squared = np.einsum("...i,ij,...j->...", offset, precision, offset)
+        distance: Array = np.sqrt(squared / (d + 2 * np.sqrt(2 * d)))
+        return distance
+
+
+@dataclass(frozen=True)
+class FrameSummary:
+    """Poses of a frame in the demonstrations.
+
+    Parameters
+    ----------
+    low, high : sequence of float
+        Range of its position, x, y, z, at all times [m].
+    orientation : sequence of float
+        Mean of its first orientations (w, x, y, z).
+    angle : float
+        The largest angle between a first orientation and their mean [rad].
+    place, turn : Region
+        Of its first positions [m], and of the rotation vectors from ``orientation`` [rad].
+    moves : bool
+        Whether it moved in a demonstration: it counts where it is at the beginning.
+    link : str or None
+        The link of the robot that was there at the start of every demonstration: the frame of
+        a new situation then follows from its start posture.
+    """
+
+    low: Sequence[float]
+    high: Sequence[float]
+    orientation: Sequence[float]
+    angle: float
+    place: Region
+    turn: Region
+    moves: bool = False
+    link: str | None = None
+
+    def rotation_vectors(self, orientations: Array) -> Array:
+        """Rotation vectors [rad] from the mean to orientations (..., 4), the shorter way."""
+        mean = torch.tensor(self.orientation, dtype=torch.float64)
+        given = torch.from_numpy(np.array(orientations))
+        turns = quaternions.product(quaternions.conjugate(mean), given)
+        return as_array(quaternions.log(turns))
+
+
+@dataclass(frozen=True)
+class TrainingSummary:
+    """Start postures and frames of the demonstrations of a model, and the novelty of others.
+
+    Parameters
+    ----------
+    n_demonstrations : int
+    joint_names : tuple of str
+    start_low, start_high : sequence of float
+        Range of the start postures [rad or m].
+    compared : sequence of int
+        Columns of the joints that are compared: those that are not parts of a quaternion.
+    start : Region
+        Of the compared joints of start postures [rad or m].
+    limit : float
+        The largest distance of a demonstration from the others: the unit of novelty.
+    frames : mapping of str to FrameSummary
+    events : mapping of str to float
+        Median times of events that all demonstrations have, as shares of the duration.
+    """
+
+    n_demonstrations: int
+    joint_names: tuple[str, ...]
+    start_low: Sequence[float]
+    start_high: Sequence[float]
+    compared: Sequence[int]
+    start: Region
+    limit: float
+    frames: Mapping[str, FrameSummary]
+    events: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        return (
+            f"TrainingSummary({self.n_demonstrations} demonstrations, "
+            f"frames={sorted(self.frames)})"
+        )
+
+    @classmethod
+    def of(cls, episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Self:
+        """Summarise demonstrations.
+
+        Parameters
+        ----------
+        episodes : sequence of EpisodeSummary
+            With their joints in the order of the kinematics.
+        kinematics : Kinematics
+        """
+        starts = np.stack([episode.start for episode in episodes])
+        state = kinematics.state(starts)
+        links = {link: state.pose(link) for link in kinematics.links}
+        angular = {i for s in kinematics.quaternion_starts for i in range(s, s + 4)}
+        angular |= {i for group in quaternion_groups(kinematics.joint_names) for i in group}
+        compared = [i for i in range(kinematics.n_joints) if i not in angular]
+        vectors = {("start", ""): starts[:, compared]}
+        frames = {}
+        for name in episodes[0].frames:
+            paths = [episode.frames[name] for episode in episodes]
+            places = np.stack([path.position for path in paths])
+            turns = np.stack([path.orientation for path in paths])
+            # the eigenvector of sum q q^T: F. L. Markley et al., Averaging Quaternions,
+            # Journal of Guidance, Control, and Dynamics 30 (2007), eq. (12)
+            mean = np.linalg.eigh(turns.T @ turns)[1][:, -1]
+            place = Region.of(places, "place")
+            bare = FrameSummary([], [], mean.tolist(), 0.0, place, place)
+            rotations = bare.rotation_vectors(turns)
+            vectors["place", name], vectors["turn", name] = places, rotations
+            first = Frame(places, turns)
+            fixed = not any(path.recorded for path in paths)
+            same = [n for n, pose in links.items() if fixed and _same(pose, first)]
+            frames[name] = FrameSummary(
+                np.min([path.low for path in paths], axis=0).tolist(),
+                np.max([path.high for path in paths], axis=0).tolist(),
+                bare.orientation,
+                float(np.linalg.norm(rotations, axis=-1).max()),
+                place,
+                Region.of(rotations, "turn"),
+                any(path.moves for path in paths),
+                same[0] if same else None,
+            )
+        return cls(
+            len(episodes),
+            tuple(kinematics.joint_names),
+            starts.min(axis=0).tolist(),
+            starts.max(axis=0).tolist(),
+            compared,
+            Region.of(vectors["start", ""], "start"),
+            _largest_distance(vectors),
+            frames,
+            {
+                name: float(np.median([episode.events[name] for episode in episodes]))
+                for name in episodes[0].events
+                if all(name in episode.events for episode in episodes)
+            },
+        )
+
+    def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
+        """How far situations are from the demonstrations, in units of the furthest of these.
+
+        It is the 4-norm of the distances of the start posture, of each frame's position and of
+        each frame's orientation from their regions, there where the skill begins, divided by
+        ``limit``, the largest such distance of a demonstration from the region of the others.
+        Of N + 1 situations of one kind the new one is the furthest with the chance 1 / (N + 1):
+        about so often, or less, novelty is above 1 for what is like the demonstrations.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints), optional
+            Start postures; one with NaN does not count.
+        frames : mapping of str to Frame, optional
+            Of shapes that broadcast with the joints, where the skill begins; those that were
+            not in the demonstrations do not count.
+
+        Returns
+        -------
+        array of shape (...)
+            From 0 on.
+        """
+        return _joined(self._distances(joints, frames or {}).values()) / self.limit
+
+    def start_frames(
+        self, joints: Any, kinematics: Kinematics, given: Collection[str] = ()
+    ) -> dict[str, Frame]:
+        """The frames that follow from a start posture: the poses of links at the start.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints)
+            Start postures.
+        kinematics : Kinematics
+        given : collection of str
+            Frames that are known.
+
+        Returns
+        -------
+        dict of str to Frame
+            Of shape (...).
+        """
+        links = {
+            name: frame.link
+            for name, frame in self.frames.items()
+            if frame.link is not None and name not in given
+        }
+        if not links:
+            return {}
+        state = kinematics.state(joints)
+        return {name: state.pose(link) for name, link in links.items()}
+
+    def findings(
+        self, joints: Any, frames: Mapping[str, Frame], label: str = ""
+    ) -> list[Finding]:
+        """Name the coordinates of one situation that make it unlike the demonstrations.
+
+        Parameters
+        ----------
+        joints : array-like of shape (n_joints,), or None
+            The start posture.
+        frames : mapping of str to Frame
+            Each one pose.
+        label : str, default=""
+            Before each name in the messages, for example ``"situation 2, "``.
+
+        Returns
+        -------
+        list of Finding
+            Empty where the novelty is at most 1.5.
+        """
+        distances = self._distances(joints, frames)
+        if not _joined(distances.values()) / self.limit > UNLIKELY:
+            return []
+        ratios = {key: float(value) / self.limit for key, value in distances.items()}
+        least = min(UNLIKELY, max(ratios.values()))
+        describe = {"start": self._start, "place": self._place, "turn": self._turn}
+        return [
+            Finding(kind, f"{label}{message}", remedy, names or (name,), value=ratio)
+            for (kind, name), ratio in ratios.items()
+            if ratio >= least
+            for message, remedy, names in [describe[kind](name, joints, frames.get(name))]
+        ]
+
+    def config(self) -> dict[str, Any]:
+        """All of it, ready for JSON."""
+        return asdict(self) | {"joint_names": list(self.joint_names)}
+
+    @classmethod
+    def from_config(
+        cls, config: Mapping[str, Any], kinematics: Kinematics | None = None
+    ) -> Self:
+        """The inverse of :meth:`config`, for a model of these kinematics.
+
+        Raises
+        ------
+        DataError
+            If a field is missing or unknown, is of another type or shape, or is no such number.
+        """
+        try:
+            fields = dict(config)
+            fields["joint_names"] = tuple(fields["joint_names"])
+            fields["start"] = Region(**fields["start"])
+            fields["frames"] = {
+                name: FrameSummary(**frame | {k: Region(**frame[k]) for k in ("place", "turn")})
+                for name, frame in fields["frames"].items()
+            }
+            summary = cls(**fields)
+            problem = _problem(summary, kinematics)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            problem = f"{type(error).__name__}: {error}"
+        if problem:
+            raise DataError(f"the summary of the demonstrations is damaged: {problem}")
+        return summary
+
+    def _distances(
+        self, joints: Any, frames: Mapping[str, Frame]
+    ) -> dict[tuple[str, str], Array]:
+        """Distances (...) of situations from each region, by its kind and frame."""
+        found: dict[tuple[str, str], Array] = {}
+        if joints is not None and len(self.compared):
+            found["start", ""] = self.start.distance(_rows(joints)[..., list(self.compared)])
+        for name, frame in frames.items():
+            if name in self.frames and not isinstance(frame, Affine):
+                known = self.frames[name]
+                found["place", name] = known.place.distance(as_array(frame.position))
+                turn = known.rotation_vectors(as_array(frame.orientation))
+                found["turn", name] = known.turn.distance(turn)
+        return found
+
+    def _start(self, name: str, joints: Any, frame: Any) -> tuple[str, str, tuple[str, ...]]:
+        bounds = np.stack((self.start_low, self.start_high, _rows(joints)))[:, self.compared]
+        low, high, values = bounds
+        names = [self.joint_names[i] for i in self.compared]
+        outside, odd = _outside(names, low, high, values)
+        remedy = (
+            "Is it in radians and in the order of the model's joint_names? Start nearer, or "
+            "show the skill from there"
+        )
+        return f"start posture: {outside} rad (or m)", remedy, odd
+
+    def _place(self, name: str, joints: Any, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
+        low, high = np.array(self.frames[name].low), np.array(self.frames[name].high)
+        outside, _ = _outside("xyz", low, high, as_array(frame.position))
+        remedy = "Is it in metres, in the same base frame? Else show the skill there too"
+        return f"{name}: {outside} m", remedy, ()
+
+    def _turn(self, name: str, joints: Any, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
+        known, orientation = self.frames[name], as_array(frame.orientation)
+        angle = np.linalg.norm(known.rotation_vectors(orientation))
+        swapped = known.rotation_vectors(np.roll(orientation, 1))  # as if it were (x, y, z, w)
+        remedy = "Is the quaternion (w, x, y, z)? Else show the skill so too"
+        if known.turn.distance(swapped) <= UNLIKELY * self.limit:
+            remedy = "Read as (x, y, z, w) it would fit: quaternions are (w, x, y, z)"
+        return (
+            f"{name}: turned by {np.rad2deg(angle):.0f} deg from the mean, shown up to "
+            f"{np.rad2deg(known.angle):.0f}",
+            remedy,
+            (),
+        )
+
+
+def _largest_distance(vectors: Mapping[tuple[str, str], Array]) -> float:
+    """The largest distance of a demonstration from the regions of the others."""
+    n = len(vectors["start", ""])
+    if n < FEWEST:
+        return 1.0
+    tried = np.unique(np.linspace(0, n - 1, min(n, MOST_LEFT_OUT)).round().astype(int))
+    distances = [
+        _joined(
+            Region.of(np.delete(given, i, axis=0), kind, fewest=2).distance(given[i])
+            for (kind, _), given in vectors.items()
+            if given.shape[1]
+        )
+        for i in tried
+    ]
+    return max(SMALLEST_LIMIT, *map(float, distances))
+
+
+def _joined(distances: Iterable[Array]) -> Array:
+    """The 4-norm of distances that broadcast; NaN does not count.
+
+    It is nearly the largest, and more where several are large.
+    """
+    total = np.zeros(())
+    for distance in distances:
+        total = total + np.where(np.isnan(distance), 0.0, distance) ** 4
+    joined: Array = total ** (1 / 4)
+    return joined
+
+
+def _rows(joints: Any) -> Array:
+    return as_array(torch.as_tensor(joints))
+
+
+def _same(pose: Frame, other: Frame) -> bool:
+    """Whether poses (N,) are equal up to rounding."""
+    turn = quaternions.match_hemisphere(
+        other.orientation.to(pose.orientation), pose.orientation
+    )
+    differences = as_array(pose.position - other.position), as_array(pose.orientation - turn)
+    return all(bool((np.abs(one) < ROUNDING).all()) for one in differences)
+
+
+def _outside(
+    names: Sequence[str], low: Array, high: Array, values: Array
+) -> tuple[str, tuple[str, ...]]:
+    """Description and names of the coordinates that are outside a range, the furthest first."""
+    excess = np.maximum(low - values, values - high)
+    odd = [i for i in np.argsort(-excess) if excess[i] > 0]
+    places = [f"{names[i]} = {values[i]:.4g}, shown {low[i]:.4g} to {high[i]:.4g}" for i in odd]
+    beside = f"beside those shown, at {', '.join(f'{x:.3g}' for x in values)}"
+    return listed(places) or beside, tuple(names[i] for i in odd)
+
+
+def _problem(summary: TrainingSummary, kinematics: Kinematics | None) -> str:
+    """Why a summary cannot be of a model of these kinematics; empty if it can."""
+    names, compared, frames = summary.joint_names, [*summary.compared], summary.frames
+    linked = {frame.link for frame in frames.values()} - {None}
+    n = len(names)
+    regions = {"start": (summary.start, len(compared))}
+    numbers: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "n_demonstrations": (summary.n_demonstrations, ()),
+        "limit": (summary.limit, ()),
+        "start_low": (summary.start_low, (n,)),
+        "start_high": (summary.start_high, (n,)),
+        "compared": (compared, (len(compared),)),
+    }
+    for name, frame in frames.items():
+        sizes = {"low": (3,), "high": (3,), "orientation": (4,), "angle": ()}
+        numbers |= {f"{name}.{field}": (getattr(frame, field), sizes[field]) for field in sizes}
+        regions |= {f"{name}.place": (frame.place, 3), f"{name}.turn": (frame.turn, 3)}
+    for name, (region, d) in regions.items():
+        numbers[f"{name}.mean"] = region.mean, (d,)
+        numbers[f"{name}.covariance"] = region.covariance, (d, d) if d else (0,)
+    numbers |= {f"event {name}": (at, ()) for name, at in summary.events.items()}
+    for name, (value, shape) in numbers.items():
+        array = np.asarray(value)
+        numeric = array.dtype.kind in "iuf" or not array.size
+        if not numeric or array.shape != shape or not np.isfinite(array).all():
+            return f"{name} is {str(value)[:60]}"
+        square = array.ndim == 2
+        if square and (not np.allclose(array, array.T) or np.linalg.eigvalsh(array)[0] <= 0):
+            return f"{name} is not symmetric and positive definite"
+    possible = {
+        "joint_names": kinematics is None or names == tuple(kinematics.joint_names),
+        "link": kinematics is None or linked <= {*kinematics.links},
+        "n_demonstrations": summary.n_demonstrations >= 1,
+        "limit": summary.limit > 0,
+        "compared": len({*compared} & {*range(n)}) == len(compared),
+        "moves": all(type(frame.moves) is bool for frame in frames.values()),
+        "events": all(0 <= at <= 1 for at in summary.events.values()),
+    }
+    return ", ".join(f"{name} cannot be so" for name, fits in possible.items() if not fits)

@@ -1,0 +1,329 @@
+"""Check of demonstrations by ``fit``: units, one clock, enough of them, objects held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.data.affine import Affine
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import carried_objects, frame_names
+from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots.kinematics import Kinematics
+
+__all__ = [
+    "FAR",
+    "IMPOSSIBLE",
+    "EpisodeSummary",
+    "PathSummary",
+    "check",
+    "summarize",
+    "unit_findings",
+]
+
+#: Nothing turns a joint so far beyond its limits [rad]: the values are in another unit.
+IMPOSSIBLE = 2 * math.pi
+#: Nothing that a robot handles is so far from its base [m].
+FAR = 10.0
+#: No robot is recorded so slowly [s]; a set in milliseconds, or in numbers of frames, is.
+SLOWEST_STEP = 0.5
+#: Demonstrations on one clock begin together and last equally, up to this share.
+ONE_CLOCK = 0.05
+#: What moves by less stands still [m], [rad]: the noise of trackers.
+STILL, STILL_ANGLE = 0.02, 0.1
+
+
+@dataclass(frozen=True)
+class PathSummary:
+    """Poses of a frame in one demonstration.
+
+    Parameters
+    ----------
+    position, orientation : array of shape (3,), (4,)
+        The first.
+    low, high : array of shape (3,)
+        Range of the position [m].
+    moves : bool
+        Whether it moves by more than a tracker's noise.
+    recorded : bool
+        Whether there is a pose for each time step.
+    """
+
+    position: Array
+    orientation: Array
+    low: Array
+    high: Array
+    moves: bool
+    recorded: bool
+
+    @classmethod
+    def of(cls, frame: Frame) -> PathSummary:
+        """Summarise a frame."""
+        positions = np.atleast_2d(as_array(frame.position))
+        first = frame[0] if frame.batch_shape else frame
+        return cls(
+            positions[0],
+            as_array(first.orientation),
+            positions.min(axis=0),
+            positions.max(axis=0),
+            bool((first.change(frame, STILL, STILL_ANGLE) > 1).any()),
+            bool(frame.batch_shape),
+        )
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """What the checks and the summary of a model need of one demonstration, of any length.
+
+    Parameters
+    ----------
+    begin, duration, step : float
+        When it begins, its length, and its median step of time [s].
+    joint_names : tuple of str or None
+    start, low, high : array of shape (n_joints,)
+        Start posture, and range of each joint.
+    frames : mapping of str to PathSummary
+        Those that are poses.
+    events : mapping of str to float
+        As shares of the duration.
+    """
+
+    begin: float
+    duration: float
+    step: float
+    joint_names: tuple[str, ...] | None
+    start: Array
+    low: Array
+    high: Array
+    frames: Mapping[str, PathSummary]
+    events: Mapping[str, float]
+
+    @classmethod
+    def of(cls, demonstration: Demonstration) -> EpisodeSummary:
+        """Summarise a demonstration."""
+        time, joints = as_array(demonstration.time), as_array(demonstration.joints)
+        begin, duration = float(time[0]), float(time[-1] - time[0])
+        return cls(
+            begin,
+            duration,
+            float(np.median(np.diff(time))) if len(time) > 1 else 0.0,
+            demonstration.joint_names,
+            joints[0],
+            joints.min(axis=0),
+            joints.max(axis=0),
+            {
+                name: PathSummary.of(frame)
+                for name, frame in demonstration.frames.items()
+                if not isinstance(frame, Affine)  # which is no pose
+            },
+            {
+                name: (at - begin) / duration if duration else 0.0
+                for name, at in demonstration.events.items()
+            },
+        )
+
+
+def summarize(
+    demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
+) -> list[EpisodeSummary]:
+    """Summaries of demonstrations, with the joints in the order of the kinematics.
+
+    Raises
+    ------
+    ShapeError, UnknownNameError
+        If a joint of the robot is missing.
+    """
+    return [EpisodeSummary.of(one) for one in in_order(demonstrations, kinematics)]
+
+
+def in_order(
+    demonstrations: Sequence[Demonstration], kinematics: Kinematics | None
+) -> list[Demonstration]:
+    """Demonstrations with the joints of the kinematics, in its order.
+
+    Raises
+    ------
+    ShapeError, UnknownNameError
+        If a joint of the robot is missing.
+    """
+    if kinematics is None:
+        return list(demonstrations)
+    names, n = kinematics.joint_names, kinematics.n_joints
+    for index, one in enumerate(demonstrations):
+        if one.n_joints < n or (one.n_joints > n and one.joint_names is None):
+            raise ShapeError(
+                f"demonstration {index} has {one.n_joints} joints, the robot has {n}: {names}"
+            )
+    return [one.reordered(names) for one in demonstrations]
+
+
+def check(
+    episodes: Sequence[EpisodeSummary],
+    kinematics: Kinematics,
+    operators: Sequence[Operator] = (),
+    holds: Sequence[Hold] = (),
+    *,
+    correlated: bool = False,
+) -> Report:
+    """Check demonstrations that are to be learned from.
+
+    Joints beyond their limits by more than a turn are an error. Unlikely are joints and frames
+    in other units, time in other units, demonstrations that are not on one clock, one or two
+    demonstrations, and operators of objects that nothing holds.
+
+    Parameters
+    ----------
+    episodes : sequence of EpisodeSummary
+        As :func:`summarize` gives them.
+    kinematics : Kinematics
+    operators : sequence of Operator
+        What is learned.
+    holds : sequence of Hold
+        What links carry.
+    correlated : bool, default=False
+        Whether correlations of coordinates are learned without shrinkage.
+    """
+    findings = [
+        *unit_findings(episodes, kinematics),
+        *_clock(episodes),
+        *_freedom(len(episodes), operators, kinematics, correlated),
+        *_carried(operators, kinematics, holds),
+    ]
+    count = len(episodes)
+    return Report.of(findings, f"{count} demonstration{'s' if count > 1 else ''}")
+
+
+def unit_findings(
+    episodes: Sequence[EpisodeSummary], kinematics: Kinematics | None
+) -> Iterator[Finding]:
+    """Joints that cannot be radians, frames that can hardly be metres, time not in seconds.
+
+    Parameters
+    ----------
+    episodes : sequence of EpisodeSummary
+    kinematics : Kinematics or None
+        Whose limits hold; optional in effect.
+    """
+    low = np.min([episode.low for episode in episodes], axis=0)
+    high = np.max([episode.high for episode in episodes], axis=0)
+    names = episodes[0].joint_names or tuple(f"joint {i}" for i in range(len(low)))
+    lower: Array = np.full(len(low), np.nan)
+    upper = lower
+    if kinematics is not None:
+        names = kinematics.joint_names
+        lower, upper = as_array(kinematics.lower), as_array(kinematics.upper)
+    excess = np.fmax(lower - low, high - upper)
+    beyond = [int(i) for i in np.argsort(-excess) if excess[i] > IMPOSSIBLE]
+    if beyond:
+        places = [
+            f"{names[i]!r} from {low[i]:.4g} to {high[i]:.4g}, limits {lower[i]:.4g} to "
+            f"{upper[i]:.4g}"
+            for i in beyond
+        ]
+        yield Finding(
+            "units",
+            "joints are in radians (metres, where they slide), these cannot be: "
+            f"{listed(places)}",
+            "Are they in degrees? If one joint is, all are: convert the whole joint vector "
+            "(np.deg2rad; load_lerobot(..., units='deg'); --units deg)",
+            tuple(names[i] for i in beyond),
+            value=float(excess[beyond[0]]),
+            impossible=True,
+        )
+    for name in episodes[0].frames:
+        first = [one.frames[name].position for one in episodes if name in one.frames]
+        distance = float(np.median(np.linalg.norm(first, axis=1)))
+        if distance > FAR:
+            yield Finding(
+                "units",
+                f"frame {name!r} is {distance:.4g} m away from the base of the robot",
+                "Positions are in metres: are these in millimetres or centimetres? "
+                "(load_lerobot: FramePose(..., scale=0.001))",
+                (name,),
+                value=distance,
+            )
+    step = float(np.median([episode.step for episode in episodes]))
+    if step >= SLOWEST_STEP:
+        yield Finding(
+            "time",
+            f"time is in seconds, and a typical step of it is {step:.3g} s",
+            "Is it in milliseconds, or numbers of frames? Convert it",
+            value=step,
+        )
+
+
+def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
+    """Demonstrations that show different things at one time."""
+    durations = np.array([episode.duration for episode in episodes])
+    begins = np.array([episode.begin for episode in episodes])
+    tolerance = ONE_CLOCK * float(np.median(durations))
+    values, message = (
+        durations,
+        "last from {:.4g} to {:.4g} s: at one time they show other things",
+    )
+    if np.ptp(durations) <= tolerance:
+        values, message = begins, "begin at different times, from {:.6g} to {:.6g} s"
+    if np.ptp(values) > tolerance:
+        yield Finding(
+            "alignment",
+            f"the demonstrations {message.format(values.min(), values.max())}",
+            "Let each begin at 0, and align them: "
+            "DynamicTimeWarping().fit_transform(demonstrations)",
+            value=float(np.ptp(values)),
+        )
+
+
+def _freedom(
+    count: int, operators: Sequence[Operator], kinematics: Kinematics, correlated: bool
+) -> Iterator[Finding]:
+    """Too few demonstrations to tell what may vary, and what varies together."""
+    widest = max((operator.dimension(kinematics) for operator in operators), default=0)
+    placed = widest > 2 and frame_names(operators, kinematics)
+    remedy = "Show the skill 5 times or more, from other starts and places"
+    if count == 1:
+        message = "one demonstration does not show what may vary"
+        yield Finding("freedom", message, remedy, value=1.0)
+    elif count == 2 and correlated and placed:
+        yield Finding(
+            "freedom",
+            f"two demonstrations differ in one direction, and the covariances of {widest} "
+            "coordinates would have to tell all apart",
+            f"{remedy}, or learn with covariance_shrinkage='auto'",
+            value=2.0,
+        )
+
+
+def _carried(
+    operators: Sequence[Operator], kinematics: Kinematics, holds: Sequence[Hold]
+) -> Iterator[Finding]:
+    """Operators that constrain no joint: the objects they are about never move with a link."""
+    links = {*kinematics.links}
+    moved = links.union(hold.frame for hold in holds)
+    inactive = [
+        operator
+        for operator in leaves(operators)
+        if operator.links()
+        and moved.isdisjoint(operator.links())
+        and links.isdisjoint(operator.references())
+    ]
+    if inactive:
+        names = carried_objects(inactive, kinematics)
+        texts = [format_operator(operator) for operator in inactive]
+        yield Finding(
+            "holds",
+            f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
+            f"Say who holds what, holds=[Hold({names[0]!r}, LINK, BEGIN, END)] "
+            f"(--hold {names[0]}@LINK:BEGIN-END), or leave such operators out; holds='auto' "
+            "finds them where poses of objects are recorded over time",
+            names,
+        )
