@@ -106,13 +106,13 @@ def test_the_mode_is_one_that_was_shown_in_situations_like_this():
         moved = copy.copy(model)
         moved.models_ = [copy.copy(one) for one in model.models_]
         shown_by_it = moved.models_[mode].summary_
-        novelty = shown_by_it.novelty
-        elsewhere = {
-            name: replace(place, mean=[x + 5 for x in place.mean])
-            for name, place in novelty.places.items()
+        frames = {
+            name: replace(
+                frame, place=replace(frame.place, mean=[x + 5 for x in frame.place.mean])
+            )
+            for name, frame in shown_by_it.frames.items()
         }
-        novelty = replace(novelty, places=elsewhere)
-        moved.models_[mode].summary_ = replace(shown_by_it, novelty=novelty)
+        moved.models_[mode].summary_ = replace(shown_by_it, frames=frames)
         assert moved.choose(situation)[0].mode == 1 - mode
 
 
