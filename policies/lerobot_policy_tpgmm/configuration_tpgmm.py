@@ -436,7 +436,7 @@ class TPGMMConfig(StatePolicyConfig):
         limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
         return {
             "clock": parse_clock(self.clock),
-            "trust": Trust(patience=self.patience, frame_patience=self.frame_patience),
+            "trust": Trust(joint_timeout=self.patience, frame_timeout=self.frame_patience),
             "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
             "feedback": "measured" if self.feedback == "observation" else "reference",
             "bounds": {name: limit for name, limit in limits.items() if limit is not None},

@@ -376,7 +376,7 @@ class Controller:
         other = moment.copy()
         other._inputs = self._inputs
         if self._inputs is not None and passed > 0:
-            other._inputs = self._inputs.hear(passed, joints, frames)
+            other._inputs = self._inputs.update(passed, joints, frames)
             other._frames = other._inputs.frames
         return other
 
@@ -427,7 +427,7 @@ class Controller:
                 self._frames = self._converted(frames)
             return self._checked(joints), None
         dt = dt if self.command else np.maximum(dt, 1e-3)
-        self._inputs = inputs = self._inputs.hear(dt, joints, frames, ages)
+        self._inputs = inputs = self._inputs.update(dt, joints, frames, ages)
         self._frames = inputs.frames
         untrusted = inputs.untrusted()
         halted = None if untrusted is None else torch.as_tensor(untrusted)

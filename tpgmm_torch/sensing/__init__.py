@@ -1,1 +1,1 @@
-"""What a running skill is told, and what it believes of it."""
+"""Readings of a running skill: which are used, filtered, and when they are too old."""

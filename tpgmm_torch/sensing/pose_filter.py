@@ -1,9 +1,9 @@
-"""Observed poses of objects without their noise: the 1-euro filter on positions and turns."""
+"""The 1-euro filter on observed poses of objects."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -24,8 +24,8 @@ class OneEuro:
 
         ``cutoff (1 + (noise / n)^2) + slope * speed``.
 
-    What is seen without noise passes unchanged: n is the median of the last second differences
-    of the pose, which neither a motion nor a jump adds to.
+    A pose without noise passes unchanged: n is the median of the last second differences of the
+    pose, which neither a motion nor a jump adds to.
 
     Parameters
     ----------
@@ -102,25 +102,24 @@ class PoseFilter:
     share: float | Floats = 1.0
 
     @classmethod
-    def of(cls, settings: OneEuro, pose: Floats) -> Self:
-        """Begin with a pose as it is."""
+    def first(cls, settings: OneEuro, pose: Floats) -> Self:
+        """A filter that has seen one ``pose`` (..., 7)."""
         zero = np.zeros_like(pose)
         return cls(settings, pose, zero, zero, pose, np.zeros((MEMORY, *pose.shape[:-1])))
 
-    def see(self, pose: Floats, dt: float | Floats) -> Self:
-        """What is known after one more ``pose``, ``dt`` seconds later.
+    def update(self, pose: Floats, dt: float | Floats) -> Self:
+        """The filter after one more ``pose`` (..., 7), ``dt`` seconds later.
 
         Its quaternion may be on either side; ``dt`` may be one of each robot, shape (...).
         """
         settings = self.settings
         if math.isinf(settings.cutoff):
-            return self._with(pose=pose, last=pose)
+            return replace(self, pose=pose, last=pose)
         if (pose == self.last).all() and not (self.change.any() or self.history.any()):
             return self
-        side = np.einsum("...i,...i", pose[..., 3:], self.pose[..., 3:])
-        if not (side > 0).all():
-            turn = np.copysign(pose[..., 3:], side[..., None] * pose[..., 3:])
-            pose = np.concatenate((pose[..., :3], turn), -1)
+        side = np.einsum("...i,...i", pose[..., 3:], self.pose[..., 3:])[..., None]
+        turn = np.copysign(1.0, side) * pose[..., 3:]
+        pose = np.concatenate((pose[..., :3], turn), -1)
         change = pose - self.last
         bend = np.square(change - self.change) @ METRIC
         history = np.concatenate((self.history[1:], bend[None]))
@@ -136,20 +135,14 @@ class PoseFilter:
         out = self.pose + share[..., None] * (pose - self.pose)
         turn = out[..., 3:]
         out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
-        # what passes whole passes bit for bit
+        # a pose without noise passes bit for bit
         out = np.where(share[..., None] == 1, pose, out)
-        return self._with(
-            pose=out, velocity=velocity, change=change, last=pose, history=history,
+        return replace(
+            self, pose=out, velocity=velocity, change=change, last=pose, history=history,
             share=share,
         )  # fmt: skip
 
-    def _with(self, **changes: Floats) -> Self:
-        """``dataclasses.replace`` without its checks, which take as long as the filter."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__, **changes)
-        return other
-
 
 def _share(cutoff: float | Floats, dt: float | Floats) -> Any:
-    """Of the new value, in a first-order low pass."""
+    """Share of the new value in a first-order low pass."""
     return 1 / (1 + 1 / (2 * math.pi * cutoff * dt))

@@ -152,7 +152,7 @@ def watched(problem: Problem, robots: slice | int = slice(None), **options) -> C
         "end": 0.2 + LAST,
         "blend": 0.3,
         "bounds": MotionBounds.of(regression.kinematics, acceleration=20.0, jerk=2000.0),
-        "trust": Trust(frame_patience=0.2),
+        "trust": Trust(frame_timeout=0.2),
     }
     return Controller(
         regression, problem.state.joints[robots], frames, **{**defaults, **options}
@@ -177,7 +177,7 @@ def test_a_robot_that_knows_nothing_stands_until_it_does(lost):
         statuses.append(command.status)
     assert [robot[0] for robot in statuses] == ["running"] * 100
     held = [k for k in range(100) if statuses[k][1] == "holding"]
-    assert held == list(range(50, 70))  # after 0.2 s of patience
+    assert held == list(range(50, 70))  # after 0.2 s
     assert float(speeds[69][1]) < 1e-6 < float(speeds[69][0])
     assert "is missing or not finite" in watched_reason(problem, lost)
     # it has lost the time for which it stood

@@ -1,12 +1,11 @@
-"""Readings that are believed, and those that are not."""
+"""Readings that are accepted, and those that are not."""
 
 import numpy as np
 import pytest
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.sensing.trust import (
-    BELIEVED,
-    DEGREES,
+    ACCEPTED,
     IMPOSSIBLE,
     JUMPED,
     LOST,
@@ -16,33 +15,38 @@ from tpgmm_torch.sensing.trust import (
     Trust,
 )
 
+DEGREES = np.degrees(1.0)
 DT = 0.02
 TRUST = Trust()
-LIMITS = (np.array([-2.0, -1.0]), np.array([2.0, 1.0]), np.array([1.0, 2.0]))
+LIMITS = {
+    "lower": np.array([-2.0, -1.0]),
+    "upper": np.array([2.0, 1.0]),
+    "velocity": np.array([1.0, 2.0]),
+}
 START = np.array([0.5, -0.3])
 POSE = np.array([0.4, 0.1, 0.2, 1.0, 0.0, 0.0, 0.0])
 
 
 def joints(value=START) -> JointReading:
-    return JointReading.of(TRUST, value, LIMITS)
+    return JointReading.first(TRUST, value, **LIMITS)
 
 
 def turned(angle: float) -> np.ndarray:
     return np.array([*POSE[:3], np.cos(angle / 2), np.sin(angle / 2), 0.0, 0.0])
 
 
-def test_what_moves_as_a_robot_can_is_believed():
+def test_what_moves_as_a_robot_can_is_accepted():
     reading = joints()
     for k in range(50):
-        heard = START + np.array([0.03, -0.01]) * (k + 1)
-        reading = reading.hear(heard, DT)
-        assert reading.believed
-        assert reading.value.tolist() == heard.tolist()
+        seen = START + np.array([0.03, -0.01]) * (k + 1)
+        reading = reading.update(seen, DT)
+        assert reading.accepted
+        assert reading.value.tolist() == seen.tolist()
         assert reading.age == 0
 
 
 @pytest.mark.parametrize(
-    ("heard", "why"),
+    ("seen", "fault"),
     [
         (None, LOST),
         ([np.nan, -0.3], LOST),
@@ -52,43 +56,43 @@ def test_what_moves_as_a_robot_can_is_believed():
         (DEGREES * START, IMPOSSIBLE),
     ],
 )
-def test_what_cannot_be_is_not_used(heard, why):
-    heard = None if heard is None else np.array(heard)
-    reading = joints().hear(heard, DT).hear(heard, DT)
-    assert reading.why == why
+def test_what_cannot_be_is_not_used(seen, fault):
+    seen = None if seen is None else np.array(seen)
+    reading = joints().update(seen, DT).update(seen, DT)
+    assert reading.fault == fault
     assert reading.value.tolist() == START.tolist()
     assert reading.age == pytest.approx(2 * DT)
-    back = reading.hear(START + 0.01, DT)
-    assert back.believed
+    back = reading.update(START + 0.01, DT)
+    assert back.accepted
     assert back.age == 0
 
 
-def test_a_jump_is_believed_once_it_stays():
+def test_a_jump_is_accepted_once_it_stays():
     reading, there = joints(), START + np.array([0.9, 0.6])
     for k in range(20):
-        reading = reading.hear(there + 0.001 * k, DT)
+        reading = reading.update(there + 0.001 * k, DT)
         # the first one begins the time for which it stays
-        settled = k * DT >= TRUST.settling - 1e-9
-        assert bool(reading.believed) == settled
+        settled = k * DT >= TRUST.settling_time - 1e-9
+        assert bool(reading.accepted) == settled
     assert reading.age == 0
     assert np.abs(reading.value - there).max() < 0.02
 
 
-def test_a_reading_that_jumps_about_is_never_believed():
+def test_a_reading_that_jumps_about_is_never_accepted():
     reading = joints()
     for k in range(50):
-        reading = reading.hear(START + (0.5 if k % 2 else -0.5), DT)
-        assert not reading.believed
+        reading = reading.update(START + (0.5 if k % 2 else -0.5), DT)
+        assert not reading.accepted
     assert reading.age == pytest.approx(50 * DT)
 
 
-def test_a_change_to_degrees_is_never_believed():
+def test_a_change_to_degrees_is_never_accepted():
     small = np.array([0.02, -0.015])
-    wide = (np.full(2, -9.0), np.full(2, 9.0), np.ones(2))
-    reading = JointReading.of(TRUST, small, wide)
+    wide = {"lower": np.full(2, -9.0), "upper": np.full(2, 9.0), "velocity": np.ones(2)}
+    reading = JointReading.first(TRUST, small, **wide)
     for _ in range(50):
-        reading = reading.hear(DEGREES * small, DT)
-        assert reading.why == OTHER_UNIT
+        reading = reading.update(DEGREES * small, DT)
+        assert reading.fault == OTHER_UNIT
     assert reading.value.tolist() == small.tolist()
 
 
@@ -97,23 +101,23 @@ def test_a_robot_of_a_batch_does_not_know_of_the_others():
     batch, alone = joints(start), [joints(), joints(), joints()]
     rng = np.random.default_rng(0)
     for k in range(60):
-        heard = start + 0.02 * rng.standard_normal(start.shape)
-        heard[1] += 0.7 if 10 < k < 40 else 0.0
-        heard[2, 0] = np.nan if 20 < k < 35 else heard[2, 0]
-        batch = batch.hear(heard, DT)
+        seen = start + 0.02 * rng.standard_normal(start.shape)
+        seen[1] += 0.7 if 10 < k < 40 else 0.0
+        seen[2, 0] = np.nan if 20 < k < 35 else seen[2, 0]
+        batch = batch.update(seen, DT)
         for robot in range(3):
-            alone[robot] = alone[robot].hear(heard[robot], DT)
+            alone[robot] = alone[robot].update(seen[robot], DT)
             assert batch.value[robot].tolist() == alone[robot].value.tolist()
             assert batch.age[robot] == alone[robot].age
-            assert batch.why[robot] == alone[robot].why
+            assert batch.fault[robot] == alone[robot].fault
 
 
 @pytest.mark.parametrize(
-    ("heard", "why"),
+    ("seen", "fault"),
     [
-        (POSE + 0.01, BELIEVED),
-        (turned(0.5), BELIEVED),
-        (turned(0.1 + 2 * np.pi), BELIEVED),
+        (POSE + 0.01, ACCEPTED),
+        (turned(0.5), ACCEPTED),
+        (turned(0.1 + 2 * np.pi), ACCEPTED),
         (turned(1.2), JUMPED),
         (POSE + np.array([0.3, 0, 0, 0, 0, 0, 0]), JUMPED),
         (POSE * 1000, IMPOSSIBLE),
@@ -121,20 +125,20 @@ def test_a_robot_of_a_batch_does_not_know_of_the_others():
         (np.zeros(7), IMPOSSIBLE),
     ],
 )
-def test_poses(heard, why):
-    if why == BELIEVED:
-        heard = np.concatenate((heard[:3], heard[3:] / np.linalg.norm(heard[3:])))
-    reading = PoseReading.of(TRUST, POSE).hear(heard, DT)
-    assert reading.why == why
-    if why == BELIEVED:
+def test_poses(seen, fault):
+    if fault == ACCEPTED:
+        seen = np.concatenate((seen[:3], seen[3:] / np.linalg.norm(seen[3:])))
+    reading = PoseReading.first(TRUST, POSE).update(seen, DT)
+    assert reading.fault == fault
+    if fault == ACCEPTED:
         return
     assert reading.value.tolist() == POSE.tolist()
 
 
 def test_an_object_that_was_moved_is_found_where_it_stays():
-    reading, there = PoseReading.of(TRUST, POSE), POSE + np.array([0.5, 0, 0, 0, 0, 0, 0])
+    reading, there = PoseReading.first(TRUST, POSE), POSE + np.array([0.5, 0, 0, 0, 0, 0, 0])
     for _ in range(10):
-        reading = reading.hear(there, DT)
+        reading = reading.update(there, DT)
     assert reading.value.tolist() == there.tolist()
 
 
