@@ -1069,7 +1069,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators there are, so that under the normal law it makes no difference whether
         independent coordinates come in one operator or in several. Models that look at
         *other* coordinates describe other data, in other units, and are not comparable: use
-        :func:`tpgmm_torch.metrics.make_scorer` for those.
+        :class:`tpgmm_torch.metrics.PoseScorer` for those.
 
         Unlike ``lower_bound_``, :meth:`bic` and :meth:`aic`, which are EM's and count time
         once for each operator.
