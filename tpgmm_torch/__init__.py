@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.clock_text import parse_clock
     from tpgmm_torch.control.clocks import (
         Clock,
         EvenClock,
-        LocalizingClock,
         WaitingClock,
-        parse_clock,
     )
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
+    from tpgmm_torch.control.localizing_clock import LocalizingClock
     from tpgmm_torch.data.affine import Affine
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
@@ -93,7 +93,9 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
+    "control.clock_text": ("parse_clock",),
+    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
+    "control.localizing_clock": ("LocalizingClock",),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
     "data.affine": ("Affine",),

@@ -24,7 +24,8 @@ from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import EpisodeSummary, check, summarize, unit_findings
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.control.clocks import Clock, parse_clock
+from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.affine import Affine
