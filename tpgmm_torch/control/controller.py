@@ -14,13 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-<<<<<<< HEAD
 from tpgmm_torch.checks.situations import START
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Progress
-=======
 from tpgmm_torch.control.clocks import Clock, EvenClock, Progress
->>>>>>> db082b2 (Localise by the likelihood that a skill gives, and search postures by a skill)
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding

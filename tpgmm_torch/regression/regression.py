@@ -23,12 +23,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-<<<<<<< HEAD
-from tpgmm_torch.operators import Canonical, Linearization, Operator
-=======
-from tpgmm_torch.novelty import Novelty
 from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
->>>>>>> db082b2 (Localise by the likelihood that a skill gives, and search postures by a skill)
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import (
