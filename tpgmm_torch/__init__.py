@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.control.localizing_clock import LocalizingClock
-    from tpgmm_torch.data.affine import Affine
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
         RelativeOrientation,
         RelativePosition,
         Stack,
-        TaskParameters,
     )
     from tpgmm_torch.regression.estimate import Estimate
     from tpgmm_torch.regression.via_points import ViaPoint
@@ -52,7 +50,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
-    "Affine",
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
@@ -83,7 +80,6 @@ __all__ = [
     "Stack",
     "Status",
     "TaskParameterizedGMM",
-    "TaskParameters",
     "Trajectory",
     "Trust",
     "ViaPoint",
@@ -98,7 +94,6 @@ _HOMES = {
     "control.localizing_clock": ("LocalizingClock",),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
-    "data.affine": ("Affine",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
@@ -116,7 +111,6 @@ _HOMES = {
         "RelativeOrientation",
         "RelativePosition",
         "Stack",
-        "TaskParameters",
     ),
     "robots.tracked_poses": ("Poses",),
     "regression.estimate": ("Estimate",),

@@ -28,7 +28,6 @@ from tpgmm_torch.control.clock_text import parse_clock
 from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -762,7 +761,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 {
                     name: Frame.stack([first[name] for first in firsts])
                     for name, frame in firsts[0].items()
-                    if not isinstance(frame, Affine)
                 },
                 torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
                 self.kinematics_,

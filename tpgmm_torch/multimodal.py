@@ -24,7 +24,6 @@ from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.clock_text import parse_clock
 from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.command import Command
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -902,8 +901,6 @@ def _moved(before: Mapping[str, Frame], now: Mapping[str, Frame]) -> bool:
         return True
     for name, frame in now.items():
         old = before[name]
-        if isinstance(frame, Affine) or isinstance(old, Affine):  # which is no pose
-            continue
         far = (frame.position - old.position).norm(dim=-1).max()
         back = quaternions.conjugate(old.orientation)
         turned = (

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tpgmm_torch.checks.report import Finding, Report, listed
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -124,7 +123,6 @@ class EpisodeSummary:
             {
                 name: PathSummary.of(frame)
                 for name, frame in demonstration.frames.items()
-                if not isinstance(frame, Affine)  # which is no pose
             },
             {
                 name: (at - begin) / duration if duration else 0.0

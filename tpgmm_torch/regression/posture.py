@@ -39,7 +39,6 @@ from tpgmm_torch.operators import (
     RelativeOrientation,
     RelativePosition,
 )
-from tpgmm_torch.operators.base import Reference
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
@@ -514,8 +513,9 @@ class Residual:
             jacobian = jacobian.expand(*exact.shape[:-3], *jacobian.shape[-2:]).clone()
             jacobian[..., self.turns, :] = exact
         for leaf, row in self.leaves:
-            swing = Reference.of(leaf.frame, state, frames, leaf.held).angular_jacobian
-            if swing is not None:
+            reference = leaf.moving_reference(state)
+            if reference is not None:
+                swing = state.angular_jacobian(reference)
                 part = slice(row, row + 3)
                 if self.turns is None:
                     jacobian = jacobian.expand(*residual.shape, -1).clone()
