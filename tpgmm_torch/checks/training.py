@@ -120,10 +120,7 @@ class EpisodeSummary:
             joints[0],
             joints.min(axis=0),
             joints.max(axis=0),
-            {
-                name: PathSummary.of(frame)
-                for name, frame in demonstration.frames.items()
-            },
+            {name: PathSummary.of(frame) for name, frame in demonstration.frames.items()},
             {
                 name: (at - begin) / duration if duration else 0.0
                 for name, at in demonstration.events.items()
