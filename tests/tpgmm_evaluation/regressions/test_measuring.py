@@ -64,6 +64,9 @@ def test_the_command_compares_what_it_measured(calls, tmp_path, monkeypatch, cap
         main(["compare", "--only", "nothing"])
 
 
+@pytest.mark.filterwarnings(
+    "ignore::tpgmm_torch.exceptions.PlausibilityWarning"
+)  # of single steps
 def test_golden_references_say_the_same_twice(tmp_path):
     plan = Plan(tmp_path, small=True, root=ROOT)
     once, again = (GOLDENS["planted"](plan) for _ in range(2))
