@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.control.clock_text import parse_clock
     from tpgmm_torch.control.clocks import (
         Clock,
         EvenClock,
+        LocalizingClock,
         WaitingClock,
+        parse_clock,
     )
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.control.localizing_clock import LocalizingClock
+    from tpgmm_torch.data.affine import Affine
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
         RelativeOrientation,
         RelativePosition,
         Stack,
+        TaskParameters,
     )
     from tpgmm_torch.regression.estimate import Estimate
     from tpgmm_torch.regression.via_points import ViaPoint
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
+    "Affine",
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
@@ -80,6 +83,7 @@ __all__ = [
     "Stack",
     "Status",
     "TaskParameterizedGMM",
+    "TaskParameters",
     "Trajectory",
     "Trust",
     "ViaPoint",
@@ -89,11 +93,10 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.clock_text": ("parse_clock",),
-    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
-    "control.localizing_clock": ("LocalizingClock",),
+    "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
+    "data.affine": ("Affine",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
@@ -111,6 +114,7 @@ _HOMES = {
         "RelativeOrientation",
         "RelativePosition",
         "Stack",
+        "TaskParameters",
     ),
     "robots.tracked_poses": ("Poses",),
     "regression.estimate": ("Estimate",),

@@ -40,8 +40,6 @@ CURRENT = re.compile(r"^\.\. currentmodule:: ([\w.]+)$", re.MULTILINE)
 NOT_CODE = (
     "tpgmm_tools.cli",
     "tpgmm_tools.app.command",
-    "tpgmm_datasets.commands.dataset",
-    "tpgmm_datasets.commands.demo",
     "tpgmm_evaluation.command",
     "tpgmm_evaluation.metaworld.__main__",
 )

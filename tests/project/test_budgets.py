@@ -55,7 +55,7 @@ CEILINGS = {
     "lines of environments and evaluation": 10500,
     "lines of tests of core, data sets, policy and tools": 26500,
     "functions of the core above complexity 10": 93,
-    "longest function of the core": 137,
+    "longest function of the core": 150,
     "most parameters in the core": 29,
     "named numeric constants of the core": 270,
     "names in tpgmm_torch.__all__": 56,

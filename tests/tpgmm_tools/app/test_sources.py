@@ -92,11 +92,3 @@ def test_names_that_lead_out_of_the_folder_stay_in_it(tmp_path, archive):
     assert len(sources.uploaded([evil], upper_body())) == 2
     assert not list(tmp_path.rglob("escaped.txt"))
     assert not (tmp_path.parent / "escaped.txt").exists()
-
-
-def test_the_generated_skill_knows_its_robot(monkeypatch):
-    sources.generated_bottle.cache_clear()
-    shown, robot = sources.generated_bottle(1, 10)
-    assert list(shown[0].frames) == ["bottle"]
-    assert tuple(shown[0].joint_names) == tuple(robot.joint_names)
-    assert sources.generated_bottle(1, 10)[0] is shown

@@ -1,13 +1,20 @@
-"""The command ``tpgmm`` as a whole: version, help, and that both are quick."""
+"""The command ``tpgmm``: help, errors in one line, commands of other distributions."""
 
 import re
 import subprocess
 import sys
-from importlib.metadata import version
+import warnings
+from importlib.metadata import EntryPoint, version
 
 import pytest
+import typer
 
-from tests.support.command_line import output
+from tests.support.command_line import output, refusal, run
+from tpgmm_tools.cli import plugins
+from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
+
+COMMANDS = ["demo", "fit", "reproduce", "plot", "view", "app", "dataset"]
+DESCRIBE = "tpgmm_datasets.description.describe_lerobot"
 
 
 def test_version_and_help_need_no_command():
@@ -15,16 +22,13 @@ def test_version_and_help_need_no_command():
     for arguments in ((), ("--help",)):
         text = output(*arguments)
         listed = re.findall(r"^│ (\w+)", text.partition("Commands")[2], re.MULTILINE)
-        assert listed[:8] == [
-            "demo", "fit", "correct", "reproduce", "plot", "view", "app", "dataset"
-        ]  # fmt: skip
-        assert "Run the paper's experiment" in text
+        assert listed[:7] == COMMANDS
+        assert "Run the paper's experiment" in text and "Learn a skill from" in text
 
 
 @pytest.mark.parametrize(
     "command",
-    ["demo", "fit", "correct", "reproduce", "plot", "view", "app"]
-    + [f"dataset {name}" for name in ("info", "check", "plot", "generate", "convert")],
+    COMMANDS[:-1] + [f"dataset {n}" for n in ("info", "check", "plot", "generate", "convert")],
 )
 def test_the_help_of_every_command_has_an_example(command):
     assert f"Example: tpgmm {command}" in output(*command.split(), "--help")
@@ -38,7 +42,93 @@ app(["--help"], standalone_mode=False)
 heavy = {"torch", "sklearn", "pandas", "pyarrow", "matplotlib", "lerobot"} & set(sys.modules)
 sys.exit(f"{sorted(heavy)} are imported" if heavy else 0)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("fot", "No such command 'fot'"),
+        ("fit --out x", "Missing argument"),
+        ("fit nowhere --out x", "there is no folder nowhere"),
+        ("fit x --out y --n-components 0", "'n_components' parameter"),
+        ("fit x --out y --n-components some", "'n_components' parameter"),
+        ("fit x --out y --fusion sum", "'fusion' parameter"),
+        ("fit x --out y --operator hand", "is not a term"),
+        ("fit x --out y --link l_hand", "need --robot"),
+        ("fit x --out y --robot upper_body --link hand", "'hand'"),
+        ("fit x --out y --robot no.urdf", "no.urdf"),
+        ("fit x --out y --poses left --robot upper_body", "--poses are instead of --robot"),
+        ("fit x --out y --format onnx", "there are ['lerobot', 'tpgmm']"),
+        ("reproduce x --dataset y --out z.csv", "x is not a saved"),
+        ("reproduce x --out z.csv", "give either --situations"),
+        ("reproduce x --dataset y --out z.txt", "z.txt"),
+        ("dataset check nowhere", "there is no folder"),
+    ],
+)
+def test_bad_input_ends_in_one_line_and_exit_code_2(command, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert message in refusal(*command.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_and_what_no_user_can_mend_keep_the_traceback(monkeypatch):
+    result = run("--debug", "reproduce", "x", "--dataset", "y", "--out", "z.csv")
+    assert isinstance(result.exception, ModelFileError)
+    monkeypatch.setattr(DESCRIBE, lambda path: 1 / 0)
+    assert isinstance(run("dataset", "check", "x").exception, ZeroDivisionError)
+
+
+def test_warnings_and_missing_packages_are_one_line_each(monkeypatch):
+    def warn(path):
+        warnings.warn("it did not\nconverge", UserWarning, stacklevel=1)
+        raise ModuleNotFoundError("No module named 'pyarrow'", name="pyarrow")
+
+    monkeypatch.setattr(DESCRIBE, warn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        lines = run("dataset", "check", "x").stderr.splitlines()
+    assert lines == [
+        "tpgmm: warning: it did not converge",
+        "tpgmm: this command needs pyarrow: pip install 'tpgmm-torch[cli]'",
+    ]
+
+
+def greet(name: str = "you") -> None:
+    """Greet."""
+    typer.echo(f"hello {name}")
+
+
+greeting = typer.Typer()
+greeting.command()(greet)
+
+
+@pytest.fixture
+def greeters(monkeypatch):
+    entries = {"greet": "greet", "welcome": "greeting", "gone": "absent", "fit": "greet"}
+    found = [EntryPoint(name, f"{__name__}:{value}", "") for name, value in entries.items()]
+    monkeypatch.setattr(plugins, "entry_points", lambda group: found)
+
+
+def test_plugins_add_commands_and_replace_none(greeters):
+    for name in ("greet", "welcome"):
+        assert output(name, "--name", "me") == "hello me\n"
+    assert "Greet." in output("greet", "--help")
+    assert "Learn a skill" in output("fit", "--help")
+
+
+def test_a_broken_plugin_is_one_line_and_spares_the_others(greeters):
+    text = " ".join(output("--help").replace("│", " ").split())
+    assert all(f"tpgmm {name} --help" in text for name in ("greet", "welcome", "gone"))
+    line = refusal("gone")
+    assert "'gone'" in line and "cannot be loaded: AttributeError" in line
+
+
+def test_plugins_add_formats_of_models(greeters):
+    assert plugins.model_format("tpgmm") is None
+    assert plugins.model_format("greet").__doc__ == greet.__doc__
+    with pytest.raises(DependencyError, match=r"'gone'.*cannot be loaded"):
+        plugins.model_format("gone")
+    with pytest.raises(DataError, match="format 'onnx' is not known here"):
+        plugins.model_format("onnx")

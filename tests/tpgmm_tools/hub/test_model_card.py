@@ -45,7 +45,7 @@ def test_what_matters_changes_from_the_object_to_the_joints():
     # the same as the shares of a reproduction where the objects are in the middle
     shown = model.summary_
     middle = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
-    bottle = Frame(shown.frames["bottle"].mean, shown.frames["bottle"].orientation)
+    bottle = Frame(shown.frames["bottle"].place.mean, shown.frames["bottle"].orientation)
     [trajectory] = model.predict([Situation(joints=middle, frames={"bottle": bottle})])
     wanted = 100 * trajectory.candidates[joints].share.mean(-1)
     first = wanted[: len(np.array_split(np.arange(len(wanted)), len(spans))[0])].mean()

@@ -7,21 +7,10 @@ import torch
 from tests.support.worlds import upper_body
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.viewing import link_shapes, parse_shape
-from tpgmm_tools.viewing.visuals import whole_body
+from tpgmm_tools.viewing.visuals import mesh, whole_body
 from tpgmm_torch import Poses, Robot
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.urdf import read_urdf
-
-TRIANGLE = """solid one
-facet normal 0 0 1
-outer loop
-vertex 0 0 0
-vertex 1 0 0
-vertex 0 1 0
-endloop
-endfacet
-endsolid one
-"""
 
 
 def robot(visuals: str, extra: str = "", materials: str = "") -> str:
@@ -96,9 +85,9 @@ def test_a_link_that_cannot_be_drawn_becomes_sticks_to_its_joints(visuals):
 def test_a_mesh_is_looked_for_by_the_end_of_its_name(tmp_path, place):
     file = tmp_path / place / "arm.stl"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(TRIANGLE)
-    [mesh] = shapes(robot(MESH), tmp_path)["arm"]
-    assert (mesh.kind, mesh.size, mesh.file) == ("mesh", (2.0, 2.0, 3.0), file)
+    file.write_text("")
+    [found] = shapes(robot(MESH), tmp_path)["arm"]
+    assert (found.kind, found.size, found.file) == ("mesh", (2.0, 2.0, 3.0), file)
 
 
 def test_a_mesh_that_is_not_in_the_folder_is_named(tmp_path):
@@ -127,10 +116,9 @@ def test_the_whole_body_follows_the_joints_of_the_model():
     assert body.links[:2] == upper_body().links
     assert set(body.links) == set(drawn) == set(read_urdf(upper_body_urdf()).links)
     assert body.joint_names == upper_body().joint_names
-    joints = torch.linspace(-0.3, 0.3, 17, dtype=torch.float64)
-    link = "l_elbow_link"
-    alone = Robot.from_urdf(upper_body_urdf(), [link]).state(joints)
-    torch.testing.assert_close(body.state(joints).position(link), alone.position(link))
+    hands = Poses(("left", "right"), dtype=torch.float32)
+    body, drawn = whole_body(hands)
+    assert (body.links, body.lower.dtype, drawn) == (hands.links, torch.float64, {})
 
 
 def test_of_a_body_only_what_the_base_holds_is_drawn():
@@ -143,12 +131,6 @@ def test_of_a_body_only_what_the_base_holds_is_drawn():
     assert body.state([0.0, 0.0]).positions.dtype == torch.float64
 
 
-def test_of_tracked_poses_only_the_poses_are_seen():
-    hands = Poses(("left", "right"), dtype=torch.float32)
-    body, drawn = whole_body(hands)
-    assert (body.links, body.lower.dtype, drawn) == (hands.links, torch.float64, {})
-
-
 @pytest.mark.parametrize(
     "text",
     ["", "box", "box:1,2", "sphere:1,2", "cone:1,2", "sphere:-1", "sphere:nan", "box:a,b,c"],
@@ -159,8 +141,42 @@ def test_a_shape_that_is_none_is_refused(text):
 
 
 def test_a_shape_is_read_from_text():
-    assert (parse_shape("box:0.1,0.2,3").kind, parse_shape("box:0.1,0.2,3").size) == (
-        "box",
-        (0.1, 0.2, 3.0),
-    )
-    assert parse_shape("sphere:0.05").size == (0.05,)
+    box = parse_shape("box:0.1,0.2,3")
+    assert (box.kind, box.size) == ("box", (0.1, 0.2, 3.0))
+
+
+#: A triangle in millimetres, 100 of them up.
+DAE = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><created>2026-01-01T00:00:00Z</created><modified>2026-01-01T00:00:00Z</modified>
+<unit name="millimeter" meter="0.001"/><up_axis>Z_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p">
+<float_array id="a" count="9">0 0 0 10 0 0 0 20 0</float_array>
+<technique_common><accessor source="#a" count="3" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
+</source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><translate>0 0 100</translate>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def test_meshes_in_collada_are_read_in_their_unit(tmp_path, monkeypatch):
+    import trimesh
+
+    (tmp_path / "arm.dae").write_text(DAE)
+    [shape] = shapes(robot(MESH.replace(".stl", ".dae")), tmp_path)["arm"]
+    vertices, _ = mesh(shape)
+    np.testing.assert_allclose(vertices, [(0, 0, 0.3), (0.02, 0, 0.3), (0, 0.04, 0.3)])
+
+    def missing(file):
+        raise ImportError("missing `pip install pycollada`")
+
+    monkeypatch.setattr(trimesh, "load_mesh", missing)
+    with pytest.raises(DependencyError, match=r"arm\.dae needs .*tpgmm-torch\[collada\]"):
+        mesh(shape)
+    (tmp_path / "arm.dae").write_text("no mesh")
+    monkeypatch.undo()
+    with pytest.raises(DataError, match=r"arm\.dae cannot be read"):
+        mesh(shape)

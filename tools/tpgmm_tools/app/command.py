@@ -11,7 +11,7 @@ import typer
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_tools.app.sources import Shown
+    from tpgmm_tools.app.sources import Recorded
 
 __all__ = ["app"]
 
@@ -23,13 +23,15 @@ LARGEST = "500mb"
 FONTS = ("ui-sans-serif", "system-ui", "sans-serif")
 serving = options.in_panel("Serving")
 EXAMPLE = (
-    "Example: tpgmm app\n\n"
+    "tpgmm app\n\n"
     "Example: tpgmm app out/demo/dataset --robot upper_body --link l_hand --link r_hand"
 )
 
 
-@app.command(epilog=EXAMPLE)
+@options.command(app, EXAMPLE)
 def page(
+    described: options.RobotOptions,
+    data: options.DataOptions,
     dataset: Annotated[
         str | None,
         typer.Argument(
@@ -38,17 +40,6 @@ def page(
             "uploaded.",
         ),
     ] = None,
-    robot: options.RobotFile = None,
-    link: options.Links = None,
-    robot_joint: options.RobotJoints = None,
-    coordinate: options.Coordinates = None,
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
     host: Annotated[
         str, serving("Address to listen on; who reaches it can have anything learned.")
     ] = "127.0.0.1",
@@ -66,17 +57,14 @@ def page(
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
+    kinematics = described.read()
     if dataset is None and kinematics is not None:
         raise DataError("--robot describes DATASET, and none is given")
 
-    def told() -> Shown:
-        given = options.recordings(
-            str(dataset), kinematics, frame, event, episodes, units, joints, joint_name, rate
-        )
-        return given.demonstrations(), kinematics
+    def recorded() -> Recorded:
+        return data.read(str(dataset), kinematics), kinematics
 
-    blocks = built({} if dataset is None else {dataset: told})
+    blocks = built({} if dataset is None else {dataset: recorded})
     from gradio.themes import Default
 
     _, url, _ = blocks.launch(

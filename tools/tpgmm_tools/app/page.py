@@ -1,30 +1,41 @@
-"""The page: what is asked, and what the answers look like."""
+"""The page in the browser: learn recordings, move objects, look at the motion."""
 
 from __future__ import annotations
 
 import html
+import shutil
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tpgmm_tools.app.skill import Skill, learn, listed, moved, remarks, show
-from tpgmm_tools.app.sources import Shown, generated_bottle, uploaded
-from tpgmm_tools.cli.commands import explain
-from tpgmm_tools.cli.options import read_robot
-from tpgmm_tools.cli.plugins import ROBOTS, registered
-from tpgmm_torch.exceptions import DependencyError
+import numpy as np
 
-__all__ = ["GENERATED", "UPLOADED", "learned", "page", "places_of", "shown_motion"]
+from tpgmm_datasets.checks.check import check
+from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
+from tpgmm_tools.cli.application import explain
+from tpgmm_tools.cli.options import ROBOTS, RobotOptions, align
+from tpgmm_tools.viewing import write_motion
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.tables import trajectories_to_frame, write_table
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
+from tpgmm_torch.operators.text import default_operators, format_operator
+
+__all__ = ["GENERATED", "UPLOADED", "Skill", "learn", "moved", "page", "places_of", "show"]
 
 GENERATED, UPLOADED = "generated: shaking a bottle with two hands", "my files"
 #: Of the choice of robots: joints alone, a file that is sent along.
 NO_ROBOT, ROBOT_FILE = "none", "my URDF or MJCF"
-#: Of the table of objects.
-PLACE = ("object", "x [m]", "y [m]", "z [m]", "turn [deg]")
 #: Both buttons take turns: the machine has few cores, and warnings are collected one at a time.
 TURNS: dict[str, Any] = {"concurrency_id": "work", "concurrency_limit": 1}
-TITLE = "tpgmm: a skill from demonstrations"
+#: Pictures per second: enough to look smooth, few enough for a page of a megabyte.
+FPS = 12.0
 INTRODUCTION = """\
 # A skill from demonstrations
 
@@ -33,7 +44,39 @@ paths, where the hands may be, and which operator decides when.
 """
 
 
-def learned(
+@dataclass(frozen=True, eq=False)
+class Skill:
+    """A fitted ``model`` and its ``demonstrations``, as recorded."""
+
+    model: TaskParameterizedGMM
+    demonstrations: Sequence[Demonstration]
+
+    def situation(self, number: int) -> Situation:
+        """The situation of a demonstration, by its ``number`` from 1."""
+        return Situation.of(self.demonstrations[number - 1])
+
+
+@contextmanager
+def _remarks() -> Iterator[list[str]]:
+    """Collect the texts of warnings, each once, as lines of Markdown."""
+    lines: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("always", UserWarning)
+        yield lines
+    texts = dict.fromkeys(" ".join(str(one.message).split()) for one in caught)
+    lines += ["\n**To be looked at:**", *(f"- {text}" for text in texts)] if texts else []
+
+
+def _refusal(error: Exception) -> str:
+    """What to mend, as Markdown; an error that no user can mend goes on."""
+    message = explain(error)
+    if message is None:
+        raise error
+    return f"**It does not work like this:** {' '.join(message.split())}"
+
+
+def learn(
     source: str,
     files: Sequence[str] | None,
     robot: str,
@@ -41,18 +84,18 @@ def learned(
     links: str,
     frames: str,
     n_components: float,
-    more: Mapping[str, Callable[[], Shown]] | None = None,
+    more: Mapping[str, Callable[[], Recorded]] | None = None,
 ) -> tuple[Skill | None, str]:
-    """Read and learn; whatever a user can mend is said, not raised.
+    """Read, align and learn, as ``tpgmm fit`` with nothing but its defaults.
 
     Parameters
     ----------
     source : str
         ``GENERATED``, ``UPLOADED``, or a name among ``more``.
     files : sequence of str, optional
-        What was uploaded.
+        The uploaded files.
     robot, robot_file : str
-        Name of a registered robot, "none", or that the file ``robot_file`` describes it.
+        One of ``ROBOTS``, "none", or ``ROBOT_FILE`` if the file describes it.
     links, frames : str
         Separated by commas; see :func:`tpgmm_tools.app.sources.uploaded`.
     n_components : float
@@ -68,20 +111,30 @@ def learned(
         What was learned, or why not, as Markdown.
     """
     try:
-        with remarks() as remarked:
+        with _remarks() as remarks:
             if source == UPLOADED:
                 described = robot_file if robot == ROBOT_FILE else robot
-                kinematics = read_robot(
-                    None if described in (NO_ROBOT, None) else described, _names(links)
-                )
-                shown = uploaded(files or (), kinematics, _names(frames))
+                given = None if described == NO_ROBOT else described
+                kinematics = RobotOptions(given, _names(links)).read()
+                read = uploaded(files or (), kinematics, _names(frames))
             else:
-                known: dict[str, Callable[[], Shown]] = {GENERATED: generated_bottle}
-                shown, kinematics = (known | dict(more or {}))[source]()
-        skill = learn(shown, kinematics, int(n_components))
+                known: dict[str, Callable[[], Recorded]] = {GENERATED: generated_bottle}
+                read, kinematics = (known | dict(more or {}))[source]()
+            check(read, kinematics).act()
+            hands = kinematics.links if kinematics is not None else ()
+            operators = default_operators(hands, list(read[0].frames))
+            model = TaskParameterizedGMM(
+                int(n_components), operators, kinematics, random_state=0
+            )
+            model.fit(align(read, "dtw", kinematics))
     except Exception as error:
         return None, _refusal(error)
-    return skill, skill.report + listed(remarked)
+    seconds = [one.duration for one in read]
+    lines = [
+        f"Learned {len(read)} demonstrations of {min(seconds):.1f} to {max(seconds):.1f} s.",
+        *(f"- `{format_operator(operator)}`" for operator in model.operators_),
+    ]
+    return Skill(model, read), "\n".join(lines + remarks)
 
 
 def places_of(skill: Skill | None, number: int) -> list[list[Any]]:
@@ -89,14 +142,10 @@ def places_of(skill: Skill | None, number: int) -> list[list[Any]]:
 
     Parameters
     ----------
-    skill : Skill, optional
-        Without one there are no rows.
-    number : int
-        Of the demonstration, counted from 1.
+    skill, number : Skill, int
+        Of the demonstration, counted from 1; without a skill there are no rows.
     """
-    if skill is None:
-        return []
-    frames = skill.situations[number - 1].frames
+    frames = {} if skill is None else skill.situation(number).frames
     return [
         [name, *(round(float(value), 4) for value in frame.position), 0.0]
         for name, frame in frames.items()
@@ -104,17 +153,48 @@ def places_of(skill: Skill | None, number: int) -> list[list[Any]]:
     ]
 
 
-def shown_motion(
-    skill: Skill | None, number: int, places: Sequence[Sequence[Any]]
-) -> tuple[str, str, list[str]]:
-    """Reproduce and write; whatever a user can mend is said, not raised.
+def moved(situation: Situation, places: Sequence[Sequence[Any]]) -> Situation:
+    """The situation with objects elsewhere.
 
     Parameters
     ----------
-    skill : Skill, optional
-        What was learned.
-    number : int
-        Of the demonstration whose start and objects are taken, counted from 1.
+    situation : Situation
+        Where they were.
+    places : sequence of sequence
+        Name of a frame that stands still, its new x, y, z [m], and by how much it is turned
+        about the vertical through it [deg].
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If a place is not four finite numbers, or no such object stands still.
+    """
+    still = {name: one for name, one in situation.frames.items() if not one.batch_shape}
+    frames = dict(situation.frames)
+    for name, *place in places:
+        if name not in still:
+            raise UnknownNameError("object", name, "the situation", still)
+        try:
+            x, y, z, degrees = np.array(place, dtype=float)
+            half = np.deg2rad(degrees) / 2
+            turn = still[name].orientation.new_tensor([np.cos(half), 0.0, 0.0, np.sin(half)])
+            frames[name] = Frame([x, y, z], quaternions.product(turn, still[name].orientation))
+        except (TypeError, ValueError):
+            raise DataError(
+                f"{name}: a place is x, y, z in metres and a turn in degrees, got {place}"
+            ) from None
+    return replace(situation, frames=frames)
+
+
+def show(
+    skill: Skill | None, number: int, places: Sequence[Sequence[Any]]
+) -> tuple[str, str, list[str]]:
+    """Reproduce a skill, and write what there is to look at and to take away.
+
+    Parameters
+    ----------
+    skill, number : Skill, int
+        And of which demonstration start and objects are taken, counted from 1.
     places : sequence of sequence
         Rows as :func:`places_of` gives them.
 
@@ -125,31 +205,49 @@ def shown_motion(
     report : str
         How new the situation is, or what is wrong, as Markdown.
     files : list of str
-        To take away: the page, the references, the model.
+        ``motion.html``, ``motion.csv`` with the references, and ``model.zip``.
     """
     if skill is None:
         return "", "Nothing is learned yet.", []
     folder = Path(tempfile.mkdtemp(prefix="tpgmm-"))
+    page = folder / "motion.html"
     try:
-        objects = {str(name): place for name, *place in places}
-        situation = moved(skill.situations[number - 1], objects)
-        _, report = show(skill, situation, folder)
+        situation = moved(skill.situation(number), places)
+        with _remarks() as remarks:
+            trajectory = write_motion(
+                page, skill.model, situation, skill.demonstrations, fps=FPS, title="motion"
+            )
     except Exception as error:
         return "", _refusal(error), []
+    frames = situation.frames_at(trajectory.time)
+    write_table(trajectories_to_frame([trajectory], [frames]), folder / "motion.csv")
+    skill.model.save(folder / "model")
+    shutil.make_archive(str(folder / "model"), "zip", folder, "model")
+    shutil.rmtree(folder / "model")
+    line = f"{float(trajectory.time[-1] - trajectory.time[0]):.1f} s of motion."
+    if trajectory.novelty is not None:
+        line += (
+            f" The situation is {float(trajectory.novelty):.2f} times as far from the "
+            "demonstrations as the one of these that is furthest from the others."
+        )
     # as the text of the frame itself, the page needs no address that serves it
-    text = html.escape((folder / "motion.html").read_text(encoding="utf-8"))
+    text = html.escape(page.read_text(encoding="utf-8"))
     picture = f'<iframe title="motion" style="width:100%;height:70vh;border:0" srcdoc="{text}">'
-    return f"{picture}</iframe>", report, sorted(map(str, folder.iterdir()))
+    return (
+        f"{picture}</iframe>",
+        "\n".join([line, *remarks]),
+        sorted(map(str, folder.iterdir())),
+    )
 
 
-def page(more: Mapping[str, Callable[[], Shown]] | None = None) -> Any:
+def page(more: Mapping[str, Callable[[], Recorded]] | None = None) -> Any:
     """The page, not yet served.
 
     Parameters
     ----------
     more : mapping of str to callable, optional
-        Sources beside the generated skill and files, by the name that is shown: the
-        demonstrations, and their robot. The first of them is chosen.
+        Sources beside the generated skill and files, by name: the demonstrations, and their
+        robot. The first of them is chosen.
 
     Returns
     -------
@@ -168,19 +266,19 @@ def page(more: Mapping[str, Callable[[], Shown]] | None = None) -> Any:
             "the page needs gradio: pip install 'tpgmm-torch[app]'"
         ) from error
     sources = [*(more or {}), GENERATED, UPLOADED]
-    robots = [NO_ROBOT, *sorted(registered(ROBOTS)), ROBOT_FILE]
-    with gr.Blocks(title=TITLE, analytics_enabled=False) as blocks:
+    with gr.Blocks(
+        title="tpgmm: a skill from demonstrations", analytics_enabled=False
+    ) as blocks:
         gr.Markdown(INTRODUCTION)
         skill = gr.State()
         with gr.Row():
             with gr.Column(scale=1):
                 source = gr.Radio(sources, value=sources[0], label="recordings")
                 with gr.Group(visible=sources[0] == UPLOADED) as own:
-                    files = gr.File(
-                        label="a .zip of a LeRobot data set's folder, or .csv, .parquet",
-                        file_count="multiple",
-                        file_types=[".zip", ".csv", ".parquet"],
-                    )
+                    label = "a .zip of a LeRobot data set's folder, or .csv, .parquet"
+                    kinds = [".zip", ".csv", ".parquet"]
+                    files = gr.File(label=label, file_count="multiple", file_types=kinds)
+                    robots = [NO_ROBOT, *ROBOTS, ROBOT_FILE]
                     robot = gr.Dropdown(robots, value=NO_ROBOT, label="robot")
                     robot_file = gr.File(label=ROBOT_FILE, file_types=[".urdf", ".xml"])
                     links = gr.Textbox(label="links of interest", placeholder="l_hand, r_hand")
@@ -193,7 +291,7 @@ def page(more: Mapping[str, Callable[[], Shown]] | None = None) -> Any:
             with gr.Column(scale=2):
                 number = gr.Dropdown([1], value=1, label="start as in demonstration")
                 places = gr.Dataframe(
-                    headers=list(PLACE),
+                    headers=["object", "x [m]", "y [m]", "z [m]", "turn [deg]"],
                     datatype=["str", *["number"] * 4],
                     type="array",
                     label="where the objects stand",
@@ -204,10 +302,10 @@ def page(more: Mapping[str, Callable[[], Shown]] | None = None) -> Any:
                 taken = gr.File(label="to take away", file_count="multiple")
 
         def ready(*given: Any) -> tuple[Skill | None, str, Any, list[list[Any]]]:
-            answer: Callable[..., tuple[Skill | None, str]] = learned
-            new, text = answer(*given, more=more)
-            count = len(new.demonstrations) if new is not None else 1
-            return new, text, gr.Dropdown(list(range(1, count + 1)), value=1), places_of(new, 1)
+            answer: Callable[..., tuple[Skill | None, str]] = learn
+            new, text = answer(*given, more)
+            numbers = list(range(1, len(new.demonstrations) + 1 if new is not None else 2))
+            return new, text, gr.Dropdown(numbers, value=1), places_of(new, 1)
 
         asked = [source, files, robot, robot_file, links, frames, n_components]
         source.change(
@@ -215,20 +313,10 @@ def page(more: Mapping[str, Callable[[], Shown]] | None = None) -> Any:
         )
         begin.click(ready, asked, [skill, report, number, places], api_name="learn", **TURNS)
         number.input(places_of, [skill, number], places, api_name="places")
-        look.click(
-            shown_motion, [skill, number, places], [picture, remarked, taken],
-            api_name="show", **TURNS,
-        )  # fmt: skip
+        given, answer = [skill, number, places], [picture, remarked, taken]
+        look.click(show, given, answer, api_name="show", **TURNS)
     return blocks
 
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def _refusal(error: Exception) -> str:
-    """What to mend, as Markdown; an error that no user can mend goes on."""
-    message = explain(error)
-    if message is None:
-        raise error
-    return f"**It does not work like this:** {' '.join(message.split())}"

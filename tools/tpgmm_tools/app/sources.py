@@ -1,4 +1,4 @@
-"""Where the page gets demonstrations from: the generated skill, or files that are uploaded."""
+"""Demonstrations for the page: the generated skill, and files that are uploaded."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from tpgmm_datasets.bottle.skill import BottleShaking, upper_body
-from tpgmm_datasets.commands.recordings import Recordings
+from tpgmm_datasets.reader import load_lerobot
+from tpgmm_datasets.text import parse_frames
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.tables import demonstrations_from_frame, read_table
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["Shown", "generated_bottle", "uploaded"]
+__all__ = ["Recorded", "generated_bottle", "uploaded"]
 
 #: Demonstrations, and the robot that gave them if it is known.
-Shown = tuple[list[Demonstration], Kinematics | None]
+Recorded = tuple[list[Demonstration], Kinematics | None]
 
-TABLES = (".csv", ".parquet")
 #: A LeRobot data set's description, in its folder.
 DESCRIPTION = "meta/info.json"
 #: Of an archive, unpacked [bytes]: a small one can hold more than a disk does.
@@ -28,23 +28,15 @@ MOST_BYTES = 2 * 1024**3
 
 
 @cache
-def generated_bottle(n_demonstrations: int = 5, rate: int = 25) -> Shown:
-    """Demonstrations of shaking a bottle with two hands; made once, as that takes a while.
-
-    Parameters
-    ----------
-    n_demonstrations : int, default=5
-        How many.
-    rate : int, default=25
-        Time steps per second.
-    """
-    return BottleShaking(rate=rate).demonstrations(n_demonstrations, 0), upper_body()
+def generated_bottle() -> Recorded:
+    """Demonstrations of shaking a bottle with two hands; made once, as that takes a while."""
+    return BottleShaking(rate=25).demonstrations(5, 0), upper_body()
 
 
 def uploaded(
     files: Sequence[str | Path], robot: Kinematics | None = None, frames: Sequence[str] = ()
 ) -> list[Demonstration]:
-    """The demonstrations in files that somebody sent.
+    """The demonstrations in uploaded files.
 
     Parameters
     ----------
@@ -62,19 +54,19 @@ def uploaded(
     DataError
         If these are no such files.
     """
-    paths = [Path(file) for file in files]
+    paths = sorted(Path(file) for file in files)
     kinds = {path.suffix.lower() for path in paths}
     if kinds == {".zip"} and len(paths) == 1:
         with TemporaryDirectory() as place:
             folder = _unpacked(paths[0], Path(place))
-            return Recordings(str(folder), robot, frames or None).demonstrations()
-    if not paths or not kinds <= set(TABLES):
+            return load_lerobot(folder, robot=robot, frames=parse_frames(frames))
+    if not paths or not kinds <= {".csv", ".parquet"}:
+        names = ", ".join(path.name for path in paths) or "no file"
         raise DataError(
             "give one .zip of a LeRobot data set's folder, or tables (.csv, .parquet); got "
-            f"{', '.join(path.name for path in paths) or 'no file'}"
+            f"{names}"
         )
-    tables = [demonstrations_from_frame(read_table(path)) for path in sorted(paths)]
-    return [one for table in tables for one in table]
+    return [one for path in paths for one in demonstrations_from_frame(read_table(path))]
 
 
 def _unpacked(archive: Path, place: Path) -> Path:

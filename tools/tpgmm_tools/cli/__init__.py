@@ -1,6 +1,6 @@
 """The command ``tpgmm``.
 
-Modules here import the toolkit inside their commands, so that ``tpgmm --help`` is quick.
+All modules but ``fit`` import the toolkit inside their commands: ``tpgmm --help`` is quick.
 """
 
 import sys
@@ -9,7 +9,7 @@ __all__ = ["main"]
 
 
 def main() -> None:
-    """Run the command line; what the entry point ``tpgmm`` calls."""
+    """Run the command line: the entry point ``tpgmm``."""
     try:
         from tpgmm_tools.cli.application import app
     except ModuleNotFoundError as error:

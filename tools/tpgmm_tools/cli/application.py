@@ -1,16 +1,133 @@
-"""The command ``tpgmm``: what its commands have in common, and what plugins add."""
+"""The command ``tpgmm``: a group whose errors are one line, and to which plugins add."""
 
 from __future__ import annotations
 
-from importlib.metadata import version
-from typing import Annotated
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.metadata import EntryPoint, version
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from tpgmm_tools.cli import correct, fit, plot, reproduce, view
-from tpgmm_tools.cli.commands import Commands
+from tpgmm_tools.cli import dataset, demo, plot, plugins, reproduce, view
 
-__all__ = ["app"]
+__all__ = ["app", "explain"]
+
+#: Commands of this package in the order of ``--help``; those of plugins follow.
+ORDER = ("demo", "fit", "reproduce", "plot", "view", "app", "dataset")
+#: Those that are imported when they run: where they are, and their line in ``--help``.
+LATE = {
+    "fit": (
+        EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
+        "Learn a skill from a LeRobot data set.",
+    ),
+    "app": (
+        EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS),
+        "Learn and look in the browser: a data set in, a moving picture out.",
+    ),
+}
+#: Packages of the extra ``cli``.
+OPTIONAL = ("matplotlib", "pandas", "pyarrow")
+
+
+class Commands(TyperGroup):
+    """Typer's group with one-line errors (exit code 2) and commands from plugins.
+
+    Attributes
+    ----------
+    debug : bool
+        Let errors through, for their traceback.
+    """
+
+    debug = False
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run with arguments and exit; as in click, ``standalone_mode=False`` returns."""
+        given = (args, prog_name, complete_var, False, windows_expand_args)
+        if not standalone_mode:
+            return super().main(*given, **extra)
+        original = warnings.showwarning
+        warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
+        try:
+            code = super().main(*given, **extra)
+        except Exception as error:
+            message = None if self.debug else explain(error)
+            if message is None:
+                raise
+            _say(message)
+            code = 2
+        finally:
+            warnings.showwarning = original
+        sys.exit(code if isinstance(code, int) else 0)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The commands of this package and those of plugins."""
+        names = {*super().list_commands(ctx), *LATE, *plugins.registered(plugins.COMMANDS)}
+        return sorted(names, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command by name; of one that is not imported yet, only the name and one line."""
+        command = super().get_command(ctx, cmd_name)
+        if command is None and (found := _late(cmd_name)) is not None:
+            command = TyperCommand(cmd_name, help=found[1])
+        return command
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is about to run, imported."""
+        if args[0] not in self.commands and (found := _late(args[0])) is not None:
+            self.add_command(_as_command(found[0]))
+        return super().resolve_command(ctx, args)
+
+
+def _late(name: str) -> tuple[EntryPoint, str] | None:
+    if name in LATE:
+        return LATE[name]
+    plugin = plugins.registered(plugins.COMMANDS).get(name)
+    if plugin is None:
+        return None
+    origin = plugin.dist.name if plugin.dist else plugin.module
+    return plugin, f"A command of {origin}: tpgmm {name} --help"
+
+
+def _as_command(plugin: EntryPoint) -> Any:
+    loaded = plugins.load(plugin)
+    if not isinstance(loaded, typer.Typer):
+        function, loaded = loaded, typer.Typer(add_completion=False)
+        loaded.command(plugin.name)(function)
+    command = typer.main.get_command(loaded)
+    command.name = plugin.name
+    return command
+
+
+def explain(error: Exception) -> str | None:
+    """The message of an ``error`` that a user can mend; None for any other."""
+    # some releases of typer bring their own copy of click's classes
+    if hasattr(error, "format_message"):
+        context = getattr(error, "ctx", None)
+        hint = f" (see {context.command_path} --help)" if context else ""
+        return f"{error.format_message()}{hint}"
+    if isinstance(error, typer.Abort):
+        return "aborted"
+    if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL:
+        return f"this command needs {error.name}: pip install 'tpgmm-torch[cli]'"
+    from tpgmm_torch.exceptions import TPGMMError
+
+    return str(error) if isinstance(error, TPGMMError | OSError) else None
+
+
+def _say(message: str) -> None:
+    typer.echo(f"tpgmm: {' '.join(message.split())}", err=True)
+
 
 app = typer.Typer(
     name="tpgmm",
@@ -21,8 +138,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     epilog="Start with: tpgmm demo --out out/demo",
 )
-for module in (fit, correct, reproduce, plot, view):
+for module in (demo, plot, reproduce, view):
     app.registered_commands += module.app.registered_commands
+app.add_typer(dataset.app, name="dataset")
 
 
 @app.callback()
@@ -37,7 +155,7 @@ def tpgmm(
 ) -> None:
     """Robot skills from ten demonstrations: task-parameterised Gaussian mixtures.
 
-    Learn from a LeRobot data set and a URDF, reproduce in situations never seen.
+    Learn from a LeRobot data set and a URDF, reproduce in new situations.
     """
     if isinstance(context.command, Commands):
         context.command.debug = debug

@@ -11,8 +11,6 @@ import typer
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from tpgmm_torch.operators import Operator
     from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -20,19 +18,17 @@ __all__ = ["app"]
 
 app = typer.Typer()
 
-EXAMPLE = (
-    "Example: tpgmm plot out/model --dataset out/demo/dataset --joint l_shoulder_pitch "
-    "--out out/pictures"
-)
+EXAMPLE = "tpgmm plot out/model --dataset out/demo/dataset --joint l_elbow --out out/pictures"
 
 
-@app.command(epilog=EXAMPLE)
+@options.command(app, EXAMPLE)
 def plot(
     model: options.Model,
     dataset: Annotated[
         str, typer.Option(help="A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.")
     ],
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the pictures go.")],
+    data: options.DataOptions,
     joint: Annotated[
         list[str] | None,
         typer.Option(help="Also draw each operator's estimate of this joint; repeatable."),
@@ -41,16 +37,9 @@ def plot(
         Literal["png", "pdf", "svg"],
         typer.Option("--format", help="Pixels, or vectors for print."),
     ] = "png",
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
     alignment: options.AlignmentMethod = "dtw",
 ) -> None:
-    """Draw what a model has learned.
+    """Draw a fitted model.
 
     For every operator a picture of its coordinates over time: the demonstrations (black), the
     components (green), and the reproduction in the situation of the first episode (orange).
@@ -63,32 +52,29 @@ def plot(
 
     fitted = TaskParameterizedGMM.load(model, device="cpu")
     kinematics = fitted.kinematics_
-    chosen = joint or ()
-    for name in chosen:
+    for name in joint or ():
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
-    recordings = options.recordings(
-        dataset, kinematics, frame, event, episodes, units, joints, joint_name, rate
-    )
-    demonstrations = options.align(recordings.demonstrations(), alignment, kinematics)
+    demonstrations = options.align(data.read(dataset, kinematics), alignment, kinematics)
     situation = Situation.of(demonstrations[0])
     [trajectory] = fitted.predict([situation])
     shown: list[tuple[Any, Any, Any]] = [
         (trajectory, situation.frames_at(trajectory.time.cpu()), {})
     ]
-    drawings: dict[str, Figure] = {}
+    drawings = {}
     labels = [fill(format_operator(operator), 60) for operator in fitted.operators_]
     for index, operator in enumerate(fitted.operators_):
         names = coordinate_names(operator, kinematics)
-        drawing = figure(len(names), labels[index], height=1.3)
+        drawings[f"operator_{index + 1}"] = drawing = figure(
+            len(names), labels[index], height=1.3
+        )
         for column, (axes, name) in enumerate(zip(drawing.axes, names, strict=True)):
             plot_local(axes, fitted, index, column, demonstrations, shown)
             axes.set_ylabel(name, fontsize="small")
-        drawings[f"operator_{index + 1}"] = drawing
-    for name in chosen:
-        drawing = figure(1, f"{name}: what each operator asks for, and the result", height=3.2)
+    for name in joint or ():
+        title = f"{name}: each operator's estimate, and the result"
+        drawings[f"joint_{name}"] = drawing = figure(1, title, height=3.2)
         plot_candidates(drawing.axes[0], trajectory, name, labels)
-        drawings[f"joint_{name}"] = drawing
     out.mkdir(parents=True, exist_ok=True)
     for name, drawing in drawings.items():
         legend(drawing)
@@ -96,27 +82,24 @@ def plot(
 
 
 def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:
-    """A label for each local coordinate of an operator."""
-    from tpgmm_torch.operators import (
-        AbsoluteOrientation,
-        AbsolutePosition,
-        Canonical,
-        RelativeOrientation,
-        RelativePosition,
-        Stack,
-    )
+    """A label for each local coordinate of an operator.
 
-    if isinstance(operator, Stack):
-        return [
-            n for member in operator.operators for n in coordinate_names(member, kinematics)
-        ]
-    if isinstance(operator, Canonical):
+    Parameters
+    ----------
+    operator, kinematics : Operator, Kinematics
+        Whose coordinates, for which robot.
+    """
+    from tpgmm_torch import operators as kinds
+
+    if isinstance(operator, kinds.Stack):
+        return [n for one in operator.operators for n in coordinate_names(one, kinematics)]
+    if isinstance(operator, kinds.Canonical):
         names = kinematics.joint_names
         return [names[column] for column in operator.columns(names)]
-    if isinstance(operator, AbsolutePosition | RelativePosition):
+    if isinstance(operator, kinds.AbsolutePosition | kinds.RelativePosition):
         return [f"{operator.link}\n{axis} [m]" for axis in "xyz"]
     if operator.rotation_vector_starts(kinematics) == (0,):
         return [f"{operator.links()[0]}\nrotation {axis} [rad]" for axis in "xyz"]
-    if isinstance(operator, AbsoluteOrientation | RelativeOrientation):
+    if isinstance(operator, kinds.AbsoluteOrientation | kinds.RelativeOrientation):
         return [f"{operator.link}\nq{part}" for part in "wxyz"]
     return [f"coordinate {i + 1}" for i in range(operator.dimension(kinematics))]

@@ -1,46 +1,20 @@
-"""What packages built on the toolkit bring to the command line, looked up as entry points."""
+"""Commands and model formats of other distributions, found by entry points."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any
 
-if TYPE_CHECKING:
-    from tpgmm_torch.data.demonstrations import Demonstration
-    from tpgmm_torch.large_data.processes import Processes
+__all__ = ["COMMANDS", "FORMATS", "load", "model_format", "registered"]
 
-__all__ = ["Recordings", "model_format", "registered", "required"]
-
-#: The groups. A command is a typer app or a function, added under its name.
+#: Group of commands: a typer app or a function, added under its name.
 COMMANDS = "tpgmm.commands"
-#: A format writes a fitted model to a folder, told the :meth:`Recordings.signals`.
+#: Group of formats: a function of a fitted model, a folder, and the data set's signals.
 FORMATS = "tpgmm.formats"
-#: A reader makes :class:`Recordings` of what ``options.recordings`` is told.
-READERS = "tpgmm.readers"
-#: A robot is a function that returns its URDF.
-ROBOTS = "tpgmm.robots"
-#: The format of ``TaskParameterizedGMM.save``, which is nobody's plugin.
+#: The format of a model's own folder.
 OWN = "tpgmm"
-
-
-class Recordings(Protocol):
-    """A data set as the options of a command describe it."""
-
-    def demonstrations(self) -> list[Demonstration]:
-        """All episodes that are meant."""
-
-    def batches(
-        self, size: int, processes: Processes | None = None
-    ) -> Iterable[Sequence[Demonstration]]:
-        """The same in batches of ``size`` episodes; a share of them for each process."""
-
-    def corrections(self) -> list[Demonstration]:
-        """What a person did, where the set tells it from what a policy did."""
-
-    def signals(self) -> Any:
-        """Names, units and rate of states and actions: what a policy must know."""
 
 
 def registered(group: str) -> dict[str, EntryPoint]:
@@ -48,27 +22,27 @@ def registered(group: str) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=group)}
 
 
-def required(group: str, name: str) -> Any:
-    """What this distribution itself registers in ``group`` under ``name``.
+def load(plugin: EntryPoint) -> Any:
+    """The object of a ``plugin``.
 
     Raises
     ------
     DependencyError
-        If it does not, because an older release is installed than is run.
+        If it cannot be imported.
     """
     from tpgmm_torch.exceptions import DependencyError
 
-    entries = registered(group)
-    if name not in entries:
+    try:
+        return plugin.load()
+    except Exception as error:  # whatever is wrong with it
         raise DependencyError(
-            f"nothing that is installed registers {name!r} in {group!r}: install "
-            "'tpgmm-torch[cli]' again"
-        )
-    return entries[name].load()
+            f"{plugin.name!r}, a plugin in {plugin.group!r}, cannot be loaded: "
+            f"{type(error).__name__}: {error}"
+        ) from error
 
 
 def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
-    """What writes a model in the format ``name``; None for the estimator's own.
+    """The function that writes a model in the format ``name``; None for a model's own folder.
 
     Raises
     ------
@@ -77,20 +51,15 @@ def model_format(name: str) -> Callable[[Any, Path, Any], None] | None:
     DependencyError
         If its plugin cannot be loaded.
     """
-    from tpgmm_torch.exceptions import DataError, DependencyError
+    from tpgmm_torch.exceptions import DataError
 
     if name == OWN:
         return None
-    plugins = registered(FORMATS)
-    if name not in plugins:
+    formats = registered(FORMATS)
+    if name not in formats:
         raise DataError(
-            f"format {name!r} is not known here; there are {sorted({OWN, *plugins})}. "
+            f"format {name!r} is not known here; there are {sorted({OWN, *formats})}. "
             "'lerobot' comes with the plugin: pip install lerobot_policy_tpgmm"
         )
-    try:
-        writer: Callable[[Any, Path, Any], None] = plugins[name].load()
-    except ImportError as error:
-        raise DependencyError(
-            f"the plugin of format {name!r}, {plugins[name].value}, cannot be loaded: {error}"
-        ) from error
+    writer: Callable[[Any, Path, Any], None] = load(formats[name])
     return writer

@@ -1,10 +1,9 @@
-"""``tpgmm reproduce``: what a model does in new situations."""
+"""``tpgmm reproduce``: the motions of a model in new situations."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,7 +20,7 @@ app = typer.Typer()
 
 FORMATS = (".parquet", ".csv", ".npz")
 EXAMPLE = (
-    "Example: tpgmm reproduce out/model --dataset out/demo/dataset --episodes 0:3 "
+    "tpgmm reproduce out/model --dataset out/demo/dataset --episodes 0:3 "
     "--out out/reproductions.csv"
     "\n\n"
     'A file of situations: [{"joints": {"elbow": 0.3, ...}, "frames": {"bottle": '
@@ -30,27 +29,18 @@ EXAMPLE = (
 ).replace("[", "\\[")
 
 
-@app.command(epilog=EXAMPLE)
+@options.command(app, EXAMPLE)
 def reproduce(
     model: options.Model,
     out: Annotated[
         Path, typer.Option(metavar="FILE", help="Where they go: .parquet, .csv or .npz.")
     ],
-    situations: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="Situations: start postures and frames."),
-    ] = None,
+    data: options.DataOptions,
+    situations: options.Situations = None,
     dataset: Annotated[
         str | None,
         typer.Option(help="Or a LeRobot data set: the situations of its episodes."),
     ] = None,
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
     via: Annotated[
         list[str] | None,
         typer.Option(
@@ -71,42 +61,25 @@ def reproduce(
     (.parquet, .csv), as tpgmm_torch.data.tables.trajectories_from_frame reads it back, or
     arrays (.npz). Prints a line per situation.
     """
-    from tpgmm_torch.data.demonstrations import Situation
-    from tpgmm_torch.data.situation_files import read_situations
-    from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError, UnknownNameError
-    from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
-    from tpgmm_torch.persistence import MODES
 
     if out.suffix not in FORMATS:
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
         raise DataError("give either --situations FILE.json or --dataset DATASET")
-    fitted: TaskParameterizedGMM | MultimodalTaskParameterizedGMM
-    if (model / MODES).is_dir():
-        if via:
-            raise DataError(f"--via is for one way, as {model / 'mode_0'}")
-        fitted = ways = MultimodalTaskParameterizedGMM.load(model, device="cpu")
-        kinematics = ways.models_[0].kinematics_
-    else:
-        fitted = one = TaskParameterizedGMM.load(model, device="cpu")
-        kinematics = one.kinematics_
-    if dataset is not None:
-        recordings = options.recordings(
-            dataset, kinematics, frame, event, episodes, units, joints, joint_name, rate
-        )
-        wanted = [Situation.of(shown) for shown in recordings.demonstrations()]
-    elif situations is not None:
-        wanted = read_situations(situations, kinematics.joint_names)
+    fitted = options.load(model)
+    several = hasattr(fitted, "models_")
+    if several and via:
+        raise DataError(f"--via is for one way, as {model / 'mode_0'}")
+    kinematics = (fitted.models_[0] if several else fitted).kinematics_
+    wanted, _ = options.wanted(situations, dataset, data, kinematics)
     if via:
-        fitted = one.with_via_points(via, fade)
-    choices: list[ModeChoice] = []
+        fitted = fitted.with_via_points(via, fade)
+    choices: dict[str, Any] = {}
     try:
-        if isinstance(fitted, MultimodalTaskParameterizedGMM):
-            choices = fitted.choose(wanted)
-            trajectories = fitted.predict(wanted, candidates=False, choices=choices)
-        else:
-            trajectories = fitted.predict(wanted, candidates=False)
+        if several:
+            choices["choices"] = fitted.choose(wanted)
+        trajectories = fitted.predict(wanted, candidates=False, **choices)
     except UnknownNameError as error:
         if error.kind != "frame" or dataset is None:
             raise
@@ -117,41 +90,35 @@ def reproduce(
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
-    for number, choice in enumerate(choices):
+    for number, choice in enumerate(choices.get("choices", ())):
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
 
 
 def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
-    import torch
-
     from tpgmm_torch.metrics import largest_acceleration, largest_velocity
 
-    joints, names = trajectory.joints, trajectory.joint_names
+    joints, tolerance = trajectory.joints, 1e-6
     speed = (joints.diff(dim=0) / trajectory.time.diff()[:, None]).abs().amax(0)
-    beyond = torch.maximum(kinematics.lower - joints, joints - kinematics.upper).amax(0)
-    tolerance = 1e-6
+    beyond = (kinematics.lower - joints).maximum(joints - kinematics.upper).amax(0)
+    fast = speed > kinematics.velocity * (1 + tolerance)
     problems = [
-        f"{name} beyond its limit by {float(by):.3g} rad"
-        for name, by in zip(names, beyond, strict=True)
-        if by > tolerance
-    ] + [
+        f"{name} beyond its limit by {float(by):.3g} rad" if by > tolerance else
         f"{name} faster than its limit"
-        for name, value, limit in zip(names, speed, kinematics.velocity, strict=True)
-        if value > limit * (1 + tolerance)
-    ]
+        for name, by, too_fast in zip(trajectory.joint_names, beyond, fast, strict=True)
+        if by > tolerance or too_fast
+    ]  # fmt: skip
+    novelty = trajectory.novelty
     return (
         f"{float(trajectory.time[-1] - trajectory.time[0]):6.2f} s  "
         f"speed <= {largest_velocity(trajectory):.3g} rad/s  "
         f"acceleration <= {largest_acceleration(trajectory):.3g} rad/s^2  "
         f"{', '.join(problems) or 'within limits'}"
-        f"{'' if trajectory.novelty is None else f'  novelty {trajectory.novelty:.2g}'}"
+        f"{'' if novelty is None else f'  novelty {novelty:.2g}'}"
     )
 
 
-def _write(
-    trajectories: Sequence[Trajectory], situations: Sequence[Situation], out: Path
-) -> None:
+def _write(trajectories: list[Trajectory], situations: list[Situation], out: Path) -> None:
     import numpy as np
 
     from tpgmm_torch.atomic import replacing
@@ -159,17 +126,15 @@ def _write(
     from tpgmm_torch.data.tables import trajectories_to_frame, write_table
 
     if out.suffix != ".npz":
-        frames = [
-            s.frames_at(t.time.cpu()) for t, s in zip(trajectories, situations, strict=True)
-        ]
+        pairs = zip(trajectories, situations, strict=True)
+        frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
         write_table(trajectories_to_frame(trajectories, frames), out)
         return
+    arrays: dict[str, Any] = {
+        name: np.concatenate([as_array(getattr(one, name)) for one in trajectories])
+        for name in ("time", "joints", "covariance")
+    }
+    arrays["episode"] = np.repeat(np.arange(len(trajectories)), list(map(len, trajectories)))
+    arrays["joint_names"] = np.array(trajectories[0].joint_names)
     with replacing(out) as new:
-        np.savez(
-            new,
-            episode=np.repeat(np.arange(len(trajectories)), list(map(len, trajectories))),
-            time=np.concatenate([as_array(one.time) for one in trajectories]),
-            joints=np.concatenate([as_array(one.joints) for one in trajectories]),
-            covariance=np.concatenate([as_array(one.covariance) for one in trajectories]),
-            joint_names=np.array(trajectories[0].joint_names),
-        )
+        np.savez(new, **arrays)

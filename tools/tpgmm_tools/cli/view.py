@@ -1,4 +1,4 @@
-"""``tpgmm view``: look at a motion."""
+"""``tpgmm view``: a motion in three dimensions."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ app = typer.Typer()
 SUFFIXES = {"html": ".html", "rerun": ".rrd"}
 serving = options.in_panel("Live")
 EXAMPLE = (
-    "Example: tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
+    "tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
     "\n\n"
     "Example: tpgmm view out/model --dataset out/demo/dataset --episodes 0:5 --live"
 )
 
 
-@app.command(epilog=EXAMPLE)
+@options.command(app, EXAMPLE)
 def view(
+    data: options.DataOptions,
     model: Annotated[
         Path,
         typer.Argument(
@@ -45,13 +46,7 @@ def view(
         str | None,
         typer.Option(help="A LeRobot data set: demonstrated paths, and their situations."),
     ] = None,
-    situations: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.json",
-            help="Situations, as 'tpgmm reproduce' takes them, instead of the data set's.",
-        ),
-    ] = None,
+    situations: options.Situations = None,
     situation: Annotated[
         list[int],
         typer.Option(
@@ -68,13 +63,6 @@ def view(
             "sphere:RADIUS in metres, at the origin of its frame; else a small box.",
         ),
     ] = None,
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
     meshes: Annotated[
         Path | None,
         options.of_robot(
@@ -89,7 +77,7 @@ def view(
         bool,
         serving(
             "Serve the page instead: objects can be moved by hand, and the skill is "
-            "reproduced anew.",
+            "reproduced for where they are.",
             "--live",
         ),
     ] = False,
@@ -106,8 +94,6 @@ def view(
     import torch
 
     from tpgmm_tools.viewing import LiveView, parse_shape, write_motion, write_rerun
-    from tpgmm_torch.data.demonstrations import Situation
-    from tpgmm_torch.data.situation_files import read_situations
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
 
@@ -124,45 +110,25 @@ def view(
     if situations is None and dataset is None:
         raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
     fitted = TaskParameterizedGMM.load(where, device="cpu")
-    demonstrations = []
-    if dataset is not None:
-        demonstrations = options.recordings(
-            dataset, fitted.kinematics_, frame, event, episodes, units, joints, joint_name, rate
-        ).demonstrations()
-    if situations is not None:
-        wanted = read_situations(situations, fitted.kinematics_.joint_names)
-    else:
-        wanted = [Situation.of(demonstration) for demonstration in demonstrations]
+    wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
     if (last := max(situation)) >= len(wanted):
         raise DataError(
             f"there are {len(wanted)} situations, counted from 0; got --situation {last}"
         )
-    objects = {}
-    for text in shapes or ():
-        name, _, shape = text.partition("=")
-        objects[name] = parse_shape(shape)
+    pairs = [text.partition("=") for text in shapes or ()]
+    objects = {name: parse_shape(shape) for name, _, shape in pairs}
+    how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
     if live:
-        at: dict[str, Any] = {"host": host, "port": port}
+        at = {"host": host, "port": port, "first": situation[0], **how}
         with (
-            LiveView(
-                fitted,
-                wanted,
-                demonstrations,
-                objects=objects,
-                first=situation[0],
-                meshes=meshes,
-                fps=fps,
-                **at,
-            ) as shown,
+            LiveView(fitted, wanted, demonstrations, **at) as shown,
             suppress(KeyboardInterrupt),
         ):
             typer.echo(f"open {shown.url} in a browser; stop with Ctrl-C")
             shown.run()
         return
-    numbers = ", ".join(map(str, situation))
     chosen = [wanted[number] for number in situation]
-    how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
-    how["title"] = f"{model.resolve().name}, situation {numbers}"
+    how["title"] = f"{model.resolve().name}, situation {', '.join(map(str, situation))}"
     if form == "rerun":
         trajectory = write_rerun(place, fitted, chosen[0], demonstrations, **how)
     else:

@@ -1,12 +1,11 @@
-"""Looking at a motion in three dimensions: the robot, the paths, and how sure the model is.
+"""Motions in three dimensions: robot, objects, paths, and where the links may be.
 
 Needs the extra ``view`` (viser). :func:`write_motion` makes one HTML file that opens
 anywhere, :func:`write_rerun` (extra ``rerun``) a recording; :class:`LiveView` serves the same
 scene, in which objects can be moved by hand.
 """
 
-from tpgmm_tools.viewing.live import LiveView
-from tpgmm_tools.viewing.recording import write_motion
+from tpgmm_tools.viewing.page import LiveView, write_motion
 from tpgmm_tools.viewing.rerun_recording import write_rerun
 from tpgmm_tools.viewing.scene import MotionScene, ellipsoids
 from tpgmm_tools.viewing.visuals import Shape, link_shapes, parse_shape

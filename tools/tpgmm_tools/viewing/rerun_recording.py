@@ -1,19 +1,20 @@
-"""The same motion as a Rerun recording."""
+"""The same motion as a Rerun recording, for LeRobot's own viewer."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+import torch
 
 from tpgmm_tools.viewing.curves import motion_marks, motion_panels
-from tpgmm_tools.viewing.scene import MotionScene
-from tpgmm_tools.viewing.visuals import Shape
+from tpgmm_tools.viewing.scene import COLORS, MotionScene
+from tpgmm_tools.viewing.visuals import Shape, mesh
+from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -23,8 +24,6 @@ __all__ = ["write_rerun"]
 
 #: Of the time line.
 TIME = "time"
-#: Where what happens, or begins, is logged.
-MARKS = "marks"
 
 
 def write_rerun(
@@ -33,10 +32,8 @@ def write_rerun(
     situation: Situation,
     demonstrations: Sequence[Demonstration] = (),
     *,
-    objects: Mapping[str, Shape] | None = None,
-    meshes: Path | None = None,
-    fps: float = 25.0,
     title: str = "tpgmm",
+    **how: Any,
 ) -> Trajectory:
     """Write what :func:`~tpgmm_tools.viewing.write_motion` shows as a ``.rrd`` file.
 
@@ -44,15 +41,17 @@ def write_rerun(
     ----------
     path : str or Path
         The file; replaced if it exists. ``rerun FILE`` opens it.
-    model, situation, demonstrations, objects, meshes, fps
+    model, situation, demonstrations
         As for :func:`~tpgmm_tools.viewing.write_motion`, of one situation.
     title : str, default="tpgmm"
         Of the recording.
+    **how
+        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
 
     Returns
     -------
     Trajectory
-        What the file shows.
+        The reproduction.
 
     Raises
     ------
@@ -65,164 +64,77 @@ def write_rerun(
         raise DependencyError(
             "Rerun recordings need rerun-sdk: pip install 'tpgmm-torch[rerun]'"
         ) from error
+    drawing = MotionScene(model, demonstrations, **how).draw(situation)
+
+    def pose(values: Array) -> Any:
+        return rerun.Transform3D(translation=values[:3], quaternion=np.roll(values[3:], -1))
+
     with replacing(path) as new:
         recording = rerun.RecordingStream("tpgmm", send_properties=True)
         recording.save(new)
         recording.send_recording_name(title)
-        drawing = _Drawing(rerun, recording)
-        server = SimpleNamespace(scene=drawing, initial_camera=SimpleNamespace())
-        scene = MotionScene(server, model, demonstrations, meshes, fps, objects=objects)
-        trajectory = scene.show(situation)
-        for picture, now in enumerate(scene.time - scene.time[0]):
+
+        def log(entity: str, *parts: Any) -> None:
+            for part in parts:
+                recording.log(entity, part, static=True)
+
+        for name, node in drawing.nodes.items():
+            if node.axes:
+                log(name, rerun.TransformAxes3D(node.axes))
+            if node.label:
+                origin = [[0.0, 0.0, 0.0]]
+                log(f"{name}/label", rerun.Points3D(origin, labels=[node.label], radii=[0]))
+            for solid, shape in node.solids.items():
+                turn = torch.from_numpy(np.ascontiguousarray(shape.pose[:3, :3]))
+                turned = quaternions.from_matrix(turn).numpy()
+                placed = pose(np.concatenate((shape.pose[:3, 3], turned)))
+                log(f"{name}/{solid}", placed, _solid(rerun, shape))
+        for name, lines in drawing.lines.items():
+            radii = rerun.Radius.ui_points(lines.thickness / 2)
+            log(name, rerun.LineStrips3D(lines.points, colors=[lines.color], radii=radii))
+        for name, some in drawing.ellipsoids.items():
+            parts = rerun.Ellipsoids3D(
+                half_sizes=some.half_axes,
+                centers=some.centres,
+                quaternions=np.roll(some.orientations, -1, axis=1),
+                colors=[(*COLORS["covariance"], 90)],
+                fill_mode=rerun.components.FillMode.Solid,
+            )
+            log(name, parts)
+        for name, poses in drawing.axes.items():
+            for number, values in enumerate(poses):
+                axes = rerun.TransformAxes3D(0.025 * drawing.size)
+                log(f"{name}/{number}", pose(values), axes)
+        for picture, now in enumerate(drawing.time):
             recording.set_time(TIME, duration=float(now))
-            scene.move_to(picture)
-        for panel in motion_panels(model, trajectory):
+            for name, node in drawing.nodes.items():
+                if picture == 0 or len(node.poses) > 1:
+                    recording.log(name, pose(node.poses[picture]))
+        for panel in motion_panels(model, drawing.trajectory):
             for curve in panel.curves:
-                entity = f"curves/{panel.title}/{curve.label or panel.title}".replace(" ", "_")
+                label = curve.label or panel.title
+                entity = f"curves/{panel.title}/{label}".replace(" ", "_")
                 rgb = [int(curve.color[at : at + 2], 16) for at in (1, 3, 5)]
-                style = rerun.SeriesLines(colors=[rgb], names=[curve.label or panel.title])
-                recording.log(entity, style, static=True)
+                log(entity, rerun.SeriesLines(colors=[rgb], names=[label]))
                 times = rerun.TimeColumn(TIME, duration=panel.time)
                 values = rerun.Scalars.columns(scalars=curve.values)
                 recording.send_columns(entity, [times], values)
-        for mark in motion_marks(model, trajectory):
+        for mark in motion_marks(model, drawing.trajectory):
             recording.set_time(TIME, duration=mark.time)
-            recording.log(MARKS, rerun.TextLog(mark.label))
+            recording.log("marks", rerun.TextLog(mark.label))
         recording.flush()
         recording.disconnect()
-    return trajectory
+    return drawing.trajectory
 
 
-class _Node:
-    """A node of the scene; what is assigned to its pose is recorded at the present instant."""
-
-    def __init__(self, drawing: _Drawing, name: str, pose: Mapping[str, Any]) -> None:
-        self._drawing, self.name = drawing, name
-        self._position = pose.get("position", (0.0, 0.0, 0.0))
-        self._wxyz = pose.get("wxyz", (1.0, 0.0, 0.0, 0.0))
-
-    @property
-    def position(self) -> Any:
-        return self._position
-
-    @position.setter
-    def position(self, value: Any) -> None:
-        self._position = value  # the orientation is always assigned after it
-
-    @property
-    def wxyz(self) -> Any:
-        return self._wxyz
-
-    @wxyz.setter
-    def wxyz(self, value: Any) -> None:
-        self._wxyz = value
-        self._drawing.place(self.name, self._position, value)
-
-
-class _Drawing:
-    """As much of viser's scene as :class:`MotionScene` uses, drawn by Rerun.
-
-    Parameters
-    ----------
-    rerun : module
-    recording : rerun.RecordingStream
-    """
-
-    def __init__(self, rerun: Any, recording: Any) -> None:
-        self._rr, self._recording = rerun, recording
-
-    def place(self, name: str, position: ArrayLike, wxyz: ArrayLike) -> None:
-        """Put a node somewhere in its parent, from now on."""
-        w, x, y, z = np.asarray(wxyz, dtype=float)
-        pose = self._rr.Transform3D(translation=np.asarray(position), quaternion=[x, y, z, w])
-        self._recording.log(name, pose)
-
-    def _add(self, name: str, *parts: Any, **placed: Any) -> _Node:
-        node = _Node(self, name, placed)
-        w, x, y, z = np.asarray(node.wxyz, dtype=float)
-        pose = self._rr.Transform3D(
-            translation=np.asarray(node.position), quaternion=[x, y, z, w]
-        )
-        if placed:
-            self._recording.log(name, pose, static=True)
-        for part in parts:
-            self._recording.log(name, part, static=True)
-        return node
-
-    def _solid(self, placed: dict[str, Any]) -> tuple[list[Any], Any]:
-        """Colour, and how solids are filled."""
-        opacity = placed.pop("opacity", None)
-        red, green, blue = placed.pop("color")
-        alpha = 255 if opacity is None else round(255 * opacity)
-        return [(red, green, blue, alpha)], self._rr.components.FillMode.Solid
-
-    def configure_default_lights(self, **_options: Any) -> None:
-        """The viewer has its own."""
-
-    def add_grid(self, *_place: Any, **_options: Any) -> None:
-        """The viewer has its own."""
-
-    def add_frame(
-        self, name: str, show_axes: bool = True, *, axes_length: float = 0.0, **_options: Any
-    ) -> _Node:
-        axes = self._rr.TransformAxes3D(axes_length) if show_axes else ()
-        return self._add(name, *([axes] if show_axes else ()))
-
-    def add_label(self, name: str, text: str) -> _Node:
-        return self._add(name, self._rr.Points3D([[0, 0, 0]], labels=[text], radii=[0]))
-
-    def add_line_segments(
-        self, name: str, points: Any, colors: Any, thickness: float, **_options: Any
-    ) -> _Node:
-        radii = self._rr.Radius.ui_points(thickness / 2)
-        return self._add(name, self._rr.LineStrips3D(points, colors=[colors], radii=radii))
-
-    def add_batched_axes(
-        self, name: str, *, batched_wxyzs: Any, batched_positions: Any, axes_length: float,
-        **_options: Any,
-    ) -> _Node:  # fmt: skip
-        for number, pose in enumerate(zip(batched_positions, batched_wxyzs, strict=True)):
-            node = f"{name}/{number}"
-            self._add(
-                node, self._rr.TransformAxes3D(axes_length), position=pose[0], wxyz=pose[1]
-            )
-        return self._add(name)
-
-    def add_batched_meshes_simple(
-        self, name: str, vertices: Any, faces: Any, *, batched_positions: Any,
-        batched_wxyzs: Any, batched_scales: Any, batched_colors: Any, opacity: float,
-        **_options: Any,
-    ) -> _Node:  # fmt: skip
-        """Ellipsoids: the mesh that is scaled is a ball."""
-        ellipsoids = self._rr.Ellipsoids3D(
-            half_sizes=batched_scales,
-            centers=batched_positions,
-            quaternions=np.roll(batched_wxyzs, -1, axis=1),
-            colors=[(*batched_colors, round(255 * opacity))],
-            fill_mode=self._rr.components.FillMode.Solid,
-        )
-        return self._add(name, ellipsoids)
-
-    def add_box(self, name: str, *, dimensions: Any, **placed: Any) -> _Node:
-        colors, fill = self._solid(placed)
-        box = self._rr.Boxes3D(sizes=[dimensions], colors=colors, fill_mode=fill)
-        return self._add(name, box, **placed)
-
-    def add_icosphere(self, name: str, radius: float, **placed: Any) -> _Node:
-        colors, fill = self._solid(placed)
-        ball = self._rr.Ellipsoids3D(radii=[radius], colors=colors, fill_mode=fill)
-        return self._add(name, ball, **placed)
-
-    def add_cylinder(self, name: str, radius: float, length: float, **placed: Any) -> _Node:
-        colors, fill = self._solid(placed)
-        solid = self._rr.Cylinders3D(
-            lengths=[length], radii=[radius], colors=colors, fill_mode=fill
-        )
-        return self._add(name, solid, **placed)
-
-    def add_mesh_simple(self, name: str, vertices: Any, faces: Any, **placed: Any) -> _Node:
-        colors, _ = self._solid(placed)
-        mesh = self._rr.Mesh3D(
-            vertex_positions=vertices, triangle_indices=faces, albedo_factor=colors[0]
-        )
-        return self._add(name, mesh, **placed)
+def _solid(rerun: Any, shape: Shape) -> Any:
+    color = (*shape.color, round(255 * shape.opacity))
+    look = {"colors": [color], "fill_mode": rerun.components.FillMode.Solid}
+    if shape.kind == "box":
+        return rerun.Boxes3D(sizes=[shape.size], **look)
+    if shape.kind == "sphere":
+        return rerun.Ellipsoids3D(radii=[shape.size[0]], **look)
+    if shape.kind == "cylinder":
+        return rerun.Cylinders3D(radii=[shape.size[0]], lengths=[shape.size[1]], **look)
+    vertices, faces = mesh(shape)
+    return rerun.Mesh3D(vertex_positions=vertices, triangle_indices=faces, albedo_factor=color)

@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes of its links, as a URDF's ``<visual>`` elements say.
+"""Shapes of a robot's links, from the ``<visual>`` elements of its URDF, and of objects.
 
 Boxes, cylinders, spheres, and meshes where their files are given. A link whose meshes are not
 at hand is drawn as sticks that lead from its origin to the joints that hang on it, so that any
@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfModel, placement, read_urdf
 
-__all__ = ["Color", "Shape", "link_shapes", "parse_shape", "whole_body"]
+__all__ = ["Color", "Shape", "link_shapes", "mesh", "parse_shape", "unit_ball", "whole_body"]
 
 Color = tuple[int, int, int]
 
@@ -148,19 +148,15 @@ def _shape(
         xyz, rpy = (_numbers(origin, key, 3, link, "0 0 0") for key in ("xyz", "rpy"))
         pose = placement(np.array(xyz), np.array(rpy))
     color, opacity = _color(visual, link, materials)
-    match solid.tag:
-        case "box":
-            return Shape("box", _numbers(solid, "size", 3, link), pose, color, opacity)
-        case "sphere":
-            return Shape("sphere", _numbers(solid, "radius", 1, link), pose, color, opacity)
-        case "cylinder":
-            size = _numbers(solid, "radius", 1, link) + _numbers(solid, "length", 1, link)
-            return Shape("cylinder", size, pose, color, opacity)
-    if meshes is None:
-        return None
-    scale = _numbers(solid, "scale", 3, link, "1 1 1")
-    file = _mesh_file(solid.get("filename", ""), link, meshes)
-    return Shape("mesh", scale, pose, color, opacity, file)
+    if solid.tag == "mesh":
+        if meshes is None:
+            return None
+        scale = _numbers(solid, "scale", 3, link, "1 1 1")
+        file = _mesh_file(solid.get("filename", ""), link, meshes)
+        return Shape("mesh", scale, pose, color, opacity, file)
+    keys = {"box": ["size"], "sphere": ["radius"], "cylinder": ["radius", "length"]}[solid.tag]
+    sizes = [_numbers(solid, key, 3 if key == "size" else 1, link) for key in keys]
+    return Shape(solid.tag, sum(sizes, ()), pose, color, opacity)  # type: ignore[arg-type]
 
 
 def _numbers(
@@ -258,3 +254,36 @@ def _held_by(urdf: UrdfModel, base: str) -> set[str]:
         held |= new
         front += new
     return held
+
+
+def unit_ball() -> tuple[Array, Array]:
+    """Vertices (V, 3) and triangles (F, 3) of a ball of radius 1."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
+def mesh(shape: Shape) -> tuple[Array, Array]:
+    """Vertices (V, 3) [m] and triangles (F, 3) of a ``shape`` that is a mesh.
+
+    Of the formats, COLLADA alone says in which unit its numbers are.
+
+    Raises
+    ------
+    DataError, DependencyError
+        If the file cannot be read, or a package is missing for its format.
+    """
+    import trimesh
+
+    try:
+        loaded = trimesh.load_mesh(shape.file)
+        units = loaded.units
+        unit = trimesh.units.unit_conversion(units, "meters") if units else 1.0
+        return np.asarray(loaded.vertices) * unit * shape.size, np.asarray(loaded.faces)
+    except ImportError as error:
+        raise DependencyError(
+            f"the mesh {shape.file} needs pycollada: pip install 'tpgmm-torch[collada]'"
+        ) from error
+    except Exception as error:  # whatever a reader of one of many formats raises
+        raise DataError(f"the mesh {shape.file} cannot be read: {error}") from error

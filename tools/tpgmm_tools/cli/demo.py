@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
 
 __all__ = ["app"]
@@ -66,57 +64,23 @@ def demo(
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    console = Console()
-    with _progress(console, BottleExperiment.STAGES) as report:
-        metrics = BottleExperiment(
-            out,
-            n_components=n_components,
-            n_demonstrations=n_demonstrations,
-            n_situations=n_situations,
-            seed=random_state,
-            report=report,
-            skill=BottleShaking(rate=rate),
-        ).run()
+    metrics = BottleExperiment(
+        out,
+        n_components=n_components,
+        n_demonstrations=n_demonstrations,
+        n_situations=n_situations,
+        seed=random_state,
+        report=lambda text: typer.echo(f"{text} ..."),
+        skill=BottleShaking(rate=rate),
+    ).run()
     shown = table(metrics["rows"], metrics["demonstrations"])
-    Console(width=max(console.width, 100)).print(shown)
+    Console(width=max(Console().width, 100)).print(shown)
     for line in summary(metrics):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    console.print(
+        typer.echo(line)
+    typer.echo(
         f"seed {random_state}, {metrics['seconds']:.0f} s; "
-        f"data set, model, figures and metrics.json in {out}",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
+        f"data set, model, figures and metrics.json in {out}"
     )
-
-
-@contextmanager
-def _progress(console: Console, stages: int) -> Iterator[Callable[[str], None]]:
-    """A bar on a terminal, a line per stage elsewhere."""
-    if not console.is_terminal:
-        yield lambda text: typer.echo(f"{text} ...")
-        return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("starting", total=stages)
-
-        def report(text: str) -> None:
-            bar.update(task, description=text, advance=1)
-
-        yield report
 
 
 def table(rows: Mapping[str, Mapping[str, Any]], demonstrations: Mapping[str, Any]) -> Table:
@@ -152,12 +116,12 @@ def _cell(value: Any, parts: tuple[str, ...], digits: int) -> str:
 
 
 def summary(metrics: Mapping[str, Any]) -> Iterator[str]:
-    """What the table does not say, in sentences.
+    """Shares, ratios and alignment, in sentences.
 
     Parameters
     ----------
     metrics : mapping
-        What the experiment returns.
+        As the experiment returns them.
     """
     for name, share in metrics["share of information on the shoulders"].items():
         yield f"share of the information on the shoulders, {name}: {100 * share:.1f} %"

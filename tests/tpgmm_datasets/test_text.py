@@ -2,7 +2,7 @@
 
 import pytest
 
-from tpgmm_datasets.commands.recordings import (
+from tpgmm_datasets.text import (
     parse_episodes,
     parse_events,
     parse_frames,

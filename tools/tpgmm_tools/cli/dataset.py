@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tpgmm_datasets.commands.recordings import Recordings
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
@@ -29,10 +28,10 @@ Target = Annotated[Path, typer.Argument(help="Folder of the set to write.")]
 Append = Annotated[
     bool, typer.Option("--append", help="Add the episodes to the set in PATH, if there is one.")
 ]
-CONVERT = "Example: tpgmm dataset convert recordings/arm out/arm --units deg --rate 30"
+CONVERT = "tpgmm dataset convert recordings/arm out/arm --units deg --rate 30"
 
 
-@app.command(epilog="Example: tpgmm dataset info out/demo/dataset")
+@options.command(app, "tpgmm dataset info out/demo/dataset")
 def info(path: options.Dataset) -> None:
     """Print what a data set holds: features, names, units and ranges, episodes, problems."""
     from tpgmm_datasets.description import describe_lerobot
@@ -49,19 +48,11 @@ def info(path: options.Dataset) -> None:
         typer.echo(f"problem: {problem}")
 
 
-@app.command(epilog="Example: tpgmm dataset check arm --robot arm.urdf && tpgmm fit ...")
+@options.command(app, "tpgmm dataset check arm --robot arm.urdf && tpgmm fit ...")
 def check(
     path: options.Dataset,
-    robot: options.RobotFile = None,
-    link: options.Links = None,
-    robot_joint: options.RobotJoints = None,
-    coordinate: options.Coordinates = None,
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
+    described: options.RobotOptions,
+    data: options.DataOptions,
     strict: Annotated[
         bool, typer.Option("--strict", help="Fail for what is only unlikely, too.")
     ] = False,
@@ -89,10 +80,8 @@ def check(
     typer.echo(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
-    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    recordings = Recordings(path, kinematics, frame, event, episodes, units, joints, joint_name)
-    # all that can be told of in one go, not the first
-    recording = open_recording(path, **recordings.options, relax=CHECKS)
+    # all problems in one go, not the first
+    recording = open_recording(path, **data.arguments(described.read()), relax=CHECKS)
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", DatasetWarning)
@@ -112,25 +101,18 @@ def check(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: tpgmm dataset plot out/demo/dataset --out out/dataset.png")
+@options.command(app, "tpgmm dataset plot out/demo/dataset --out out/dataset.png")
 def plot(
     path: options.Dataset,
     out: Annotated[Path, typer.Option(metavar="FILE.png", help="Where the picture goes.")],
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
+    data: options.DataOptions,
 ) -> None:
     """Draw the joints and the positions of the frames over time, a line per episode."""
     import numpy as np
 
     from tpgmm_tools.plotting import figure, save
 
-    recordings = Recordings(path, None, frame, event, episodes, units, joints, joint_name, rate)
-    demonstrations = recordings.demonstrations()
+    demonstrations = data.read(path)
     first = demonstrations[0]
     panels = list(first.joint_names or (f"joint {i}" for i in range(first.n_joints)))
     panels += [f"{name}.{axis}" for name in first.frames for axis in "xyz"]
@@ -151,7 +133,7 @@ def plot(
     typer.echo(save(drawing, out))
 
 
-@app.command(epilog="Example: tpgmm dataset generate out/shake --n-demonstrations 20")
+@options.command(app, "tpgmm dataset generate out/shake --n-demonstrations 20")
 def generate(
     path: Target,
     n_demonstrations: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 10,
@@ -179,25 +161,16 @@ def generate(
     _save(demonstrations, path, append, fps=rate, task=TASK, robot_type="upper_body")
 
 
-@app.command(epilog=CONVERT)
+@options.command(app, CONVERT)
 def convert(
     source: options.Dataset,
     path: Target,
+    described: options.RobotOptions,
+    data: options.DataOptions,
     append: Append = False,
     task: Annotated[
         str | None, typer.Option(help="What is done, for all. Default: each episode's own.")
     ] = None,
-    robot: options.RobotFile = None,
-    link: options.Links = None,
-    robot_joint: options.RobotJoints = None,
-    coordinate: options.Coordinates = None,
-    frame: options.Frames = None,
-    event: options.Events = None,
-    episodes: options.Episodes = None,
-    units: options.Units = None,
-    joints: options.Joints = None,
-    joint_name: options.JointNames = None,
-    rate: options.Rate = None,
 ) -> None:
     """Write a data set anew: layout v3.0, joints in radians, episodes and joints as chosen.
 
@@ -208,14 +181,12 @@ def convert(
     from tpgmm_datasets.conversion.timing import resample
     from tpgmm_datasets.reader import open_recording
 
-    kinematics = options.read_robot(robot, link, robot_joint, coordinate)
-    recordings = Recordings(
-        source, kinematics, frame, event, episodes, units, joints, joint_name
-    )
-    recording = open_recording(source, **recordings.options)
+    given = data.arguments(described.read())
+    rate = given.pop("rate")
+    recording = open_recording(source, **given)
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints
-    commanded = _commanded(source, recordings.options, recording, demonstrations)
+    commanded = _commanded(source, given, recording, demonstrations)
     if rate is not None:
         demonstrations = [resample(item, rate) for item in demonstrations]
         commanded = commanded and [resample(item, rate) for item in commanded]

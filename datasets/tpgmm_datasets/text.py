@@ -1,0 +1,106 @@
+"""The arguments of :func:`tpgmm_datasets.load_lerobot` from a command line's texts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.lerobot.columns import ENVIRONMENT
+from tpgmm_torch.events.text import parse_event
+from tpgmm_torch.exceptions import DataError
+
+__all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]
+
+#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
+FRAME = re.compile(
+    r"(?P<name>[^=@\[\]]+)"
+    r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
+)
+
+
+def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
+    """The argument ``frames``; None without texts.
+
+    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``;
+    anything else is a DataError.
+    """
+    frames: dict[str, Any] = {}
+    for text in texts:
+        match = FRAME.fullmatch(text)
+        if match is None:
+            raise DataError(
+                f"frame {text!r} is none of NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
+                "NAME=LINK@EVENT"
+            )
+        source, event, start = match["source"], match["event"], match["start"]
+        if event:
+            frames[match["name"]] = LinkPose(source, event)
+        elif source is None:
+            frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
+        else:
+            columns = slice(int(start), int(match["stop"])) if start else None
+            frames[match["name"]] = FramePose(source, columns)
+    return frames or None
+
+
+def parse_events(texts: Sequence[str]) -> dict[str, Any] | None:
+    """The argument ``events``; None without texts.
+
+    Each text is ``NAME=HOW``, as ``parse_event`` takes HOW; anything else is a
+    DataError.
+    """
+    pairs = _pairs(texts, "event", "NAME=HOW", "close=closing:*gripper*")
+    return {name: parse_event(how) for name, how in pairs.items()} or None
+
+
+def parse_joint_names(texts: Sequence[str]) -> dict[str, str] | None:
+    """The argument ``joint_names``; None without texts.
+
+    Each text is ``STORED=JOINT``; anything else is a DataError.
+    """
+    return _pairs(texts, "joint name", "STORED=JOINT", "main_elbow=elbow_flex") or None
+
+
+def _pairs(texts: Sequence[str], kind: str, form: str, example: str) -> dict[str, str]:
+    pairs: dict[str, str] = {}
+    for text in texts:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not name or not value or name in pairs:
+            problem = "is given twice" if name in pairs else f"is not {form}"
+            raise DataError(f"{kind} {text!r} {problem}, as in {example}")
+        pairs[name] = value
+    return pairs
+
+
+def parse_episodes(text: str | None) -> slice | list[int] | str | None:
+    """``"0:10"`` as a slice, ``"0,3,5"`` as a list, anything else as the name of a task."""
+    if text is None:
+        return None
+    if re.fullmatch(r"(-?\d*):(-?\d*)", text):
+        start, stop = (int(part) if part else None for part in text.split(":"))
+        return slice(start, stop)
+    if re.fullmatch(r"\d+(,\d+)*", text):
+        return [int(part) for part in text.split(",")]
+    return text
+
+
+def parse_units(texts: Sequence[str]) -> dict[str, Any]:
+    """The arguments ``units`` and ``calibration``.
+
+    The texts are one unit for all, or any number of ``JOINT=UNIT``; and ``FILE.json`` or
+    ``PREFIX=FILE.json`` for LeRobot's calibration. Anything else is a DataError.
+    """
+    pairs = [(name, unit) for name, _, unit in (text.rpartition("=") for text in texts)]
+    calibration = {name: unit for name, unit in pairs if unit.endswith(".json")}
+    named = {name: unit for name, unit in pairs if not unit.endswith(".json")}
+    wrong = [text for text in texts if text.startswith("=") or text.endswith("=")]
+    if wrong or len(calibration) + len(named) < len(pairs):
+        raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
+    units: Any = named or "auto"
+    if "" in named:
+        units = named[""]
+        if len(named) > 1:
+            raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
+    return {"units": units, "calibration": calibration or None}

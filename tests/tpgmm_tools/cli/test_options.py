@@ -1,0 +1,75 @@
+"""Options made from signatures, in groups, and what their texts mean."""
+
+import inspect
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_tools.cli import options
+from tpgmm_torch import TaskParameterizedGMM
+
+
+class Made:
+    """Something.
+
+    Parameters
+    ----------
+    share : float, default=0.5
+        How much, see :func:`~tpgmm.other`. More than a help needs.
+    kind, other : str
+        Of both ``kinds`` [m].
+    strict : bool
+    """
+
+    def __init__(self, share=0.5, kind="a", other=None, strict=False):
+        pass
+
+
+def test_options_follow_signature_and_docstring():
+    app, given = typer.Typer(), {}
+
+    @options.command(app, "tpgmm made", options.options_of(Made, "Made", {"other"}))
+    def made(data: options.DataOptions, **settings):
+        given.update(settings, rate=data.rate, frames=data.frame)
+
+    def run(*arguments):
+        return CliRunner().invoke(app, arguments)
+
+    assert run("--share", "1e-3", "--kind", "auto", "--strict", "--frame", "a").exit_code == 0
+    assert given == {
+        "share": 0.001, "kind": "auto", "strict": True, "rate": None, "frames": ["a"],
+    }  # fmt: skip
+    text = " ".join(run("--help").output.replace("│", " ").split())
+    assert "How much, see tpgmm.other. [default: 0.5]" in text
+    assert "Of both kinds [m]." in text and "--other" not in text
+
+
+@pytest.mark.parametrize(
+    ("text", "value"), [("auto", "auto"), ("3", 3), ("1e-4", 1e-4), ("None", None)]
+)
+def test_values_are_numbers_or_words(text, value):
+    assert options.value(text) == value
+
+
+def test_fit_has_the_estimators_defaults():
+    from tpgmm_tools.cli.fit import SETTINGS, fit
+
+    estimator = inspect.signature(TaskParameterizedGMM).parameters
+    shared = {one.name: one.default for one in SETTINGS}
+    shared["n_components"] = inspect.signature(fit).parameters["n_components"].default
+    assert {"tol", "fusion", "covariance_type"} <= shared.keys()
+    assert shared == {name: estimator[name].default for name in shared}
+
+
+def test_robots_are_files_of_either_format_or_come_with_the_package(tmp_path):
+    body = '<body name="hand"><joint name="lift"/><geom size="0.1"/></body>'
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
+    (tmp_path / "body.urdf").write_text(upper_body_urdf())
+    read = options.RobotOptions
+    assert read(str(tmp_path / "arm.xml"), ["hand"]).read().joint_names == ("lift",)
+    body = read(str(tmp_path / "body.urdf"), ["l_hand"], ["l_*"], ["grip"]).read()
+    assert body.joint_names[-2:] == ("l_wrist_roll", "grip")
+    assert read("so101", ["gripper_frame_link"]).read().n_joints == 6
+    assert read().read() is None

@@ -1,0 +1,495 @@
+"""A motion in the browser, by viser: one HTML file, or live, with objects to move by hand."""
+
+from __future__ import annotations
+
+import html
+import io
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from tpgmm_tools.viewing.curves import Panel, as_html, motion_marks, motion_panels
+from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
+from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
+from tpgmm_torch import quaternions
+from tpgmm_torch.atomic import replacing
+from tpgmm_torch.control.command import Command
+from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.trajectories import Trajectory
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DependencyError
+
+__all__ = ["LiveView", "write_motion"]
+
+#: How long the last picture stands before the motion starts again [s].
+PAUSE = 1.0
+#: Distance of situations that are shown side by side, in a scene of size 1.
+APART = 0.9
+#: The page is light in any browser. On a narrow one the curves go above the legend.
+STYLE = """
+#legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
+display:flex;flex-wrap:wrap-reverse;justify-content:space-between;align-items:end;gap:.5em;
+font:14px sans-serif;color:#333}
+#legend>*{background:rgba(255,255,255,.9);padding:.5em;box-sizing:border-box;max-width:100%}
+#curves{width:24em;font-size:12px;overflow-wrap:anywhere}
+#curves summary{pointer-events:auto;cursor:pointer}
+#curves .row{display:flex;justify-content:space-between;gap:1em}
+#curves .row :last-child{white-space:nowrap}
+#curves svg{display:block;width:100%;height:3.5em;overflow:visible;
+border-bottom:1px solid currentColor}
+#curves polyline,#curves line{fill:none;stroke-width:1.5;vector-effect:non-scaling-stroke}
+#curves line{stroke:currentColor;stroke-width:1}
+#curves .mark{stroke-dasharray:3 3;opacity:.6}
+"""
+
+Moved = Callable[[str, Frame], None]
+
+
+def write_motion(
+    path: str | Path,
+    model: TaskParameterizedGMM,
+    situation: Situation | Sequence[Situation],
+    demonstrations: Sequence[Demonstration] = (),
+    *,
+    title: str = "tpgmm",
+    **how: Any,
+) -> Trajectory:
+    """Write a reproduction as an HTML file with a time line, which needs nothing else.
+
+    Beside the scene are stiffness and each operator's share over time, and in them where parts
+    begin and when the events of the demonstrations happen.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; replaced if it exists.
+    model : TaskParameterizedGMM
+        Fitted, with a robot or with tracked poses.
+    situation : Situation or sequence of Situation
+        Where the skill is reproduced; several are shown side by side, and the curves are of
+        the first.
+    demonstrations : sequence of Demonstration, default=()
+        Whose paths and frames are drawn.
+    title : str, default="tpgmm"
+        Of the page.
+    **how
+        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
+
+    Returns
+    -------
+    Trajectory
+        The reproduction in the first situation.
+
+    Raises
+    ------
+    DependencyError, DataError
+        If viser is not installed, or the model has no links that can be drawn.
+    """
+    situations = [situation] if isinstance(situation, Situation) else list(situation)
+    scene = MotionScene(model, demonstrations, **how)
+    with viser_server("127.0.0.1", 0) as server:
+        drawings = [scene.draw(one) for one in situations]
+        first, trajectory = drawings[0], drawings[0].trajectory
+        several, drawn = len(drawings) - 1, []
+        for number, drawing in enumerate(drawings):
+            root, aside = (f"/{number}" if number else ""), number * APART * first.size
+            if number:
+                server.scene.add_frame(root, show_axes=False, position=(0.0, aside, 0.0))
+            if several:
+                server.scene.add_label(f"{root}/number", f"{number + 1} of {several + 1}")
+            drawn.append(draw(server.scene, drawing, root))
+        _set_view(server, first, several)
+        recording = server.get_scene_serializer()
+        clock = max((drawing.time for drawing in drawings), key=lambda instants: instants[-1])
+        for now, pause in zip(clock, [*np.diff(clock), PAUSE], strict=True):
+            for drawing, handles in zip(drawings, drawn, strict=True):
+                move(handles, drawing.nodes, drawing.picture(now))
+            recording.insert_sleep(float(pause))
+        page = recording.as_html()
+    curves = as_html(motion_panels(model, trajectory), motion_marks(model, trajectory))
+    before, body, after = page.rpartition("</body>")
+    page = before + _legend(title, bool(demonstrations), curves) + body + after
+    title = f"<title>{html.escape(title)}</title>"
+    with replacing(path) as new:
+        new.write_text(page.replace("<title>Viser</title>", title, 1), encoding="utf-8")
+    return trajectory
+
+
+def _legend(title: str, with_demonstrations: bool, curves: str) -> str:
+    """The colours' meaning, and the curves, along the lower edge."""
+    entries = {
+        "reproduction": "reproduction",
+        "covariance": f"where the link may be: {STANDARD_DEVIATIONS:g} standard deviations",
+    }
+    if with_demonstrations:
+        entries["demonstrations"] = "demonstrations"
+    lines = "".join(
+        f'<div><span style="color:rgb{COLORS[kind]}">&#9632;</span> {text}</div>'
+        for kind, text in entries.items()
+    )
+    return (
+        f'<style>{STYLE}</style><div id="legend">'
+        f"<div><b>{html.escape(title)}</b>{lines}</div>{curves}</div>"
+    )
+
+
+@contextmanager
+def viser_server(host: str, port: int) -> Iterator[Any]:
+    """A viser server on ``host`` and ``port`` (0 for any that is free) that stops in the end.
+
+    Raises
+    ------
+    DependencyError
+        If viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise DependencyError(
+            "looking at motions needs viser: pip install 'tpgmm-torch[view]'"
+        ) from error
+    with redirect_stdout(io.StringIO()):  # it prints, whatever its options say
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    try:
+        yield server
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def draw(
+    scene: Any,
+    drawing: Drawing,
+    root: str = "",
+    handles: Mapping[str, Any] | None = None,
+    moved: Moved | None = None,
+) -> dict[str, Any]:
+    """Draw into a viser scene; its nodes by their path.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+        Where it is drawn.
+    drawing : Drawing
+        The motion.
+    root : str
+        Begins all paths.
+    handles : mapping of str to viser.SceneNodeHandle, optional
+        Nodes that are there already, of another motion of the same model.
+    moved : callable, optional
+        Makes objects that stand still movable by hand: called with the name of one and its new
+        pose.
+    """
+    nodes = dict(handles or {})
+    for gone in nodes.keys() - drawing.nodes.keys():
+        nodes.pop(gone).remove()
+    for path, node in drawing.nodes.items():
+        if path not in nodes:
+            nodes[path] = _add_node(scene, root + path, node, drawing.size, moved)
+    for path, lines in drawing.lines.items():
+        scene.add_line_segments(
+            root + path, points=lines.points, colors=lines.color, thickness=lines.thickness,
+            thickness_units="screen",
+        )  # fmt: skip
+    for path, some in drawing.ellipsoids.items():
+        scene.add_batched_meshes_simple(
+            root + path, *unit_ball(), batched_positions=some.centres,
+            batched_wxyzs=some.orientations, batched_scales=some.half_axes,
+            batched_colors=COLORS["covariance"], opacity=0.35, lod="off", cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
+    for path, poses in drawing.axes.items():
+        scene.add_batched_axes(
+            root + path, batched_wxyzs=poses[:, 3:], batched_positions=poses[:, :3],
+            axes_length=0.025 * drawing.size, axes_radius=0.0012 * drawing.size,
+        )  # fmt: skip
+    for path, node in drawing.nodes.items():
+        place(nodes[path], node.poses[0])
+    return nodes
+
+
+def move(handles: Mapping[str, Any], nodes: Mapping[str, Node], picture: int) -> None:
+    """Put the nodes that move where they are in a picture.
+
+    Parameters
+    ----------
+    handles : mapping of str to viser.SceneNodeHandle
+        As :func:`draw` gives them.
+    nodes, picture : mapping of str to Node, int
+        Of the drawing, and which of its pictures.
+    """
+    for path, node in nodes.items():
+        if len(node.poses) > 1:
+            place(handles[path], node.poses[picture])
+
+
+def place(handle: Any, pose: Array) -> None:
+    """Put a node (its ``handle``) at a ``pose`` (7,)."""
+    handle.position, handle.wxyz = pose[:3], pose[3:]
+
+
+def _add_node(scene: Any, path: str, node: Node, size: float, moved: Moved | None) -> Any:
+    axes = {"axes_length": node.axes, "axes_radius": 0.03 * node.axes, "origin_radius": 0.0}
+    if moved is not None and node.label and len(node.poses) == 1:
+        handle = scene.add_transform_controls(path, scale=0.12 * size, disable_sliders=True)
+        scene.add_frame(f"{path}/axes", **axes)
+        handle.on_update(partial(_let_go, moved, node.label))
+    else:
+        handle = scene.add_frame(path, node.axes > 0, **axes)
+    if node.label:
+        scene.add_label(f"{path}/label", node.label)
+    for name, shape in node.solids.items():
+        _add_solid(scene, f"{path}/{name}", shape)
+    return handle
+
+
+def _let_go(moved: Moved, name: str, event: Any) -> None:
+    if event.phase == "end":
+        moved(name, Frame(event.target.position, event.target.wxyz))
+
+
+def _add_solid(scene: Any, path: str, shape: Shape) -> None:
+    turn = torch.from_numpy(np.ascontiguousarray(shape.pose[:3, :3]))
+    placed: dict[str, Any] = {
+        "position": shape.pose[:3, 3],
+        "wxyz": quaternions.from_matrix(turn).numpy(),
+        "color": shape.color,
+        "opacity": None if shape.opacity >= 1 else shape.opacity,
+    }
+    if shape.kind == "box":
+        scene.add_box(path, dimensions=shape.size, **placed)
+    elif shape.kind == "mesh":
+        scene.add_mesh_simple(path, *mesh(shape), **placed)
+    else:
+        add = scene.add_icosphere if shape.kind == "sphere" else scene.add_cylinder
+        add(path, *shape.size, **placed)
+
+
+def _set_view(server: Any, drawing: Drawing, others: int = 0) -> None:
+    """Camera, lights and floor, for a drawing and ``others`` beside it along y."""
+    size, camera = drawing.size, server.initial_camera
+    camera.look_at = drawing.middle + np.array([0.0, others * APART * size / 2, 0.0])
+    away = drawing.distance * np.array([0.8, 0.5, 0.35])
+    camera.position = camera.look_at + away * (1 + 0.5 * others)
+    camera.fov = 0.75
+    server.scene.configure_default_lights(cast_shadow=False)
+    cell = 10.0 ** np.floor(np.log10(size / 2))
+    server.scene.add_grid(
+        "/ground", *(2 * np.ceil(size / cell) * cell,) * 2, cell_size=cell,
+        section_size=10 * cell, cell_color=(225, 225, 225), section_color=(190, 190, 190),
+        position=(*np.round(drawing.middle[:2] / cell) * cell, drawing.ground - 0.02 * size),
+    )  # fmt: skip
+
+
+class LiveView:
+    """Serve motions to a browser; a context manager.
+
+    The page has a time line, a choice of situations, and a handle on every object that stands
+    still: where it is let go, the skill is reproduced again. Beside it are stiffness and each
+    operator's share over time. With "controller", a :class:`Controller` leads the robot
+    instead: objects can be moved meanwhile, and the robot be held.
+
+    Parameters
+    ----------
+    model, situations : TaskParameterizedGMM, sequence of Situation
+        Fitted, with a robot or with tracked poses; and where to reproduce.
+    demonstrations : sequence of Demonstration, default=()
+        Whose paths and frames are drawn.
+    first : int, default=0
+        Which of the situations is shown first.
+    host : str, default="127.0.0.1"
+        Address to listen on: this machine only, or "0.0.0.0" for all that can reach it.
+    port : int, default=8080
+        The next free one from here on; 0 for any that is free.
+    **how
+        ``objects``, ``meshes`` and ``fps``, as for :class:`MotionScene`.
+
+    Attributes
+    ----------
+    url : str
+        What to open.
+    drawing : Drawing
+        What is shown.
+    situation : Situation
+        With the objects where they are now.
+    command : Command or None
+        The controller's last, if one leads.
+    clock : float
+        The instant that is shown, from the start of the motion [s].
+
+    Raises
+    ------
+    DependencyError, DataError
+        If viser is not installed, or the model has no links that can be drawn.
+    """
+
+    def __init__(
+        self,
+        model: TaskParameterizedGMM,
+        situations: Sequence[Situation],
+        demonstrations: Sequence[Demonstration] = (),
+        *,
+        first: int = 0,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        **how: Any,
+    ) -> None:
+        self._model, self._situations = model, list(situations)
+        self._scene = MotionScene(model, demonstrations, **how)
+        self._handles: dict[str, Any] = {}
+        self._plots: list[Any] = []
+        self._controller: Controller | None = None
+        self.command: Command | None = None
+        self.clock, self._posture = 0.0, self._situations[first].joints
+        self._lock = threading.RLock()
+        with ExitStack() as stack:
+            self.server = stack.enter_context(viser_server(host, port))
+            self.url = f"http://{host}:{self.server.get_port()}"
+            self._add_controls(self.server.gui, first)
+            self.show(first)
+            _set_view(self.server, self.drawing)
+            self._resources = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        """The view, which runs since it was made."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop."""
+        self._resources.close()
+
+    def show(self, index: int) -> None:
+        """Show the situation of that ``index``."""
+        with self._lock:
+            self._reproduce(self._situations[index])
+            if self._controller is not None:
+                self.start_controller()
+
+    def move_frame(self, name: str, frame: Frame) -> None:
+        """Put an object, by its ``name``, at another ``frame``, and reproduce again."""
+        frames = {**self.situation.frames, name: frame}
+        self._reproduce(replace(self.situation, frames=frames))
+
+    def run(self, seconds: float = math.inf) -> None:
+        """Play the motion again and again, for so many ``seconds``."""
+        last = time.monotonic()
+        end = last + seconds
+        while last < end:
+            time.sleep(1 / self._scene.fps)
+            now = time.monotonic()
+            if self._play.value:
+                self.step(now - last)
+            last = now
+
+    def step(self, seconds: float) -> None:
+        """Go on by so many ``seconds``, along the time line or with the controller."""
+        with self._lock:
+            if self._controller is None:
+                self._move_to(self.clock + seconds)
+                return
+            self.command = self._controller.step(seconds, self._posture, self._frames_now())
+            if not self.hold.value:
+                self._posture = self.command.reference
+            reason = self.command.reason()
+            self._status.value = self.command.status + (f": {reason}" if reason else "")
+            self.clock = float(self.command.time - self.drawing.trajectory.time[0])
+            self._move_to(self.clock)
+            for path, poses in self._scene.robot_poses(self._posture).items():
+                place(self._handles[path], poses[0])
+
+    def start_controller(self) -> None:
+        """Let a controller lead the robot, from the skill's start."""
+        with self._lock:
+            self.clock, self._posture = 0.0, self.situation.joints
+            self._controller = self._model.controller(self._posture, self._frames_now())
+            self._run.value = True
+
+    def stop_controller(self) -> None:
+        """Go back to the reproduction and its time line."""
+        with self._lock:
+            self._controller = self.command = None
+            self._run.value, self._status.value = False, ""
+            self._move_to(self.clock)
+
+    def _frames_now(self) -> dict[str, Frame]:
+        """Poses of the model's objects at the instant that is shown."""
+        instants = self.drawing.trajectory.time
+        at = min(int((instants - instants[0] < self.clock).sum()), len(instants) - 1)
+        frames = self.situation.frames_at(instants)
+        return {
+            name: frames[name][at] if frames[name].batch_shape else frames[name]
+            for name in self._model.frame_names_
+            if name in frames
+        }
+
+    def _reproduce(self, situation: Situation) -> None:
+        with self._lock:
+            self.situation, self.drawing = situation, self._scene.draw(situation)
+            self._handles = draw(
+                self.server.scene, self.drawing, "", self._handles, self.move_frame
+            )
+            trajectory = self.drawing.trajectory
+            plots = [_plot_options(one) for one in motion_panels(self._model, trajectory)]
+            if not self._plots:
+                gui = self.server.gui
+                self._plots = [gui.add_uplot(height=160, **options) for options in plots]
+            for plot, options in zip(self._plots, plots, strict=True):
+                plot.scales, plot.data = options["scales"], options["data"]
+            marks = motion_marks(self._model, trajectory)
+            self._marks.content = "  \n".join(f"{m.time:.1f} s: {m.label}" for m in marks)
+            self._slider.max = max(float(self.drawing.time[-1]), 0.01)
+            self._move_to(self.clock)
+
+    def _move_to(self, clock: float) -> None:
+        """Show an instant, in seconds since the start; after the end that is the start."""
+        with self._lock:
+            self.clock = clock if clock <= self.drawing.time[-1] else 0.0
+            move(self._handles, self.drawing.nodes, self.drawing.picture(self.clock))
+            self._slider.value = round(self.clock, 2)
+
+    def _add_controls(self, gui: Any, first: int) -> None:
+        self._play = gui.add_checkbox("play", True)
+        self._slider = gui.add_slider("time [s]", 0.0, 1.0, 0.01, 0.0)
+        self._marks = gui.add_markdown("")
+        self._run = gui.add_checkbox("controller", False)
+        self.hold = gui.add_checkbox("hold the robot", False)
+        self._status = gui.add_text("status", "", disabled=True)
+        if len(self._situations) > 1:
+            numbers = [str(index) for index in range(len(self._situations))]
+            chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])
+            chosen.on_update(lambda event: self.show(int(event.target.value)))
+        self._slider.on_update(self._slid)
+        self._run.on_update(self._switched)
+
+    def _slid(self, event: Any) -> None:
+        if event.client is not None:  # moved by hand, not by the clock
+            self._play.value, self.clock = False, event.target.value
+            self.stop_controller()
+
+    def _switched(self, event: Any) -> None:
+        if event.client is not None:
+            (self.start_controller if event.target.value else self.stop_controller)()
+
+
+def _plot_options(panel: Panel) -> dict[str, Any]:
+    """A panel as viser's plots have it."""
+    lines = [{"label": c.label, "stroke": c.color, "width": 1.5} for c in panel.curves]
+    return {
+        "title": panel.title,
+        "data": (panel.time, *(curve.values for curve in panel.curves)),
+        "series": ({"label": "time [s]"}, *lines),
+        "padding": (12, 24, 0, 0),
+        "scales": {"x": {"time": False}, "y": {"range": (0.0, panel.top)}},
+    }
