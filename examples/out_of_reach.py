@@ -33,7 +33,7 @@ from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.clocks import EvenProgress
 from tpgmm_torch.regression.posture import NEGLIGIBLE, _Cost, _descended, _with_means
-from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.skill import Skill
 
 #: When the hands are at the bottle, shortly before it is moved [s].
 GRASP = 4.4
@@ -52,14 +52,14 @@ class UpTo(EvenClock):
 
     def start(
         self,
-        regression: Regression,
-        begin: float,
-        end: float,
+        skill: Skill,
         joints: Tensor,
         frames: Mapping[str, Frame],
+        begin: float | None = None,
+        end: float | None = None,
     ) -> EvenProgress:
         """See :class:`EvenClock`."""
-        return super().start(regression, begin, min(end, self.stop), joints, frames)
+        return super().start(skill, joints, frames, begin, self.stop)
 
 
 def outside(n: int, seed: int, most: float) -> Frame:

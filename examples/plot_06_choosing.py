@@ -24,7 +24,7 @@ from tpgmm_torch import (
     RelativePosition,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.metrics import make_scorer, reproduction_scorer
+from tpgmm_torch.metrics import PoseScorer, reproduction_scorer
 
 # %%
 # Demonstrations
@@ -69,7 +69,7 @@ counts = [2, 4, 8, 12, 20]
 search = GridSearchCV(
     TaskParameterizedGMM(robot=hand, blend=0, random_state=0),
     {"operators": list(sets.values()), "n_components": counts},
-    scoring={"path": reproduction_scorer, "take": make_scorer("hand", event="take")},
+    scoring={"path": reproduction_scorer, "take": PoseScorer("hand", event="take")},
     refit="path",
     cv=KFold(3),
 )

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.clock_text import parse_clock
     from tpgmm_torch.control.clocks import (
         Clock,
         EvenClock,
-        LocalizingClock,
         WaitingClock,
-        parse_clock,
     )
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.data.affine import Affine
+    from tpgmm_torch.control.localizing_clock import LocalizingClock
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
         RelativeOrientation,
         RelativePosition,
         Stack,
-        TaskParameters,
     )
     from tpgmm_torch.regression.estimate import Estimate
     from tpgmm_torch.regression.via_points import ViaPoint
@@ -52,7 +50,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
-    "Affine",
     "BlockGaussianMixture",
     "Candidate",
     "Canonical",
@@ -83,7 +80,6 @@ __all__ = [
     "Stack",
     "Status",
     "TaskParameterizedGMM",
-    "TaskParameters",
     "Trajectory",
     "Trust",
     "ViaPoint",
@@ -93,10 +89,11 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.clocks": ("Clock", "EvenClock", "LocalizingClock", "WaitingClock", "parse_clock"),
+    "control.clock_text": ("parse_clock",),
+    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
+    "control.localizing_clock": ("LocalizingClock",),
     "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
-    "data.affine": ("Affine",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
@@ -114,7 +111,6 @@ _HOMES = {
         "RelativeOrientation",
         "RelativePosition",
         "Stack",
-        "TaskParameters",
     ),
     "robots.tracked_poses": ("Poses",),
     "regression.estimate": ("Estimate",),

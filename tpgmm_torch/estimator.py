@@ -24,10 +24,10 @@ from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import EpisodeSummary, check, summarize, unit_findings
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.control.clocks import Clock, parse_clock
+from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -761,7 +761,6 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 {
                     name: Frame.stack([first[name] for first in firsts])
                     for name, frame in firsts[0].items()
-                    if not isinstance(frame, Affine)
                 },
                 torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
                 self.kinematics_,
@@ -1069,7 +1068,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         operators there are, so that under the normal law it makes no difference whether
         independent coordinates come in one operator or in several. Models that look at
         *other* coordinates describe other data, in other units, and are not comparable: use
-        :func:`tpgmm_torch.metrics.make_scorer` for those.
+        :class:`tpgmm_torch.metrics.PoseScorer` for those.
 
         Unlike ``lower_bound_``, :meth:`bic` and :meth:`aic`, which are EM's and count time
         once for each operator.

@@ -1,4 +1,4 @@
-"""How good a reproduction is: errors against demonstrations, rhythm, smoothness.
+"""Errors of reproductions against demonstrations, their speed and acceleration, and scorers.
 
 Errors of poses are in millimetres and degrees, so that they can be read; those of joints in
 radians. None depends on the signs of quaternions.
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from sklearn.pipeline import Pipeline
 from torch import Tensor
 
@@ -28,18 +27,15 @@ __all__ = [
     "Instants",
     "PoseErrors",
     "PoseScorer",
-    "Sinusoid",
     "joint_rmse",
     "largest_acceleration",
     "largest_velocity",
-    "make_scorer",
     "pose_errors",
     "reproduction_scorer",
-    "sinusoid",
 ]
 
 
-#: An event's name, an instant or several [s], or what finds them in a demonstration.
+#: An event's name, an instant or several [s], or a function of a demonstration to find them.
 Instants = str | float | Sequence[float] | Tensor | Callable[[Demonstration], Any]
 
 
@@ -98,17 +94,15 @@ def pose_errors(
     robot: Kinematics,
     link: str,
     at: Instants | None = None,
-    *,
-    reproduced_at: float | Sequence[float] | Tensor | None = None,
 ) -> PoseErrors:
     """Errors of a link's pose: along the path, at instants, or at an event.
 
     Parameters
     ----------
     trajectory : Trajectory
-        What was reproduced.
+        The reproduction.
     demonstration : Demonstration
-        What was shown in that situation.
+        In the same situation.
     robot : Kinematics
         ``model.kinematics_``.
     link : str
@@ -116,9 +110,8 @@ def pose_errors(
     at : str, float, array-like or callable, optional
         When, on the demonstration's clock: an event's name, an instant or several [s], or a
         function of the demonstration that returns them. By default each of its time steps.
-    reproduced_at : float or array-like, optional
-        The same instants on the trajectory's clock, if that is another [s]. Between time steps
-        the joints are interpolated; before and after a motion they stand still.
+        Between time steps the joints are interpolated; before and after a motion they stand
+        still.
 
     Returns
     -------
@@ -128,9 +121,8 @@ def pose_errors(
     ------
     UnknownNameError
         If there is no such link or event.
-    DataError, ShapeError
-        If an instant is no number, lies outside the demonstration, or there are more or fewer
-        on one clock than on the other.
+    DataError
+        If an instant is no number, or lies outside the demonstration.
 
     Examples
     --------
@@ -145,16 +137,8 @@ def pose_errors(
     if link not in robot.links:
         raise UnknownNameError("link", link, "the robot", robot.links)
     instants = _instants(at, demonstration)
-    elsewhere = instants
-    if reproduced_at is not None:
-        elsewhere = as_tensor(reproduced_at, "reproduced_at").reshape(-1)
-        if elsewhere.shape != instants.shape:
-            raise ShapeError(
-                f"there are {len(instants)} instants in the demonstration, and "
-                f"{len(elsewhere)} in reproduced_at"
-            )
     shown = demonstration.reordered(robot.joint_names)
-    found = _state_at(trajectory.time, trajectory.joints, elsewhere, robot)
+    found = _state_at(trajectory.time, trajectory.joints, instants, robot)
     wanted = _state_at(shown.time, shown.joints, instants, robot)
     distance = torch.linalg.vector_norm(found.position(link) - wanted.position(link), dim=-1)
     turn = quaternions.product(
@@ -200,64 +184,7 @@ def _state_at(time: Tensor, joints: Tensor, instants: Tensor, robot: Kinematics)
 
 @dataclass(frozen=True)
 class PoseScorer:
-    """What :func:`make_scorer` makes: minus a mean pose error, for scikit-learn.
-
-    Parameters
-    ----------
-    link, event, quantity, robot
-        As given to :func:`make_scorer`.
-    """
-
-    link: str | None = None
-    event: Instants | None = None
-    quantity: str = "position"
-    robot: Kinematics | None = None
-
-    def __call__(self, estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
-        """Minus the mean over demonstrations and links; higher is better.
-
-        Parameters
-        ----------
-        estimator : TaskParameterizedGMM
-            Fitted.
-        X : sequence of Demonstration
-            Held out.
-        y : ignored
-            Here for scikit-learn.
-        """
-        model, demonstrations = _held_out(estimator, X)
-        trajectories = _reproductions(model, demonstrations)
-        robot = model.kinematics_ if self.robot is None else self.robot
-        links = robot.links if self.link is None else (self.link,)
-        if not links:
-            raise DataError(
-                "the model has no links whose pose could be compared: give it a robot"
-            )
-        instants: list[Any] = [self.event] * len(demonstrations)
-        if not (
-            self.event is None or isinstance(self.event, str | float | int)
-        ) and not callable(self.event):
-            instants = list(self.event)
-            if len(instants) != len(demonstrations):
-                raise ShapeError(
-                    f"there are {len(instants)} instants for {len(demonstrations)} "
-                    "demonstrations: for folds, name an event of the demonstrations"
-                )
-        errors = [
-            getattr(pose_errors(found, shown, robot, link, at), self.quantity).mean()
-            for found, shown, at in zip(trajectories, demonstrations, instants, strict=True)
-            for link in links
-        ]
-        return -float(torch.stack(errors).mean())
-
-
-def make_scorer(
-    link: str | None = None,
-    event: Instants | None = None,
-    quantity: str = "position",
-    robot: Kinematics | None = None,
-) -> PoseScorer:
-    """A scorer of what a skill is for: where a link is when it matters.
+    """Scorer for scikit-learn: minus the mean pose error of links of reproductions.
 
     For ``scoring=`` of :func:`tpgmm_torch.model_selection.cross_validate`, ``cross_val_score``
     and ``GridSearchCV``. Held-out demonstrations are reproduced on their own clock; those of a
@@ -267,19 +194,13 @@ def make_scorer(
     ----------
     link : str, optional
         Of the robot; the mean over all its links by default.
-    event : str, float, callable or sequence of float, optional
-        When: the name of an event of the demonstrations, an instant of all of them [s], a
-        function of a demonstration that returns one, or one for each of the demonstrations
-        that are scored. By default the whole path.
+    event : str, float or callable, optional
+        When: the name of an event of the demonstrations, an instant of all of them [s], or a
+        function of a demonstration that returns one. By default the whole path.
     quantity : {"position", "angle"}, default="position"
         In millimetres, or in degrees.
     robot : Kinematics, optional
         By default the model's own.
-
-    Returns
-    -------
-    PoseScorer
-        ``scorer(model, demonstrations)`` is minus the mean error.
 
     Raises
     ------
@@ -288,29 +209,59 @@ def make_scorer(
 
     Examples
     --------
-    >>> make_scorer("hand", event="close").quantity
+    >>> PoseScorer("hand", event="close").quantity
     'position'
     """
-    if quantity not in ("position", "angle"):
-        raise DataError(f"quantity is 'position' [mm] or 'angle' [deg], got {quantity!r}")
-    return PoseScorer(link, event, quantity, robot)
+
+    link: str | None = None
+    event: Instants | None = None
+    quantity: str = "position"
+    robot: Kinematics | None = None
+
+    def __post_init__(self) -> None:
+        if self.quantity not in ("position", "angle"):
+            raise DataError(
+                f"quantity is 'position' [mm] or 'angle' [deg], got {self.quantity!r}"
+            )
+
+    def __call__(self, estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
+        """Minus the mean over demonstrations and links; higher is better.
+
+        Parameters
+        ----------
+        estimator : TaskParameterizedGMM
+            Fitted, or a pipeline that ends in one.
+        X : sequence of Demonstration
+            Held out.
+        y : ignored
+            Here for scikit-learn.
+        """
+        model, pairs = _reproductions(estimator, X)
+        robot = model.kinematics_ if self.robot is None else self.robot
+        links = robot.links if self.link is None else (self.link,)
+        if not links:
+            raise DataError(
+                "the model has no links whose pose could be compared: give it a robot"
+            )
+        errors = [
+            getattr(pose_errors(found, shown, robot, link, self.event), self.quantity).mean()
+            for found, shown in pairs
+            for link in links
+        ]
+        return -float(torch.stack(errors).mean())
 
 
-def _held_out(
+def _reproductions(
     estimator: Any, X: Sequence[Demonstration]
-) -> tuple[Any, Sequence[Demonstration]]:
-    """The model and the demonstrations, brought onto its clock by the steps before it."""
-    demonstrations = check_demonstrations(X)
-    if not isinstance(estimator, Pipeline):
-        return estimator, demonstrations
-    before, model = estimator[:-1], estimator[-1]
-    return model, before.transform(demonstrations) if len(before) else demonstrations
-
-
-def _reproductions(model: Any, demonstrations: Sequence[Demonstration]) -> list[Trajectory]:
-    """What a model does in the situations of demonstrations, at their time steps."""
+) -> tuple[Any, list[tuple[Trajectory, Demonstration]]]:
+    """The model, and its reproductions beside demonstrations, aligned by steps before it."""
+    model, demonstrations = estimator, check_demonstrations(X)
+    if isinstance(estimator, Pipeline):
+        before, model = estimator[:-1], estimator[-1]
+        demonstrations = before.transform(demonstrations) if len(before) else demonstrations
     situations = [Situation.of(one, one.time) for one in demonstrations]
-    return model.predict(situations, candidates=False)
+    found = model.predict(situations, candidates=False)
+    return model, list(zip(found, demonstrations, strict=True))
 
 
 def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = None) -> float:
@@ -318,20 +269,19 @@ def reproduction_scorer(estimator: Any, X: Sequence[Demonstration], y: object = 
 
     For ``cross_val_score(..., scoring=reproduction_scorer)`` and ``GridSearchCV``; unlike the
     likelihood it compares models with different operators. Where a pose matters rather than
-    joints, :func:`make_scorer` asks for it.
+    joints, :class:`PoseScorer` scores it.
 
     Parameters
     ----------
     estimator : TaskParameterizedGMM
-        Fitted.
+        Fitted, or a pipeline that ends in one.
     X : sequence of Demonstration
         Held out.
     y : ignored
         Here for scikit-learn.
     """
-    model, demonstrations = _held_out(estimator, X)
-    errors = map(joint_rmse, _reproductions(model, demonstrations), demonstrations)
-    return -float(np.mean(list(errors)))
+    _, pairs = _reproductions(estimator, X)
+    return -float(np.mean([joint_rmse(found, shown) for found, shown in pairs]))
 
 
 def largest_velocity(motion: Trajectory | Demonstration) -> float:
@@ -358,76 +308,3 @@ def largest_acceleration(motion: Trajectory | Demonstration) -> float:
     speed = motion.joints.diff(dim=0) / steps[:, None]
     middle = (steps[1:] + steps[:-1]) / 2
     return float((speed.diff(dim=0) / middle[:, None]).abs().max())
-
-
-@dataclass(frozen=True)
-class Sinusoid:
-    """``offset + amplitude sin(2 pi frequency t + phase)``, and what it leaves unexplained.
-
-    Parameters
-    ----------
-    frequency : float
-        In hertz.
-    amplitude, offset : float
-        In the signal's unit.
-    phase : float
-        At time 0 [rad].
-    residual : float
-        Root mean square of the rest.
-    """
-
-    frequency: float
-    amplitude: float
-    offset: float
-    phase: float
-    residual: float
-
-
-def sinusoid(time: ArrayLike, signal: ArrayLike) -> Sinusoid:
-    """The sinusoid of least squares through a signal.
-
-    The frequency is searched between one period in the window and the Nyquist frequency,
-    coarsely by steps of a fifth of a period in the window, then by golden sections.
-
-    Parameters
-    ----------
-    time, signal : array-like of shape (T,)
-        In seconds, and in any unit.
-
-    Raises
-    ------
-    ShapeError
-        If there are fewer than eight points, or the shapes differ.
-
-    Examples
-    --------
-    >>> time = np.linspace(0, 3, 100)
-    >>> fit = sinusoid(time, 0.2 + 0.5 * np.sin(2 * np.pi * 1.5 * time))
-    >>> round(fit.frequency, 6), round(fit.amplitude, 6), round(fit.offset, 6)
-    (1.5, 0.5, 0.2)
-    """
-    t = np.asarray(torch.as_tensor(time), dtype=np.float64)
-    y = np.asarray(torch.as_tensor(signal), dtype=np.float64)
-    if t.shape != y.shape or t.ndim != 1 or len(t) < 8:
-        raise ShapeError(
-            f"sinusoid needs two equal vectors of 8 or more, got {t.shape}, {y.shape}"
-        )
-
-    def fit(frequency: float) -> tuple[float, NDArray[np.float64]]:
-        angle = 2 * np.pi * frequency * t
-        basis = np.stack((np.sin(angle), np.cos(angle), np.ones_like(t)), axis=1)
-        coefficients = np.linalg.lstsq(basis, y, rcond=None)[0]
-        return float(np.sqrt(np.mean((y - basis @ coefficients) ** 2))), coefficients
-
-    window = t[-1] - t[0]
-    grid = np.arange(1, len(t) / 2, 0.2) / window
-    best = int(np.argmin([fit(frequency)[0] for frequency in grid]))
-    low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    golden = (np.sqrt(5) - 1) / 2
-    for _ in range(40):
-        left, right = high - golden * (high - low), low + golden * (high - low)
-        low, high = (low, right) if fit(left)[0] < fit(right)[0] else (left, high)
-    frequency = float((low + high) / 2)
-    residual, (sine, cosine, offset) = fit(frequency)
-    amplitude, phase = float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
-    return Sinusoid(frequency, amplitude, float(offset), phase, residual)

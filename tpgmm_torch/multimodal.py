@@ -21,9 +21,9 @@ from tpgmm_torch.atomic import consistent, replacing
 from tpgmm_torch.checks.situations import START
 from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.control.clocks import Clock, parse_clock
+from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.command import Command
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
@@ -657,7 +657,7 @@ class MultimodalController:
         for model in self._model.models_:
             first, last = float(model.time_[0]), float(model.time_[-1])
             places = model._completed(joints, frames)
-            begun = self._clock.start(model.regression(), first, last, joints, places)
+            begun = self._clock.start(model.regression(), joints, places, first, last)
             times.append(float(begun.time))
             self._midway |= times[-1] > first + START * (last - first)
         if self._midway:
@@ -700,7 +700,7 @@ class MultimodalController:
         skill = _silent(self._model.models_[mode])
         other = skill.controller(self._start, frames, clock=self._clock, **self._settings)
         regression, end = skill.regression(), float(skill.time_[-1])
-        progress = self._clock.start(regression, time, end, self.reference, frames)
+        progress = self._clock.start(regression, self.reference, frames, time, end)
         self.controller, self.mode = self.controller.switched(other, progress), mode
 
     def _progress(self, mode: int) -> float:
@@ -901,8 +901,6 @@ def _moved(before: Mapping[str, Frame], now: Mapping[str, Frame]) -> bool:
         return True
     for name, frame in now.items():
         old = before[name]
-        if isinstance(frame, Affine) or isinstance(old, Affine):  # which is no pose
-            continue
         far = (frame.position - old.position).norm(dim=-1).max()
         back = quaternions.conjugate(old.orientation)
         turned = (

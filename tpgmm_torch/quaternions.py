@@ -39,7 +39,6 @@ __all__ = [
     "normalize",
     "product",
     "quaternion_blocks",
-    "relative_matrix",
     "right_matrix",
     "rotate",
     "slerp",
@@ -71,15 +70,14 @@ def _constants(dtype: torch.dtype, device: torch.device) -> dict[str, Tensor]:
             left[abs(entry) - 1, row, column] = math.copysign(1, entry)
         right = left.permute(2, 1, 0)
         conjugate = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=dtype)
-        relative = (conjugate[:, None, None] * right)[:, None] @ left
-        rotation = relative[..., 1:, 1:]
-        rotation = (rotation + rotation.transpose(0, 1)) / 2  # of products q_i q_j
+        # q v conj(q) = H+(q) Hbar(conj q) v in the products q_i q_j
+        rotation = (left[:, None] @ (conjugate[:, None, None] * right))[..., 1:, 1:]
+        rotation = (rotation + rotation.transpose(0, 1)) / 2
         constants = {
             "one": torch.ones((), dtype=dtype),
             "conjugate": conjugate,
             "left": left.flatten(1),
             "right": right.flatten(1),
-            "relative": relative.reshape(16, 16),
             "rotation": rotation.reshape(16, 9),
         }
         return {key: value.contiguous().to(device) for key, value in constants.items()}
@@ -140,23 +138,6 @@ def vector_matrix(q: Tensor) -> Tensor:
     return right_matrix(q)[..., 1:, :]
 
 
-def relative_matrix(q: Tensor, reference: Tensor) -> Tensor:
-    """``Hbar(conj q) H+(reference)`` of eq. (15), (..., 4, 4).
-
-    It maps a to ``reference a conj(q)``. Its first row is ``conj(reference) q``: q as seen
-    from the reference.
-
-    Examples
-    --------
-    >>> q, reference = exp(torch.tensor([[0.3, 0.1, 0.0], [0.0, 0.2, 0.5]]).double())
-    >>> seen = product(conjugate(reference), q)
-    >>> torch.allclose(relative_matrix(q, reference)[0], seen)
-    True
-    """
-    pairs = (q[..., :, None] * reference[..., None, :]).flatten(-2)
-    return (pairs @ _constant("relative", q)).unflatten(-1, (4, 4))
-
-
 def normalize(q: Tensor) -> Tensor:
     """Scale ``q`` to unit norm.
 
@@ -215,15 +196,17 @@ def match_hemisphere(x: Tensor, reference: Tensor, starts: Sequence[int] = (0,))
     return x * hemisphere_signs(x, reference, starts)
 
 
-def continuous(q: Tensor, dim: int = -2) -> Tensor:
+def continuous(q: Tensor, dim: int = -2, starts: Sequence[int] = (0,)) -> Tensor:
     """Remove the sign jumps along a sequence; the first quaternion keeps its sign.
 
     Parameters
     ----------
-    q : Tensor of shape (..., T, 4)
-        A sequence of unit quaternions along ``dim``.
+    q : Tensor of shape (..., T, D)
+        A sequence of unit quaternions, or of coordinates with some among them, along ``dim``.
     dim : int, default=-2
         The dimension of time.
+    starts : sequence of int, default=(0,)
+        Where quaternions begin among the coordinates.
 
     Returns
     -------
@@ -232,7 +215,7 @@ def continuous(q: Tensor, dim: int = -2) -> Tensor:
     """
     q = q.movedim(dim, -2)
     if q.shape[-2] > 1:
-        flips = hemisphere_signs(q[..., 1:, :], q[..., :-1, :]).cumprod(dim=-2)
+        flips = hemisphere_signs(q[..., 1:, :], q[..., :-1, :], starts).cumprod(dim=-2)
         q = q * torch.cat((torch.ones_like(flips[..., :1, :]), flips), dim=-2)
     return q.movedim(-2, dim)
 

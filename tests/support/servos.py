@@ -36,7 +36,7 @@ class Run:
     def __post_init__(self) -> None:
         self.random = torch.Generator().manual_seed(self.seed)
         self.progress: Progress = self.clock.start(
-            self.regression, self.begin, self.end, self.joints, self.frames
+            self.regression, self.joints, self.frames, self.begin, self.end
         )
         self.passed = 0.0
         self.estimate = self._tick(self.joints)

@@ -10,7 +10,6 @@ from torch import Tensor
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import IMPOSSIBLE
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -61,7 +60,7 @@ def check_situations(
             "Is time in seconds, and from the same zero? Without one the skill's own is used"
         )
         findings.append(Finding("time", message, remedy, value=last))
-    poses = {name: frame for name, frame in frames.items() if not isinstance(frame, Affine)}
+    poses = dict(frames)
     batch = np.broadcast_shapes(joints.shape[:-1], *(f.batch_shape for f in poses.values()))
     rows = joints.expand(*batch, kinematics.n_joints)
     values, lower, upper = map(as_array, (rows, kinematics.lower, kinematics.upper))

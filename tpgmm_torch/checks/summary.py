@@ -12,7 +12,6 @@ import torch
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, listed
 from tpgmm_torch.checks.training import EpisodeSummary
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import quaternion_groups
@@ -340,7 +339,7 @@ class TrainingSummary:
         if joints is not None and len(self.compared):
             found["start", ""] = self.start.distance(_rows(joints)[..., list(self.compared)])
         for name, frame in frames.items():
-            if name in self.frames and not isinstance(frame, Affine):
+            if name in self.frames:
                 known = self.frames[name]
                 found["place", name] = known.place.distance(as_array(frame.position))
                 turn = known.rotation_vectors(as_array(frame.orientation))

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tpgmm_torch.checks.report import Finding, Report, listed
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -121,11 +120,7 @@ class EpisodeSummary:
             joints[0],
             joints.min(axis=0),
             joints.max(axis=0),
-            {
-                name: PathSummary.of(frame)
-                for name, frame in demonstration.frames.items()
-                if not isinstance(frame, Affine)  # which is no pose
-            },
+            {name: PathSummary.of(frame) for name, frame in demonstration.frames.items()},
             {
                 name: (at - begin) / duration if duration else 0.0
                 for name, at in demonstration.events.items()

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tpgmm_torch.checks.situations import START
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.control.clocks import STANDS, Clock, EvenClock, Progress
+from tpgmm_torch.control.clocks import Clock, EvenClock, Progress
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
@@ -29,7 +29,6 @@ from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
@@ -41,6 +40,8 @@ __all__ = ["Controller", "SkillController"]
 
 #: For so long a robot that was moved is remembered to have been [s].
 PUSH_MEMORY = 0.5
+#: Below that share of its speed, time stands, and a robot is led.
+STANDS = 0.05
 #: The share of the usual lead of robots that hold something.
 CAREFUL = 1 / 3
 #: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
@@ -195,7 +196,7 @@ class Controller:
         self._inputs: Inputs | None = None
         if trust is not None:
             self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
-        self._progress = clock.start(regression, begin, end, self.reference, self._frames)
+        self._progress = clock.start(regression, self.reference, self._frames, begin, end)
         self._novelty, self._at_first = novelty, self._frames
         # who begins in the middle of the skill stands where nobody starts
         midway = self._progress.time > begin + START * (end - begin)
@@ -207,7 +208,7 @@ class Controller:
             # what is rounded keeps within them
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
             self._position_bounds = low / GRID, high / GRID
-        self._search, self._via = PostureSearch(), via
+        self._search, self._via = regression.posture_search(), via
         self._late: Tensor | None = None  # robots whose time did not increase in this tick
         self._taken: Follower | None = None  # of this tick, where all can be followed
         self._velocity = torch.zeros_like(self.reference)
@@ -392,7 +393,11 @@ class Controller:
         """
         skill = self.copy()
         skill._regression, skill._end, skill._progress = other._regression, other._end, progress
-        skill._novelty, skill._via, skill._search = other._novelty, other._via, PostureSearch()
+        skill._novelty, skill._via, skill._search = (
+            other._novelty,
+            other._via,
+            other._search.begun(),
+        )
         if not self.holding.held:
             skill.holding = other.holding
         skill._restart_fading(torch.ones_like(self._led))
@@ -458,7 +463,7 @@ class Controller:
         holding = self.holding
         try:
             joints, self._search = self._search.advance(
-                self._regression, time, at, holding.frames, estimate, self._position_bounds,
+                time, at, holding.frames, estimate, self._position_bounds,
                 asked, self._carrying if holding.carries else None,
             )  # fmt: skip
         except TPGMMError:

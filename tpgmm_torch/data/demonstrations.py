@@ -91,8 +91,7 @@ class Demonstration(_PlainFrames):
         Joint positions q_t [rad or m], in the order of the robot. Coordinates without
         kinematics (a gripper) are joints too.
     frames : mapping of str to Frame, optional
-        Object poses by name, constant or one per time step; or task parameters
-        :class:`Affine`.
+        Object poses by name, constant or one per time step.
     joint_names : sequence of str, optional
         Names of the columns of ``joints``; with them a robot may have another order.
     events : mapping of str to float, optional
@@ -287,8 +286,7 @@ class Situation(_PlainFrames):
         The start posture q_0 [rad or m], in the order of the model, or by name. Names that
         the model does not have are left out.
     frames : mapping of str to Frame, optional
-        Object poses by name, constant or one per time step; or task parameters
-        :class:`Affine`.
+        Object poses by name, constant or one per time step.
     time : array-like of shape (T,), optional
         When references are wanted [s]; by default the time grid that the model learned.
         Before the skill begins and after its end references are held.

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from tpgmm_torch.atomic import read_whole
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
@@ -79,12 +78,7 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
         raise DataError(f"'frames' maps names to poses, got {frames!r}")
     poses: dict[str, Frame] = {}
     for name, pose in frames.items():
-        what = f"frame {name!r}"
-        if isinstance(pose, dict) and "A" in pose:
-            _check_keys(pose, what, required={"A", "b"}, optional=set())
-            poses[name] = Affine(pose["A"], pose["b"])
-            continue
-        _check_keys(pose, what, required={"position"}, optional={"orientation"})
+        _check_keys(pose, f"frame {name!r}", required={"position"}, optional={"orientation"})
         poses[name] = Frame(pose["position"], pose.get("orientation"))
     times = {name: item.get(name) for name in TIMES}
     return Situation(_joints(item["joints"], joint_names), poses, **times)

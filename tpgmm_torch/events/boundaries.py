@@ -15,7 +15,6 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.signal import find_peaks
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.pose_names import is_gripper
@@ -144,7 +143,7 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
                 found.append(Boundary(time, f"{hold.frame} {does}", time, time))
     held = {hold.frame for hold in holds}
     for name, frame in demonstration.frames.items():
-        if name in held or isinstance(frame, Affine) or not frame.batch_shape:
+        if name in held or not frame.batch_shape:
             continue
         at = ObjectMoves(name).find(demonstration)
         if at.confidence >= LEAST_CONFIDENCE and begin < at.time < end:

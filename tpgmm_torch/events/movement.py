@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.events.detection import (
@@ -67,7 +66,7 @@ class ObjectMoves(Detector):
         """See :meth:`Detector.find`."""
         at_least_two_steps(demonstration)
         frame = demonstration.frame(self.frame)
-        if isinstance(frame, Affine) or not frame.batch_shape:
+        if not frame.batch_shape:
             raise DataError(
                 f"frame {self.frame!r} was recorded once: when it starts to move is not known"
             )

@@ -1,10 +1,10 @@
-"""What every operator is: one linear map in task space."""
+"""Operators: one linear map in task space each (Table I)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
-from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import ShapeError, UnknownNameError
 from tpgmm_torch.notebook import Tabular
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -21,9 +21,7 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 __all__ = [
     "Linearization",
     "Operator",
-    "Reference",
     "carried_objects",
-    "check_pair",
     "frame_names",
 ]
 
@@ -44,8 +42,8 @@ class Linearization:
         The present quaternions where the local coordinates hold some, zero elsewhere; None
         leaves it to :meth:`Operator.coordinates`.
     noise : Tensor of shape (..., m), optional
-        A variance that is added to each row's: 1 in rows that say nothing (``0 = 0``), which
-        without it would be certain; None stands for zero.
+        A variance that is added to each row's: 1 in rows ``0 = 0``, which without it would be
+        certain; None stands for zero.
     """
 
     jacobian: Tensor | None
@@ -54,89 +52,22 @@ class Linearization:
     present: Tensor | None = None
     noise: Tensor | None = None
 
-    def silent(self, rigid: bool | Tensor) -> Linearization:
+    def without(self, rigid: Tensor) -> Linearization:
         """The rows as ``0 = 0``, where the joints cannot change what the operator measures.
 
         Parameters
         ----------
-        rigid : bool, or Tensor of bool, of shape (...)
-            For which robots.
+        rigid : Tensor of bool, of shape (..., m)
         """
-        if rigid is False:
-            return self
         assert self.jacobian is not None and self.matrix is not None
-        speaks = ~torch.as_tensor(rigid, device=self.displacement.device)
-        displacement = self.displacement * speaks[..., None]
-        return Linearization(
-            self.jacobian * speaks[..., None, None],
-            self.matrix * speaks[..., None, None],
-            displacement,
-            self.present,
-            (~speaks[..., None]).to(displacement.dtype).expand_as(displacement),
+        active = ~rigid
+        return replace(
+            self,
+            jacobian=self.jacobian * active[..., None],
+            matrix=self.matrix * active[..., None],
+            displacement=self.displacement * active,
+            noise=rigid.to(self.displacement.dtype).expand_as(self.displacement),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Pose that operators refer to: a link of the robot, or an object, free or held.
-
-    Parameters
-    ----------
-    frame : Frame
-        Its pose at present.
-    linear_jacobian, angular_jacobian : Tensor of shape (..., 3, n_joints), optional
-        How the joints move it; None for what they do not move.
-    carrier : int, or Tensor of int, of shape (...)
-        The index of the robot's link that it is, or that carries it; -1 for what is free.
-        What has one carrier is one rigid body: no joint moves the one against the other.
-    """
-
-    frame: Frame
-    linear_jacobian: Tensor | None = None
-    angular_jacobian: Tensor | None = None
-    carrier: int | Tensor = -1
-
-    @classmethod
-    def of(
-        cls, name: str, state: RobotState, frames: Mapping[str, Frame], held: bool = False
-    ) -> Reference:
-        """Look a name up, first among the links, then among the frames.
-
-        Parameters
-        ----------
-        name : str
-            Of a link of the robot, or of an object.
-        state : RobotState
-        frames : mapping of str to Frame
-            Poses of the objects when they were last free.
-        held : bool, default=False
-            Whether an object is meant as the thing that a link may carry, rather than as the
-            place where it was when it was last free.
-
-        Raises
-        ------
-        UnknownNameError
-            If it is neither.
-        """
-        if name in (state.links if held else state.robot_links):
-            jacobians = state.linear_jacobian(name), state.angular_jacobian(name)
-            return cls(state.pose(name), *jacobians, state.carrier(name))
-        if name not in frames:
-            known = [*frames, *state.links]
-            raise UnknownNameError("frame", name, "the situation or the robot's links", known)
-        return cls(frames[name])
-
-    @classmethod
-    def world(cls, state: RobotState) -> Reference:
-        """The base frame, for a ``state``."""
-        like = state.positions
-        return cls(
-            Frame._from(like.new_zeros(3), quaternions.identity(like.dtype, like.device))
-        )
-
-    def rigid_with(self, other: Reference) -> bool | Tensor:
-        """Whether no joint moves the one against the other, for each robot."""
-        return self.carrier == other.carrier
 
 
 class Operator(Tabular, ABC):
@@ -146,8 +77,7 @@ class Operator(Tabular, ABC):
     :meth:`coordinates`; make it a frozen dataclass, and ``clone``, ``repr``, ``==``, ``pickle``
     and grid search work. An operator given by its ``A`` and ``b`` (Definition 1 of the
     paper) returns ``Linearization(None, A, b - state.joints)``; where ``A`` is singular it
-    needs ``fusion="covariance"``. Where A and b come with the situation, as an
-    :class:`Affine`, :class:`TaskParameters` does it.
+    needs the covariance form of the fusion.
     """
 
     @abstractmethod
@@ -177,9 +107,9 @@ class Operator(Tabular, ABC):
         return ()
 
     def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """Variances of the path that the coordinates follow, which theirs lack; zero if none.
+        """Variances of the mean path that the coordinates deviate from; zero by default.
 
-        What says how far something moves in the skill, has to add them to the coordinates'.
+        How far something moves in the skill is their variance and that of the path.
         """
         return (0.0,) * self.dimension(kinematics)
 
@@ -197,7 +127,7 @@ class Operator(Tabular, ABC):
     def units(self, kinematics: Kinematics | None) -> tuple[str | None, ...]:
         """The unit of each coordinate; None, the default, if it is like no other.
 
-        Few demonstrations say little of a variance: those of one unit are learned together.
+        Variances of one unit are learned together from few demonstrations.
         """
         return (None,) * self.dimension(kinematics)
 
@@ -216,15 +146,14 @@ class Operator(Tabular, ABC):
 
     def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``A_t = J^+ M`` of Table I, shape (..., n_joints, D)."""
-        at = self.linearize(state, frames)
-        matrix = at.matrix
-        if matrix is None:
+        at, like = self.linearize(state, frames), state.joints
+        linear = at.matrix
+        if linear is None:
             size = at.displacement.shape[-1]
-            matrix = torch.eye(size, dtype=state.joints.dtype, device=state.joints.device)
-        linear = (
-            matrix if at.jacobian is None else gaussians.pseudo_inverse(at.jacobian) @ matrix
-        )
-        batch = gaussians.common_shape(state.joints.shape[:-1], linear.shape[:-2])
+            linear = torch.eye(size, dtype=like.dtype, device=like.device)
+        if at.jacobian is not None:
+            linear = gaussians.pseudo_inverse(at.jacobian) @ linear
+        batch = gaussians.common_shape(like.shape[:-1], linear.shape[:-2])
         return linear.expand(*batch, *linear.shape[-2:])
 
     def offset(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
@@ -252,21 +181,18 @@ class Operator(Tabular, ABC):
         """
         demonstration = demonstration.reordered(kinematics.joint_names)
         state = kinematics.state(demonstration.joints)
+        time = demonstration.time.to(state.joints)
         frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
         if holds:
-            time = demonstration.time.to(state.joints)
             state, frames = held_objects(state, time, frames, holds)
-        at = self.at(demonstration.time.to(state.joints))
-        local = at.coordinates(state, frames)
+        local = self.at(time).coordinates(state, frames)
         if tuple(local.shape) != (len(demonstration), self.dimension(kinematics)):
             raise ShapeError(
                 f"{self!r} has {self.dimension(kinematics)} coordinates, but its coordinates() "
                 f"gave shape {tuple(local.shape)} for {len(demonstration)} time steps"
             )
-        for start in self.quaternion_starts(kinematics):
-            block = quaternions.continuous(local[:, start : start + 4])
-            local = torch.cat((local[:, :start], block, local[:, start + 4 :]), dim=-1)
-        return local
+        starts = self.quaternion_starts(kinematics)
+        return quaternions.continuous(local, starts=starts) if starts else local
 
     def check(self, kinematics: Kinematics, frames: Collection[str]) -> None:
         """Check that the links and frames that are needed exist.
@@ -276,12 +202,12 @@ class Operator(Tabular, ABC):
         UnknownNameError
             If one does not exist, or is both a link and a frame.
         """
+        known = [*kinematics.links, *frames]
         for link in self.links():
-            if link not in kinematics.links and link not in frames:
-                known = [*kinematics.links, *frames]
+            if link not in known:
                 raise UnknownNameError("link", link, "the robot or the frames", known)
         for name in self.references():
-            if name not in frames and name not in kinematics.links:
+            if name not in known:
                 raise UnknownNameError("frame", name, "the demonstration", frames)
         for name in (*self.links(), *self.references()):
             if name in frames and name in kinematics.links:
@@ -293,34 +219,14 @@ class Operator(Tabular, ABC):
                 )
 
 
-def check_pair(link: str, frame: str, held: object) -> None:
-    """Check what a relative operator is told.
-
-    Parameters
-    ----------
-    link, frame : str
-        What is seen, and from where.
-    held : object
-        Whether the frame is a thing.
-
-    Raises
-    ------
-    DataError
-        If something is seen from itself, or ``held`` is neither True nor False.
-    """
-    if link == frame:
-        raise DataError(f"{link!r} seen from itself never changes: name another frame")
-    if not isinstance(held, bool):
-        raise DataError(f"held is True or False, got {held!r}")
-
-
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:
     """Names of the frames that a situation must have, each once.
 
     Parameters
     ----------
-    operators, kinematics : sequence of Operator, Kinematics
-        What refers to frames, and whose links are none.
+    operators : sequence of Operator
+    kinematics : Kinematics
+        Its links are no frames.
     """
     references = [name for operator in operators for name in operator.references()]
     names = (*references, *carried_objects(operators, kinematics))
@@ -332,8 +238,9 @@ def carried_objects(operators: Sequence[Operator], kinematics: Kinematics) -> tu
 
     Parameters
     ----------
-    operators, kinematics : sequence of Operator, Kinematics
-        What refers to objects, and whose links are none.
+    operators : sequence of Operator
+    kinematics : Kinematics
+        Its links are no objects.
     """
     links = (name for operator in operators for name in operator.links())
     return tuple(dict.fromkeys(name for name in links if name not in kinematics.links))

@@ -32,38 +32,35 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.constraints import Interval
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators.base import Linearization, Operator, Reference, check_pair
+from tpgmm_torch.operators.base import Linearization
+from tpgmm_torch.operators.pose import PoseOperator
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["AbsoluteOrientation", "RelativeOrientation"]
 
-
 GEOMETRIES = "quaternion", "tangent"
 
 
-class _Orientation(Operator):
-    """What the two operators share: the coordinates that an orientation is described by."""
+class _Orientation(PoseOperator):
+    """Four coordinates, a quaternion, or three, a rotation vector [rad]."""
 
-    link: str
     gain: float
-    tolerance: float
     geometry: str
     path: tuple[tuple[float, ...], ...] | None
     #: The base orientation (..., 4) at the time of :meth:`at`.
     _base: Tensor | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.geometry not in GEOMETRIES:
             raise DataError(f"geometry is one of {list(GEOMETRIES)}, got {self.geometry!r}")
         if self.gain not in Interval(Real, 0, None, closed="neither"):
             raise DataError(f"gain is a positive number, got {self.gain!r}")
-        if self.geometry == "tangent" and self.gain != 2.0:
+        if self._tangent and self.gain != 2.0:
             raise DataError(
                 f"gain={self.gain} is for geometry='quaternion': rotation vectors need none"
             )
-        if self.path is not None and (
-            self.geometry != "tangent" or not self.path or {*map(len, self.path)} != {5}
-        ):
+        if self.path is not None and not (self._tangent and {*map(len, self.path)} == {5}):
             raise DataError(
                 "path is of geometry='tangent', and has rows (time, w, x, y, z), got "
                 f"geometry={self.geometry!r} and {self.path!r}"
@@ -101,8 +98,7 @@ class _Orientation(Operator):
         if self.path is None:
             return self
         bound = copy.copy(self)
-        knots, orientations = (x.to(time) for x in self._path)
-        base = quaternions.interpolate(time, knots, orientations)
+        base = quaternions.interpolate(time, *(part.to(time) for part in self._path))
         object.__setattr__(bound, "_base", base)
         return bound
 
@@ -111,11 +107,9 @@ class _Orientation(Operator):
         if self.path is None:
             return super().path_variances(kinematics)
         orientations = self._path[1]
-        turn = quaternions.product(
-            quaternions.conjugate(quaternions.mean(orientations)), orientations
-        )
-        variance = quaternions.log(turn).square().sum(-1).mean() / 3
-        return (float(variance),) * 3
+        back = quaternions.conjugate(quaternions.mean(orientations))
+        turn = quaternions.log(quaternions.product(back, orientations))
+        return (float(turn.square().sum(-1).mean() / 3),) * 3
 
     @cached_property
     def _path(self) -> tuple[Tensor, Tensor]:
@@ -123,49 +117,63 @@ class _Orientation(Operator):
             rows = torch.tensor(self.path, dtype=torch.float64)
         return rows[:, 0].contiguous(), rows[:, 1:]
 
-    def _origin(self, orientation: Tensor) -> Tensor:
-        """Of tangent space in the world, ``eps_f b_t``, for the frame's orientation."""
+    def _orientations(
+        self, state: RobotState, frames: Mapping[str, Frame]
+    ) -> tuple[Tensor, Tensor]:
+        """``eps`` of the link, and what its coordinates refer to: ``eps_f``, ``eps_f b_t``."""
+        body, reference = self.poses(state, frames)
+        eps = body.orientation
+        if reference is None:
+            origin = quaternions.identity(eps.dtype, eps.device).expand_as(eps)
+        else:
+            origin = reference.orientation
         if self._base is not None:
-            return quaternions.product(orientation, self._base.to(orientation))
+            return eps, quaternions.product(origin, self._base.to(eps))
         if self.path is not None:
             raise DataError(
                 f"the coordinates of {self!r} follow a path: ask operator.at(time) for them"
             )
-        return orientation
+        return eps, origin
 
-    def _coordinates(self, link: Reference, reference: Reference) -> Tensor:
-        """The orientation of a body as seen from a reference."""
-        orientation = reference.frame.orientation
-        if not self._tangent:
-            turn = quaternions.conjugate(orientation)
-            return quaternions.product(turn, link.frame.orientation)
-        turn = quaternions.conjugate(self._origin(orientation))
-        return quaternions.log(quaternions.product(turn, link.frame.orientation))
+    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
+        """``H+(conj eps_t^(j)) eps_t``; in tangent space ``log(conj(eps_t^(j) b_t) eps_t)``."""
+        eps, origin = self._orientations(state, frames)
+        seen = quaternions.product(quaternions.conjugate(origin), eps)
+        return quaternions.log(seen) if self._tangent else seen
 
-    def _linearize(
-        self, link: Reference, reference: Reference, state: RobotState
-    ) -> Linearization:
-        """How the joints turn a body as seen from a reference, eq. (11)."""
-        jacobian = link.angular_jacobian
-        if jacobian is None:
-            jacobian = state.joints.new_zeros(3, state.joints.shape[-1])
-        if reference.angular_jacobian is not None:
-            jacobian = jacobian - reference.angular_jacobian
+    def is_bilinear(self, state: RobotState) -> bool:
+        """Whether :func:`linearize_poses` serves: not in tangent space, nor for tracked poses.
+
+        Where a link's quaternion is part of the joint vector nothing has to be linearised.
+        """
+        place = not self.links()[1:] and self.moving_reference(state) is None
+        return not self._tangent and not (place and state.quaternion_columns(self.link))
+
+    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        """See :meth:`PoseOperator.linearize`; exact in tangent space and for tracked poses.
+
+        Of tracked poses, whose quaternion is part of the joint vector, it is
+        ``eps = H+(eps^(j)) mu``, and the gain has no effect.
+        """
+        if self.is_bilinear(state):
+            return super().linearize(state, frames)
+        eps, origin = self._orientations(state, frames)
         if self._tangent:
-            origin = self._origin(reference.frame.orientation)
-            turn = quaternions.product(quaternions.conjugate(origin), link.frame.orientation)
-            vector = quaternions.log(turn)
-            inverse = quaternions.inverse_left_jacobian(vector)
-            jacobian = inverse @ quaternions.to_matrix(origin).mT @ jacobian
-            matrix = torch.eye(3, dtype=vector.dtype, device=vector.device)
-            return Linearization(jacobian, matrix.expand(*vector.shape, 3), -vector).silent(
-                link.rigid_with(reference)
+            at = super().linearize(state, frames)
+            assert at.jacobian is not None
+            vector = quaternions.log(quaternions.product(quaternions.conjugate(origin), eps))
+            turned = quaternions.to_matrix(origin).mT @ at.jacobian
+            matrix = torch.eye(3, dtype=eps.dtype, device=eps.device).expand(*vector.shape, 3)
+            exact = Linearization(
+                quaternions.inverse_left_jacobian(vector) @ turned, matrix, -vector
             )
-        present = quaternions.conjugate(link.frame.orientation)
-        turn = quaternions.left_matrix(reference.frame.orientation)
-        matrix = self.gain * quaternions.vector_matrix(present) @ turn
-        displacement = state.joints.new_zeros(matrix.shape[:-1])
-        return Linearization(jacobian, matrix, displacement).silent(link.rigid_with(reference))
+            return exact if at.noise is None else exact.without(at.noise > 0)
+        like, columns = state.joints, state.quaternion_columns(self.link)
+        rows = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)[columns]
+        matrix = quaternions.left_matrix(origin)
+        present = (matrix.mT @ eps[..., None])[..., 0]
+        jacobian = rows.expand(*like.shape[:-1], *rows.shape)
+        return Linearization(jacobian, matrix, -like[..., columns], present)
 
 
 @dataclass(frozen=True)
@@ -205,24 +213,6 @@ class AbsoluteOrientation(_Orientation):
     tolerance: float = 0.0
     geometry: str = "quaternion"
     path: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
-
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) mu``."""
-        if not self._tangent and self.link in state.robot_links:
-            return Linearization(*state.orientation_map(self.link, self.gain))
-        link = Reference.of(self.link, state, frames, held=True)
-        return self._linearize(link, Reference.world(state), state)
-
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """``eps_t``, or ``log(conj(b_t) eps_t)``."""
-        link = Reference.of(self.link, state, frames, held=True)
-        if not self._tangent:
-            return link.frame.orientation
-        return self._coordinates(link, Reference.world(state))
-
-    def links(self) -> tuple[str, ...]:
-        """The link."""
-        return (self.link,)
 
 
 @dataclass(frozen=True)
@@ -270,32 +260,3 @@ class RelativeOrientation(_Orientation):
     tolerance: float = 0.0
     geometry: str = "quaternion"
     path: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_pair(self.link, self.frame, self.held)
-
-    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
-        """``J_o (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``."""
-        reference = Reference.of(self.frame, state, frames, self.held)
-        place = reference.angular_jacobian is None and not self.held
-        if place and not self._tangent and self.link in state.robot_links:
-            turn = quaternions.left_matrix(reference.frame.orientation)
-            jacobian, matrix, displacement = state.orientation_map(self.link, self.gain)
-            return Linearization(jacobian, matrix @ turn, displacement)
-        link = Reference.of(self.link, state, frames, held=True)
-        return self._linearize(link, reference, state)
-
-    def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
-        """``H+(conj eps_t^(j)) eps_t``, or its ``log(conj(b_t) ...)``."""
-        reference = Reference.of(self.frame, state, frames, self.held)
-        link = Reference.of(self.link, state, frames, held=True)
-        return self._coordinates(link, reference)
-
-    def links(self) -> tuple[str, ...]:
-        """The link; the frame too, if it is the held object that is meant."""
-        return (self.link, self.frame) if self.held else (self.link,)
-
-    def references(self) -> tuple[str, ...]:
-        """The frame, if it is a place."""
-        return () if self.held else (self.frame,)

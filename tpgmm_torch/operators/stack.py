@@ -5,18 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 
 import torch
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.gaussians import common_shape
 from tpgmm_torch.operators.base import Linearization, Operator
-from tpgmm_torch.operators.pose_terms import pose_terms
+from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
+from tpgmm_torch.operators.pose import linearize_poses
+from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Stack", "leaves"]
+__all__ = ["POSE_OPERATORS", "Stack", "leaves"]
+
+#: Operators that are linearised together.
+POSE_OPERATORS = AbsolutePosition, RelativePosition, AbsoluteOrientation, RelativeOrientation
 
 
 @dataclass(frozen=True, init=False)
@@ -66,77 +72,79 @@ class Stack(Operator):
 
     def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
         """Jacobians and displacements stacked, matrices on the diagonal."""
+        parts: list[Linearization] = []
+        for together, group in groupby(self.leaves, lambda leaf: _is_bilinear(leaf, state)):
+            if together:
+                parts.append(linearize_poses(tuple(group), state, frames))  # type: ignore[arg-type]
+            else:
+                parts += [operator.linearize(state, frames) for operator in group]
+        if len(parts) == 1:
+            return parts[0]
         like = state.joints
-        # where a state maps orientations in its own way, so must each operator
-        if type(state).orientation_map is RobotState.orientation_map:
-            terms = pose_terms(self.leaves, state.robot_links, like.dtype, like.device)
-            if terms is not None:
-                return terms.linearize(state, frames)
-        parts = [operator.linearize(state, frames) for operator in self.operators]
-        identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
-        jacobians, matrices, displacements = [], [], []
-        for part in parts:
-            rows = part.displacement.shape[-1]
-            jacobian = identity if part.jacobian is None else part.jacobian
-            matrix = identity.new_ones(rows).diag() if part.matrix is None else part.matrix
-            jacobians.append(jacobian)
-            matrices.append(matrix)
-            displacements.append(part.displacement)
-        batch = common_shape(
-            like.shape[:-1],
-            *(matrix.shape[:-2] for matrix in (*jacobians, *matrices)),
-            *(vector.shape[:-1] for vector in displacements),
-        )
-        rows, columns = sum(m.shape[-2] for m in matrices), sum(m.shape[-1] for m in matrices)
-        diagonal = like.new_zeros(*batch, rows, columns)
-        row = column = 0
-        for matrix in matrices:
-            m, d = matrix.shape[-2:]
-            diagonal[..., row : row + m, column : column + d] = matrix
-            row, column = row + m, column + d
+        sizes = [part.displacement.shape[-1] for part in parts]
+        identity = torch.eye(max(*sizes, like.shape[-1]), dtype=like.dtype, device=like.device)
+        n = like.shape[-1]
+        jacobians = [identity[:n, :n] if p.jacobian is None else p.jacobian for p in parts]
+        matrices = [
+            identity[:m, :m] if part.matrix is None else part.matrix
+            for m, part in zip(sizes, parts, strict=True)
+        ]
+        shapes = [matrix.shape[:-2] for matrix in (*jacobians, *matrices)]
+        shapes += [part.displacement.shape[:-1] for part in parts]
+        batch = gaussians.common_shape(like.shape[:-1], *shapes)
+        widths = [matrix.shape[-1] for matrix in matrices]
+        # the last row has the present quaternions
+        whole = like.new_zeros(*batch, sum(sizes) + 1, sum(widths))
+        row, column, known = 0, 0, True
+        for part, matrix, m, width in zip(parts, matrices, sizes, widths, strict=True):
+            whole[..., row : row + m, column : column + width] = matrix
+            if part.present is None:
+                known = False
+            else:
+                whole[..., -1, column : column + width] = part.present
+            row, column = row + m, column + width
+        noises = [part.noise for part in parts]
         noise = None
-        if any(part.noise is not None for part in parts):
-            each = [
-                torch.zeros_like(p.displacement) if p.noise is None else p.noise for p in parts
+        if any(one is not None for one in noises):
+            noise = [
+                torch.zeros_like(part.displacement) if part.noise is None else part.noise
+                for part in parts
             ]
-            noise = torch.cat([one.expand(*batch, one.shape[-1]) for one in each], dim=-1)
         return Linearization(
-            torch.cat([j.expand(*batch, *j.shape[-2:]) for j in jacobians], dim=-2),
-            diagonal,
-            torch.cat([c.expand(*batch, c.shape[-1]) for c in displacements], dim=-1),
-            noise=noise,
+            _joined(jacobians, batch, 2),
+            whole[..., :-1, :],
+            _joined([part.displacement for part in parts], batch, 1),
+            whole[..., -1, :] if known else None,
+            None if noise is None else _joined(noise, batch, 1),
         )
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """The coordinates side by side."""
         parts = [operator.coordinates(state, frames) for operator in self.operators]
-        batch = common_shape(*(part.shape[:-1] for part in parts))
-        return torch.cat([part.expand(*batch, part.shape[-1]) for part in parts], dim=-1)
+        return _joined(parts, gaussians.common_shape(*(part.shape[:-1] for part in parts)), 1)
+
+    def _starts(self, method: str, kinematics: Kinematics | None) -> tuple[int, ...]:
+        starts: list[int] = []
+        column = 0
+        for operator in self.operators:
+            starts += [column + start for start in getattr(operator, method)(kinematics)]
+            column += operator.dimension(kinematics)
+        return tuple(starts)
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """Those of the members, shifted to their columns."""
-        starts: list[int] = []
-        column = 0
-        for operator in self.operators:
-            starts += [column + start for start in operator.quaternion_starts(kinematics)]
-            column += operator.dimension(kinematics)
-        return tuple(starts)
+        return self._starts("quaternion_starts", kinematics)
 
     def rotation_vector_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """Those of the members, shifted to their columns."""
-        starts: list[int] = []
-        column = 0
-        for operator in self.operators:
-            starts += [column + s for s in operator.rotation_vector_starts(kinematics)]
-            column += operator.dimension(kinematics)
-        return tuple(starts)
+        return self._starts("rotation_vector_starts", kinematics)
 
     def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """Those of the members, side by side."""
         return tuple(v for o in self.operators for v in o.path_variances(kinematics))
 
     def at(self, time: Tensor) -> Operator:
-        """The stack of what the members are then."""
+        """The stack of the members at a time."""
         members = [operator.at(time) for operator in self.operators]
         same = all(now is one for now, one in zip(members, self.operators, strict=True))
         return self if same else Stack(*members)
@@ -170,9 +178,19 @@ class Stack(Operator):
 
 
 def leaves(operators: Sequence[Operator]) -> tuple[Operator, ...]:
-    """The members of stacks, and what is no stack, of some ``operators`` in their order."""
+    """The members of stacks, and other operators, of some ``operators`` in their order."""
     return tuple(
         leaf
         for operator in operators
         for leaf in (operator.leaves if isinstance(operator, Stack) else (operator,))
     )
+
+
+def _is_bilinear(operator: Operator, state: RobotState) -> bool:
+    # a class that is derived from one of them may linearise in its own way
+    return type(operator) in POSE_OPERATORS and operator.is_bilinear(state)  # type: ignore[attr-defined]
+
+
+def _joined(parts: Sequence[Tensor], batch: torch.Size, rank: int) -> Tensor:
+    """Parts one after the other along the first dimension behind the batch."""
+    return torch.cat([part.expand(*batch, *part.shape[-rank:]) for part in parts], dim=-rank)

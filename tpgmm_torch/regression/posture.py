@@ -23,7 +23,7 @@ a few fixed postures in turn.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, Self
@@ -39,15 +39,14 @@ from tpgmm_torch.operators import (
     RelativeOrientation,
     RelativePosition,
 )
-from tpgmm_torch.operators.base import Reference
 from tpgmm_torch.operators.stack import leaves
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import TASKS
 from tpgmm_torch.regression.joint_limits import step_within
-from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["PostureSearch", "Residual"]
+__all__ = ["PostureCost", "PostureSearch", "Residual", "descend"]
 
 #: Steps that are tried in one tick: the time that they take is all that trouble may cost.
 TRIALS = 2
@@ -71,13 +70,19 @@ EARLY, HOPELESS = 5, 5.0
 
 @dataclass(frozen=True, eq=False)
 class PostureSearch:
-    """The search for what is wanted, tick by tick; immutable. Begin with ``PostureSearch()``.
+    """Search for the nearest posture to an estimate that cannot be followed; immutable.
 
-    It costs nothing as long as nobody asks. Once begun for a robot it goes on until the
+    It costs nothing as long as all robots follow. Once begun for a robot it goes on until the
     regression's own step leads to the minimum as well.
 
     Parameters
     ----------
+    kinematics : Kinematics
+    operators : sequence of Operator
+    conditionals : sequence of Conditionals
+        The components' Gaussians given time, as they are fused, one for each operator.
+    prior_std : float or Tensor of shape (n_joints,)
+        Of the prior N(q_{t-1}, .) where no operator determines every joint.
     active : Tensor of bool, of shape (...), optional
         Robots whose regression is not trusted; None if there are none.
     minima, damping : Tensor of shape (K + 2, ..., n_joints) and (K + 2, ...), optional
@@ -87,6 +92,10 @@ class PostureSearch:
         Ticks since each robot's search began, and those that looks were given up early.
     """
 
+    kinematics: Kinematics
+    operators: Sequence[Operator]
+    conditionals: Sequence[Conditionals]
+    prior_std: float | Tensor
     active: Tensor | None = None
     minima: Tensor | None = None
     damping: Tensor | None = None
@@ -94,7 +103,6 @@ class PostureSearch:
 
     def advance(
         self,
-        regression: Regression,
         time: Tensor,
         reference: Tensor,
         frames: Mapping[str, Frame],
@@ -103,12 +111,10 @@ class PostureSearch:
         asked: Tensor,
         state_at: Callable[[Tensor], RobotState] | None = None,
     ) -> tuple[Tensor, Self]:
-        """What is wanted by each robot, and the search for the next tick.
+        """The nearest posture of each robot, and the search for the next tick.
 
         Parameters
         ----------
-        regression : Regression
-            What gave the estimate.
         time : Tensor of shape () or (...)
             Of the estimate [s].
         reference : Tensor of shape (..., n_joints)
@@ -134,25 +140,31 @@ class PostureSearch:
         """
         rows = asked if self.active is None else asked | self.active
         if not bool(rows.any()):
-            return estimate.joints, type(self)()
+            return estimate.joints, self.begun()
         with torch.no_grad():
             wanted, trust, *state = self._searched(
-                regression, time, reference, frames, estimate, bounds, rows, state_at
+                time, reference, frames, estimate, bounds, rows, state_at
             )
         joints = torch.lerp(wanted, estimate.joints, trust.unsqueeze(-1))
         joints = torch.where((trust < 1).unsqueeze(-1), joints, estimate.joints)
-        return joints, type(self)(rows & (asked | (trust < 1)), *state)
+        active = rows & (asked | (trust < 1))
+        minima, damping, age = state
+        searched = replace(self, active=active, minima=minima, damping=damping, age=age)
+        return joints, searched
+
+    def begun(self) -> Self:
+        """The same before any robot is searched for."""
+        return replace(self, active=None, minima=None, damping=None, age=None)
 
     def ended(self, robots: Tensor) -> Self:
-        """The same without the searches of robots (...) that were brought elsewhere."""
+        """The same without the searches of robots (...) that were displaced."""
         active = None if self.active is None else self.active & ~robots
         if active is None or not bool(active.any()):
-            return type(self)()
+            return self.begun()
         return replace(self, active=active)
 
     def _searched(
         self,
-        regression: Regression,
         time: Tensor,
         reference: Tensor,
         frames: Mapping[str, Frame],
@@ -182,7 +194,7 @@ class PostureSearch:
 
         def state(joints: Tensor) -> RobotState:
             if state_at is None:
-                return regression.kinematics.state(joints)
+                return self.kinematics.state(joints)
             everyone = reference.expand(len(joints), *batch, -1).clone()
             everyone[(slice(None), *where)] = joints
             return state_at(everyone)[(slice(None), *where)]
@@ -197,8 +209,8 @@ class PostureSearch:
         found[-1] = torch.where(begins.unsqueeze(-1), starts, found[-1])
         damped[-1] = torch.where(begins, 0.0, damped[-1])
         every = index.unsqueeze(-1).expand(-1, len(here))
-        cost = _Cost(
-            regression,
+        cost = PostureCost(
+            self,
             torch.cat((every.gather(0, heaviest), every, every, every)),
             time.expand(batch)[where] if time.ndim else time,
             reference[where],
@@ -206,7 +218,7 @@ class PostureSearch:
             state,
         )
         begun = torch.clamp(reference[where], lower, upper)
-        found, damped, height, stepped = _descended(
+        found, damped, height, stepped = descend(
             partial(_with_means, cost, weights, 1 + len(weights)),
             torch.cat((begun.unsqueeze(0), found)),
             torch.cat((torch.zeros_like(damped[:1]), damped)),
@@ -247,7 +259,7 @@ class PostureSearch:
 
 
 def _with_means(
-    cost: _Cost, weights: Tensor, alone: int, joints: Tensor
+    cost: PostureCost, weights: Tensor, alone: int, joints: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Costs for joints (A, R, n): of one component each for ``alone`` rows, then means.
 
@@ -282,16 +294,29 @@ def _shares(n_joints: int) -> Tensor:
     return shares
 
 
-def _descended(
+def descend(
     cost: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]],
     joints: Tensor,
     damping: Tensor,
     lower: Tensor,
     upper: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A few steps downhill within bounds from joints (A, ..., n) with damping (A, ...).
+    """A few steps of Levenberg's and Marquardt's method within bounds.
 
-    Joints, damping and costs after them, and where the first step led.
+    Parameters
+    ----------
+    cost : callable
+        Cost, downhill gradient and precision at joints.
+    joints : Tensor of shape (A, ..., n_joints)
+    damping : Tensor of shape (A, ...)
+    lower, upper : Tensor of shape (..., n_joints)
+
+    Returns
+    -------
+    joints, damping, cost : Tensor
+        After the steps.
+    first : Tensor of shape (A, ..., n_joints)
+        Joints after the first step.
     """
     joints = torch.clamp(joints, lower, upper)
     here, vector, precision = cost(joints)
@@ -320,12 +345,26 @@ def _descended(
     return joints, damping, here, first
 
 
-class _Cost:
-    """The costs F_i of components (A, ...) at one instant, for states of joints (A, ..., n)."""
+class PostureCost:
+    """The costs F_i of components (A, ...) at one instant, for joints (A, ..., n).
+
+    Parameters
+    ----------
+    search : PostureSearch
+        Operators and their conditionals.
+    index : Tensor of int, of shape (A, ...)
+        The components.
+    time : Tensor of shape () or (...)
+    centre : Tensor of shape (..., n_joints)
+        Mean of the prior where no operator determines every joint.
+    frames : mapping of str to Frame
+    state_at : callable
+        ``state_at(joints)`` gives the states of joints (A, ..., n_joints).
+    """
 
     def __init__(
         self,
-        regression: Regression,
+        search: PostureSearch,
         index: Tensor,
         time: Tensor,
         centre: Tensor,
@@ -335,14 +374,14 @@ class _Cost:
         self.centre, self.frames = centre, frames
         self.state_at, self.factors = state_at, list[Tensor]()
         self.local = []
-        for operator, one in zip(regression.operators, regression.fused, strict=True):
+        for operator, one in zip(search.operators, search.conditionals, strict=True):
             chosen = one.select(index)
             elapsed = (time - chosen.time_mean).unsqueeze(-1)
             mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
-            term = Residual.of(operator.at(time), regression.kinematics)
+            term = Residual.of(operator.at(time), search.kinematics)
             self.local.append((term, mean, chosen.covariance))
-        closed = any(operator.determines_joints for operator in regression.operators)
-        self.prior = None if closed else torch.as_tensor(regression.prior_std).to(centre) ** -2
+        closed = any(operator.determines_joints for operator in search.operators)
+        self.prior = None if closed else torch.as_tensor(search.prior_std).to(centre) ** -2
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (A, ...), downhill gradient (A, ..., n), and precision (A, ..., n, n)."""
@@ -474,8 +513,9 @@ class Residual:
             jacobian = jacobian.expand(*exact.shape[:-3], *jacobian.shape[-2:]).clone()
             jacobian[..., self.turns, :] = exact
         for leaf, row in self.leaves:
-            swing = Reference.of(leaf.frame, state, frames, leaf.held).angular_jacobian
-            if swing is not None:
+            reference = leaf.moving_reference(state)
+            if reference is not None:
+                swing = state.angular_jacobian(reference)
                 part = slice(row, row + 3)
                 if self.turns is None:
                     jacobian = jacobian.expand(*residual.shape, -1).clone()

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,11 +23,11 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Canonical, Linearization, Operator
+from tpgmm_torch.operators import Canonical, Linearization, Operator, Stack
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.operators.stack import leaves
-from tpgmm_torch.regression.active_components import ActiveComponents
 from tpgmm_torch.regression.conditionals import (
+    ActiveComponents,
     Conditionals,
     TimeMarginals,
     predictive_scale,
@@ -34,7 +35,9 @@ from tpgmm_torch.regression.conditionals import (
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.joint_limits import within
+from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.prior import PRIOR_STD
+from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Components", "Regression"]
@@ -231,6 +234,43 @@ class Regression:
         weights = torch.softmax(self._marginals.log_activation(time.unsqueeze(-1)), -1)
         return (weights.unsqueeze(-2) @ self.conditionals[operator].at(time)).squeeze(-2)
 
+    def log_likelihood(
+        self,
+        times: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        window: slice = slice(None),
+    ) -> Tensor:
+        """Log-density of observed robots at times; see :meth:`Skill.log_likelihood`."""
+        key = times.numpy(force=True).tobytes()
+        if key not in self._likelihoods:
+            parts = self.kinematics, self.operators, self.conditionals, self._marginals
+            with torch.inference_mode(False):
+                self._likelihoods[key] = TimeLikelihood(*parts, times)
+        with torch.inference_mode():
+            return torch.from_numpy(self._likelihoods[key](state, frames, window))
+
+    def observed(self, names: frozenset[str]) -> Regression | None:
+        """The mixture of observed operators; see :meth:`Skill.observed`.
+
+        Of a stack of operators, those of which all frames and links are observed are kept.
+        """
+        if names not in self._observed:
+            self._observed[names] = self._restricted(names)
+        return self._observed[names]
+
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
+        """The same for all robots; see :meth:`Skill.start`."""
+        return self
+
+    def advance(self, estimate: Estimate) -> Regression:
+        """The same at all ticks; see :meth:`Skill.advance`."""
+        return self
+
+    def posture_search(self) -> PostureSearch:
+        """Search for the nearest posture; see :meth:`Skill.posture_search`."""
+        return PostureSearch(self.kinematics, self.operators, self.fused, self.prior_std)
+
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
     ) -> Tensor:
@@ -340,6 +380,43 @@ class Regression:
     def carried_names(self) -> tuple[str, ...]:
         """See :attr:`Skill.carried_names`."""
         return carried_objects(self.operators, self.kinematics)
+
+    @cached_property
+    def _likelihoods(self) -> dict[bytes, TimeLikelihood]:
+        return {}
+
+    @cached_property
+    def _observed(self) -> dict[frozenset[str], Regression | None]:
+        return {}
+
+    def _restricted(self, names: frozenset[str]) -> Regression | None:
+        """The mixture of those operators that need no other frames and links than these."""
+        operators: list[Operator] = []
+        conditionals: list[Conditionals] = []
+        kept: list[int] = []
+        for index, operator in enumerate(self.operators):
+            members = leaves([operator])
+            there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
+            if not any(there):
+                continue
+            one = self.conditionals[index]
+            if not all(there):
+                sizes = [leaf.dimension(self.kinematics) for leaf in members]
+                columns = np.flatnonzero(np.repeat(there, sizes))
+                one = one.marginal(torch.from_numpy(columns))
+                seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
+                operator = Stack(*seen)
+            operators.append(operator)
+            conditionals.append(one)
+            kept.append(index)
+        if operators == list(self.operators):
+            return self
+        if not operators:
+            return None
+        priorities = self.priorities and [self.priorities[index] for index in kept]
+        return replace(
+            self, operators=operators, conditionals=conditionals, priorities=priorities
+        )
 
     @cached_property
     def _marginals(self) -> TimeMarginals:

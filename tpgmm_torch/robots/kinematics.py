@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import is_gripper
@@ -66,7 +65,7 @@ class RobotState:
         Unit quaternions of the links in the base frame.
     jacobians : Tensor of shape (..., L, 6, n_joints)
         Geometric Jacobians in the base frame: velocity, then angular velocity.
-    carriers : Tensor of int, of shape (..., V), optional
+    carriers : tuple of int or Tensor of int of shape (...), default=()
         For each of the last V links, which are objects (:meth:`with_link`), the index of the
         robot's link that carries it, -1 where it is free.
     joint_names : tuple of str, default=()
@@ -78,7 +77,7 @@ class RobotState:
     positions: Tensor
     orientations: Tensor
     jacobians: Tensor
-    carriers: Tensor | None = None
+    carriers: tuple[int | Tensor, ...] = ()
     joint_names: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -88,7 +87,7 @@ class RobotState:
     @property
     def robot_links(self) -> tuple[str, ...]:
         """The links of the robot itself, without objects."""
-        return self.links if self.carriers is None else self.links[: -self.carriers.shape[-1]]
+        return self.links[: len(self.links) - len(self.carriers)]
 
     def position(self, link: str) -> Tensor:
         """``x_{t-1}`` of a link [m], shape (..., 3)."""
@@ -102,38 +101,27 @@ class RobotState:
         """Position and orientation of a link."""
         return Frame._from(self.position(link), self.orientation(link))
 
+    def jacobian(self, link: str) -> Tensor:
+        """``J_p`` above ``J_o`` of a link, shape (..., 6, n_joints)."""
+        return self.jacobians[..., self._index(link), :, :]
+
     def linear_jacobian(self, link: str) -> Tensor:
         """``J_p`` of a link: velocity per joint velocity, shape (..., 3, n_joints)."""
-        return self.jacobians[..., self._index(link), :3, :]
+        return self.jacobian(link)[..., :3, :]
 
     def angular_jacobian(self, link: str) -> Tensor:
         """``J_o`` of a link: angular velocity per joint velocity, shape (..., 3, n_joints)."""
-        return self.jacobians[..., self._index(link), 3:, :]
+        return self.jacobian(link)[..., 3:, :]
 
-    def orientation_map(self, link: str, gain: float) -> tuple[Tensor, Tensor, Tensor]:
-        """What it takes to turn a ``link`` to a wanted orientation ``eps`` (eq. 11).
-
-        ``jacobian (q - q_{t-1}) = matrix eps + offset``: here the Jacobian is ``J_o``, the
-        matrix ``gain * Hbar*(conj eps_{t-1})``, the offset 0. A ``gain`` of 2 asks for the
-        whole rotation vector to first order, 1 is the text of eq. (7).
-
-        Returns
-        -------
-        jacobian : Tensor of shape (..., m, n_joints)
-        matrix : Tensor of shape (..., m, 4)
-        offset : Tensor of shape (..., m)
-            Here m = 3.
-        """
-        orientation = self.orientation(link)
-        matrix = gain * quaternions.vector_matrix(quaternions.conjugate(orientation))
-        return self.angular_jacobian(link), matrix, torch.zeros_like(orientation[..., 1:])
+    def quaternion_columns(self, link: str) -> slice | None:
+        """Where the quaternion of a link is in the joint vector: nowhere, on a robot."""
+        return None
 
     def carrier(self, link: str) -> int | Tensor:
         """The index of the robot's link that a link is, or that carries it; -1 if none does."""
-        index = self._index(link) - len(self.robot_links)
-        if index < 0 or self.carriers is None:
-            return self._index(link)
-        return self.carriers[..., index]
+        index = self._index(link)
+        n_robot = len(self.links) - len(self.carriers)
+        return index if index < n_robot else self.carriers[index - n_robot]
 
     def with_link(
         self, name: str, link: str | None, pose: Frame, where: Tensor | None = None
@@ -180,12 +168,12 @@ class RobotState:
         if link is not None:
             pose = self.pose(link).compose(pose)
             arm = pose.position - self.position(link)
-            angular = self.angular_jacobian(link).expand(*arm.shape[:-1], -1, -1)
+            linear, angular = self.jacobian(link).split(3, -2)
+            angular = angular.expand(*arm.shape[:-1], -1, -1)
             swing = torch.linalg.cross(angular, arm[..., None], dim=-2)
-            jacobian = torch.cat((self.linear_jacobian(link) + swing, angular), dim=-2)
+            jacobian = torch.cat((linear + swing, angular), dim=-2)
             carrier = self.carrier(link)
         position, orientation = pose.position, pose.orientation
-        index = torch.as_tensor(carrier, device=position.device)
         if where is not None:
             if name not in self.links:
                 raise DataError(
@@ -195,71 +183,68 @@ class RobotState:
             where = where.to(position.device)
             position = torch.where(where[..., None], position, self.position(name))
             orientation = torch.where(where[..., None], orientation, self.orientation(name))
-            here = self.jacobians[..., self._index(name), :, :]
-            jacobian = torch.where(where[..., None, None], jacobian, here)
-            index = torch.where(where, index, self.carrier(name))
-        state = self
-        if name in self.links:
-            objects = self.links[len(self.robot_links) :]
-            state = self.with_objects([other for other in objects if other != name])
-        batch = common_shape(state.joints.shape[:-1], position.shape[:-1], index.shape)
-        carriers = [index.expand(batch)[..., None]]
-        if state.carriers is not None:
-            carriers = [state.carriers.expand(*batch, -1), *carriers]
+            jacobian = torch.where(where[..., None, None], jacobian, self.jacobian(name))
+            carrier = torch.where(where, carrier, self.carrier(name))
+        known = self._without(name) if name in self.links else self
+        shape = carrier.shape if isinstance(carrier, Tensor) else torch.Size()
+        batch = common_shape(known.joints.shape[:-1], position.shape[:-1], shape)
 
-        def joined(known: Tensor, new: Tensor, shape: tuple[int, ...]) -> Tensor:
-            parts = known.expand(*batch, -1, *shape), new.expand(*batch, *shape)
-            return torch.cat((parts[0], parts[1].unsqueeze(-1 - len(shape))), -1 - len(shape))
+        def joined(links: Tensor, new: Tensor, rank: int) -> Tensor:
+            tail = new.shape[-rank:]
+            one = new.expand(*batch, *tail).unsqueeze(-1 - rank)
+            return torch.cat((links.expand(*batch, -1, *tail), one), -1 - rank)
 
-        n = state.joints.shape[-1]
         return replace(
-            state,
-            joints=state.joints.expand(*batch, n),
-            links=(*state.links, name),
-            positions=joined(state.positions, position, (3,)),
-            orientations=joined(state.orientations, orientation, (4,)),
-            jacobians=joined(state.jacobians, jacobian, (6, n)),
-            carriers=torch.cat(carriers, -1),
+            known,
+            joints=known.joints.expand(*batch, -1),
+            links=(*known.links, name),
+            positions=joined(known.positions, position, 1),
+            orientations=joined(known.orientations, orientation, 1),
+            jacobians=joined(known.jacobians, jacobian, 2),
+            carriers=tuple(
+                one.expand(batch) if isinstance(one, Tensor) else one
+                for one in (*known.carriers, carrier)
+            ),
+        )
+
+    def _without(self, name: str) -> Self:
+        """The state without one of its objects."""
+        kept = [i for i, link in enumerate(self.links) if link != name]
+        first = len(self.robot_links)
+        return replace(
+            self,
+            links=tuple(self.links[i] for i in kept),
+            positions=self.positions[..., kept, :],
+            orientations=self.orientations[..., kept, :],
+            jacobians=self.jacobians[..., kept, :, :],
+            carriers=tuple(self.carriers[i - first] for i in kept[first:]),
+        )
+
+    def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
+        """The state with each of its tensors changed, given the rank behind the batch."""
+        return replace(
+            self,
+            joints=change(self.joints, 1),
+            positions=change(self.positions, 2),
+            orientations=change(self.orientations, 2),
+            jacobians=change(self.jacobians, 3),
+            carriers=tuple(
+                change(one, 0) if isinstance(one, Tensor) else one for one in self.carriers
+            ),
         )
 
     def flatten(self, batch: torch.Size) -> Self:
         """The states of a whole batch, its dimensions as one."""
-        tails = {"joints": 1, "positions": 2, "orientations": 2, "jacobians": 3, "carriers": 1}
-        parts = {name: getattr(self, name) for name in tails}
-        whole = {
-            name: part.expand(*batch, *part.shape[-tails[name] :]).flatten(0, len(batch) - 1)
-            for name, part in parts.items()
-            if part is not None
-        }
-        return replace(self, **whole)
+        last = len(batch) - 1
 
-    def with_objects(self, names: Sequence[str]) -> Self:
-        """The state with these of its objects, in that order, and no others."""
-        if self.carriers is None:
-            for name in names:
-                raise UnknownNameError("object", name, "the state", ())
-            return self
-        own = len(self.robot_links)
-        chosen = [*range(own), *(self._index(name) for name in names)]
-        return replace(
-            self,
-            links=tuple(self.links[i] for i in chosen),
-            positions=self.positions[..., chosen, :],
-            orientations=self.orientations[..., chosen, :],
-            jacobians=self.jacobians[..., chosen, :, :],
-            carriers=None if not names else self.carriers[..., [i - own for i in chosen[own:]]],
-        )
+        def whole(part: Tensor, rank: int) -> Tensor:
+            return part.expand(*batch, *part.shape[part.ndim - rank :]).flatten(0, last)
+
+        return self._map(whole)
 
     def __getitem__(self, index: Any) -> Self:
         """Select along the leading dimensions."""
-        return replace(
-            self,
-            joints=self.joints[index],
-            positions=self.positions[index],
-            orientations=self.orientations[index],
-            jacobians=self.jacobians[index],
-            carriers=None if self.carriers is None else self.carriers[index],
-        )
+        return self._map(lambda part, _: part[index])
 
     def _index(self, link: str) -> int:
         if link not in self.links:

@@ -25,12 +25,8 @@ __all__ = ["Poses", "PosesState"]
 class PosesState(RobotState):
     """The poses themselves, see :class:`RobotState`."""
 
-    def orientation_map(self, link: str, gain: float) -> tuple[Tensor, Tensor, Tensor]:
-        """The exact map: the quaternion's coordinates become those of the wanted one.
-
-        Nothing is linearised, so that the gain has no effect: the Jacobian (..., 4, n_joints)
-        selects the quaternion's columns, the matrix is the identity, the offset ``-eps_{t-1}``.
-        An object that a body carries is turned as by a robot.
+    def quaternion_columns(self, link: str) -> slice | None:
+        """Where the quaternion of a body is in the joint vector; nowhere, of an object.
 
         Raises
         ------
@@ -38,18 +34,14 @@ class PosesState(RobotState):
             If the poses were made without orientation.
         """
         if link not in self.robot_links:
-            return super().orientation_map(link, gain)
-        place = self._index(link)
-        n, batch = self.joints.shape[-1], self.joints.shape[:-1]
-        width = n // len(self.robot_links)
+            return None
+        width = self.joints.shape[-1] // len(self.robot_links)
         if width == 3:
             raise DataError(
                 f"link {link!r} has no orientation: the poses were made with orientation=False"
             )
-        columns = slice(width * place + 3, width * (place + 1))
-        eye = torch.eye(n, dtype=self.joints.dtype, device=self.joints.device)
-        jacobian = eye[columns].expand(*batch, 4, n)
-        return jacobian, eye[:4, :4].expand(*batch, 4, 4), -self.joints[..., columns]
+        end = width * (self._index(link) + 1)
+        return slice(end - 4, end)
 
 
 class Poses(Kinematics):

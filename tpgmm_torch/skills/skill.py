@@ -173,26 +173,22 @@ class Skill(Protocol):
         """Search for the nearest posture where an estimate cannot be followed, or None."""
         return None
 
-    def advance(
-        self, dt: float | Tensor, time: Tensor, observation: Observation
-    ) -> tuple[Skill, Tensor | None]:
-        """The skill to run from the next tick on; called at the end of each tick.
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
+        """The skill for robots that begin with these postures and objects.
 
         Parameters
         ----------
-        dt : float or Tensor of shape (...)
-            Seconds since the last tick.
-        time : Tensor of shape () or (...)
-            Progress of this tick [s].
-        observation : Observation
-            Of this tick, with the estimate that this skill gave.
-
-        Returns
-        -------
-        skill : Skill
-            ``self``, or the same with what it remembers, or another one, into which the
-            controller fades within the bounds of motion.
-        time : Tensor of shape (), or None
-            Where in that one the robots are [s]; None if the time goes on.
+        joints : Tensor of shape (..., n_joints)
+        frames : mapping of str to Frame
         """
-        return self, None
+        return self
+
+    def advance(self, estimate: Estimate) -> Skill:
+        """The skill for the next tick, with what it remembers of its last estimate.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            What :meth:`estimate` returned at this tick.
+        """
+        return self

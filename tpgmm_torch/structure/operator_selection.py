@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError
@@ -396,7 +395,7 @@ def candidate_operators(
     kinematics : Kinematics or None
         Whose links are seen: in the base frame, from every frame, and from one another.
     demonstration : Demonstration
-        Whose frames there are. Task parameters (:class:`Affine`) are none of them.
+        Whose frames there are.
     held : sequence of str, default=()
         Frames of objects that links hold at times: they are seen from the other frames, too,
         and from one another as they are held.
@@ -416,7 +415,7 @@ def candidate_operators(
     turns = getattr(kinematics, "orientation", True)  # tracked points have none
     for link in links:
         candidates += [AbsolutePosition(link), AbsoluteOrientation(link)][: 1 + turns]
-    frames = [n for n, f in demonstration.frames.items() if not isinstance(f, Affine)]
+    frames = list(demonstration.frames)
     pairs = [(link, frame) for frame in frames for link in links]
     pairs += [(link, other) for other, link in combinations(links, 2)]
     pairs += [(thing, frame) for thing in held for frame in frames if frame != thing]

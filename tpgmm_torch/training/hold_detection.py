@@ -16,7 +16,6 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
@@ -124,8 +123,7 @@ def find_holds(
         motion: _Motion | None = None
         for name in names:
             pose, shown = demonstration.frames[name], list[Hold]()
-            recorded = pose.batch_shape and not isinstance(pose, Affine)
-            if recorded and float(change(pose[:1], pose).max()) > TRAVEL:
+            if pose.batch_shape and float(change(pose[:1], pose).max()) > TRAVEL:
                 motion = motion or _Motion.of(demonstration, kinematics, grippers or {})
                 shown = motion.holds(name, pose.to(motion.time), change)
             found[name].append(shown)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import chain
 from numbers import Real
 from typing import Any
 
@@ -15,9 +14,8 @@ from numpy.typing import NDArray
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.operators import Canonical, Operator, TaskParameters
-from tpgmm_torch.operators.stack import leaves
-from tpgmm_torch.operators.text import KINDS
+from tpgmm_torch.operators import Canonical, Operator
+from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -31,7 +29,7 @@ __all__ = [
 ]
 
 #: Of these, equal ones say the same; of a user's own operators nobody knows.
-COMPARED = frozenset((Canonical, TaskParameters, *chain(*KINDS.values())))
+COMPARED = (Canonical, *POSE_OPERATORS)
 
 
 def check_operators(operators: Any) -> tuple[Operator, ...]:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_datasets.bottle.figures import draw_figures
+from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import HANDS, SHOULDERS, TASK, BottleShaking
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
@@ -40,7 +41,7 @@ from tpgmm_torch import (
     Trajectory,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
-from tpgmm_torch.metrics import largest_acceleration, largest_velocity, sinusoid
+from tpgmm_torch.metrics import largest_acceleration, largest_velocity
 
 __all__ = ["BottleExperiment", "bottle_operators"]
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_torch.checks.training import EpisodeSummary
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -79,7 +78,7 @@ class RecordingSummary(EpisodeSummary):
         speeds = np.abs(steps) / periods[:, None] if len(periods) else 0 * joints
         longest = int(periods.argmax()) if len(periods) else 0
         phases = np.linspace(0, len(time) - 1, PHASES).round().astype(int)
-        poses = {n: f for n, f in demonstration.frames.items() if not isinstance(f, Affine)}
+        poses = demonstration.frames
         wraps, jumps = _jumps(time, joints, steps)
         return cls(
             **vars(EpisodeSummary.of(demonstration)),

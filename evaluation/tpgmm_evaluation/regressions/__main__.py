@@ -39,12 +39,14 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("constant", nargs="?", help="MODULE:NAME, for sensitivity")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--small", action="store_true", help="minutes in place of hours")
-    parser.add_argument("--only", default=",".join(SECTIONS), help="sections, with commas")
+    parser.add_argument("--only", help="sections, with commas")
     parser.add_argument("--workers", type=int, default=2, help="processes for rollouts")
     parser.add_argument("--again", action="store_true", help="measure what was measured before")
     parser.add_argument("--base", type=Path, help="checkout to take times beside, in turns")
     parser.add_argument("--rounds", type=int, default=3, help="of times taken in turns")
     given = parser.parse_args(arguments)
+    usual = ("goldens", "recordings") if given.what == "sensitivity" else SECTIONS
+    given.only = given.only or ",".join(usual)
     if unknown := set(given.only.split(",")) - set(SECTIONS):
         parser.error(f"--only: no such section: {sorted(unknown)}; there are {list(SECTIONS)}")
     return given
@@ -58,7 +60,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     before = given.out / f"baseline{form}"
     plan = Plan(before, given.small, workers=given.workers)
     if given.what == "sensitivity":
-        for line in sensitivity(given.constant, replace(plan, small=True)):
+        plan = replace(plan, out=given.out / "sensitivity")
+        for line in sensitivity(given.constant or "", plan, given.only.split(",")):
             print(line, flush=True)
         return 0
     if given.what == "compare":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import types
 from collections.abc import Mapping
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Measured", "Plan"]
+__all__ = ["Measured", "Plan", "import_paths"]
 
 #: Arrays by ``KIND:NAME``. The kind says how two of them are compared: ``same`` to rounding;
 #: ``success`` (0 or 1), ``score`` (more is better) and ``error`` (less is better) in pairs, the
@@ -52,3 +53,9 @@ class Plan:
             sys.modules[parent] = types.ModuleType(parent)
         sys.modules[parent].__path__ = [str(self.root / parent)]
         return import_module(module)
+
+
+def import_paths(root: Path) -> str:
+    """``PYTHONPATH`` with which the packages of a checkout are found."""
+    containers = ("", "datasets", "policies", "environments", "evaluation", "tools")
+    return os.pathsep.join(str(root.resolve() / each) for each in containers)

@@ -23,7 +23,7 @@ from tpgmm_evaluation.benchmarks import BENCHMARKS, OTHER_ROBOTS
 from tpgmm_evaluation.cells import Results
 from tpgmm_evaluation.compare import compare
 from tpgmm_evaluation.regressions.goldens import GOLDENS
-from tpgmm_evaluation.regressions.plan import Measured, Plan
+from tpgmm_evaluation.regressions.plan import Measured, Plan, import_paths
 from tpgmm_evaluation.settings import Settings
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import TPGMMError
@@ -197,12 +197,10 @@ def mistakes(plan: Plan) -> Iterator[tuple[str, Work]]:
 
 def timed(root: Path, small: bool) -> Measured:
     """Seconds of the main work, measured by the checkout at ``root`` with its own code."""
-    containers = ("", "datasets", "policies", "environments", "evaluation", "tools")
-    paths = os.pathsep.join(str(root.resolve() / each) for each in containers)
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "benchmarks", "--only", "main", "--out", out]
         command += ["--sizes", "tiny"] if small else []
-        env = os.environ | {"PYTHONPATH": paths}
+        env = os.environ | {"PYTHONPATH": import_paths(root)}
         subprocess.run(command, cwd=root, env=env, check=True, stdout=subprocess.DEVNULL)
         rows = json.loads((Path(out) / "main.json").read_text(encoding="utf-8"))["rows"]
     return {f"seconds:{row['work']}": np.array([row["ours"]]) for row in rows}

@@ -19,10 +19,10 @@ from lerobot_env_bimanual.bottle.shaking import (
     BottleShakingEnv,
 )
 from lerobot_env_bimanual.start import PUSHED
+from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
 from tpgmm_torch import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.metrics import sinusoid
 
 FIGURES = {
     *("grasp_mm", "grasp_deg", "lift_mm", "frequency_hz", "amplitude_rad"),

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import HANDS, PHASES, BottleShaking
 from tpgmm_torch import Frame, Situation, quaternions
-from tpgmm_torch.metrics import largest_velocity, sinusoid
+from tpgmm_torch.metrics import largest_velocity
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from sklearn.base import clone
 
-from tests.support.motions import DEMONSTRATIONS, turning
+from tests.support.motions import DEMONSTRATIONS
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import (
     Alignment,
@@ -21,17 +21,6 @@ from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.tracked_poses import Poses
-
-
-def test_moving_frames_and_recorded_poses_turn_along_great_arcs():
-    coarse, fine = np.linspace(0, 2, 65), np.linspace(0, 1, 65)
-    [aligned] = LinearTimeNormalization(1.0, robot=Poses(["hand"])).fit_transform(
-        [turning(coarse, coarse / 2)]
-    )
-    exact = turning(fine, fine)
-    arcs = aligned.frames["moving"].orientation
-    torch.testing.assert_close(arcs, exact.frames["moving"].orientation, rtol=0, atol=1e-12)
-    torch.testing.assert_close(aligned.joints[:, 3:], arcs, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("transformer", [DynamicTimeWarping(), LinearTimeNormalization()])
@@ -124,13 +113,6 @@ def test_quaternions_among_the_joints_turn_and_keep_unit_norm():
     expected = Slerp(steps, turns)(path).as_matrix()
     np.testing.assert_allclose(quaternions.to_matrix(turned), expected, atol=1e-12)
     np.testing.assert_allclose(retimed.joints[:, 5], -path, atol=1e-13)
-
-
-def test_retiming_keeps_the_type_of_the_data():
-    own = moving()
-    single = Demonstration(own.time.float(), own.joints.float())
-    retimed = retime(single, instants(single, [0.0, 3.5]), torch.tensor([0.0, 1.0]))
-    assert retimed.time.dtype == retimed.joints.dtype == torch.float32
 
 
 class Backwards(Alignment):

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tests.support.motions import DEMONSTRATIONS, Arm, turning
-from tpgmm_torch import quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.alignment.features import AlignmentFeatures, quaternion_columns
 from tpgmm_torch.data.demonstrations import Demonstration
@@ -37,14 +36,6 @@ def test_nothing_to_align_by_is_an_error():
     still = Demonstration(np.arange(5.0), np.ones((5, 2)))
     with pytest.raises(DataError, match="nothing to align by"):
         DynamicTimeWarping().fit([still, still])
-
-
-def test_frames_unknown_to_fit_are_an_error():
-    fitted = DynamicTimeWarping(0, features=["elbow in bottle"], robot=Arm())
-    fitted.fit(DEMONSTRATIONS[:2])
-    bare = Demonstration(DEMONSTRATIONS[0].time, DEMONSTRATIONS[0].joints, None, tuple("abcde"))
-    with pytest.raises(UnknownNameError, match="'elbow in bottle'"):
-        fitted.transform([bare])
 
 
 def scaled(demonstrations, name, robot=None):
@@ -115,22 +106,6 @@ def test_directions_do_not_depend_on_the_speed_and_fade_out_at_standstill():
     assert -forth[0] / back[0] == pytest.approx(expected, rel=0.01)
 
 
-def test_directions_are_those_of_uneven_time_steps_too():
-    time = np.linspace(0, 2, 201) ** 2
-    even = np.linspace(0, 4, 201)
-
-    def path(t):
-        return np.stack((np.sin(2 * t), np.cos(3 * t)), axis=1)
-
-    uneven, regular = (
-        scaled([Demonstration(t, path(t))], "directions")[0] for t in (time, even)
-    )
-    for column in range(2):
-        expected = np.interp(time, even, regular[:, column])
-        ratio = uneven[20:-20, column] @ expected[20:-20] / (expected[20:-20] ** 2).sum()
-        assert np.abs(uneven[20:-20, column] - ratio * expected[20:-20]).max() < 0.1
-
-
 def test_quaternions_are_found_by_the_names_of_the_joints():
     time = np.linspace(0, 1, 30)
     own = turning(time, time)
@@ -145,15 +120,6 @@ def test_quaternions_are_found_by_the_names_of_the_joints():
         quaternion_columns(Demonstration(time, np.ones((30, 3))), poses)
     with pytest.raises(UnknownNameError, match=r"'hand\.qw' is not in the demonstration"):
         quaternion_columns(own.reordered(names[:3]), poses)
-
-
-def test_quaternions_count_as_rotations():
-    time = np.linspace(0, 1, 30)
-    own = turning(time, time)
-    turns = own.frames["moving"].orientation
-    [rows] = scaled([own], "joints", Poses(["hand"]))
-    expected = np.column_stack((own.joints[:, :3], quaternions.to_matrix(turns).flatten(1)))
-    np.testing.assert_allclose(rows / rows[9, 0], expected / expected[9, 0], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from sklearn.base import clone
-from sklearn.pipeline import make_pipeline
 
 from tpgmm_torch.alignment import (
     DynamicTimeWarping,
@@ -94,14 +93,6 @@ def test_events_are_at_one_instant_and_each_part_is_stretched_evenly(duration):
         np.testing.assert_allclose(one.joints[:, 0], phase, atol=0.02)
 
 
-def test_events_at_equal_phases_leave_it_linear():
-    family = [shown(0, end, close=end / 4) for end in (4.0, 6.0)]
-    expected = LinearTimeNormalization().fit_transform(family)
-    for one, other in zip(EventAlignment().fit_transform(family), expected, strict=True):
-        np.testing.assert_allclose(one.time, other.time)
-        np.testing.assert_allclose(one.joints, other.joints, atol=1e-9)
-
-
 def test_others_are_aligned_onto_the_same_instants():
     transformer = EventAlignment(["close"]).fit(FAMILY)
     assert transformer.events_ == ("close",)
@@ -118,11 +109,6 @@ def test_start_and_end_are_anchors_anyway():
     named = EventAlignment(["start", "close", "open", "end"]).fit(FAMILY)
     assert named.events_ == ("close", "open")
     np.testing.assert_allclose(named.paths_[1], EventAlignment().fit(FAMILY).paths_[1])
-
-
-def test_it_is_a_step_of_a_pipeline():
-    pipeline = make_pipeline(EventAlignment(), LinearTimeNormalization(1.0))
-    assert [one.duration for one in pipeline.fit_transform(FAMILY)] == [1.0] * 3
 
 
 @pytest.mark.parametrize(
@@ -143,11 +129,6 @@ def test_it_is_a_step_of_a_pipeline():
 def test_events_that_are_missing_or_out_of_order_are_refused(family, events, told):
     with pytest.raises(DataError, match=told):
         EventAlignment(events).fit(family)
-
-
-def test_transformed_demonstrations_need_the_events_too():
-    with pytest.raises(DataError, match=r"has no event 'open'; it has \['close'\]"):
-        EventAlignment().fit(FAMILY).transform([shown(close=2.0)])
 
 
 def paced(close, pace, seed=0):

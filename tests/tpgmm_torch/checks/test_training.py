@@ -21,7 +21,6 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.checks import check
 from tpgmm_torch.checks.training import summarize
-from tpgmm_torch.data.affine import Affine
 from tpgmm_torch.exceptions import PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.joint_space import JointSpace
 
@@ -38,7 +37,7 @@ def test_what_a_summary_keeps():
     time = np.arange(6) / 2
     cup = np.zeros((6, 3))
     cup[2:, 1] = 0.3
-    frames = {"cup": Frame(cup), "box": Frame([1, 0, 0]), "rail": Affine([[2.0]], [0.1])}
+    frames = {"cup": Frame(cup), "box": Frame([1, 0, 0])}
     shown = Demonstration(time, np.stack((time, -time), 1), frames, ("a", "b"), {"put": 0.5})
     [one] = summarize([shown], JointSpace(("b", "a")))
     assert (one.begin, one.duration, one.step) == (0.0, 2.5, 0.5)

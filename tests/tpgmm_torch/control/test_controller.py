@@ -11,7 +11,8 @@ from tests.support.mixtures import CASES, Case, Problem, assert_close
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
 from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation
-from tpgmm_torch.control.clocks import EvenClock, parse_clock
+from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clocks import EvenClock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, ShapeError

@@ -384,7 +384,7 @@ def test_robots_at_their_own_times_are_each_as_if_alone():
 def test_what_is_told_counts_from_then_on_for_those_of_whom_it_is_told():
     holding, joints = begun(2)
     told = holding.advance(1.0, joints, told={"bottle": RIGHT})
-    assert told.state(upper_body().state(joints)).carrier("bottle").tolist() == [1, 1]
+    assert told.state(upper_body().state(joints)).carrier("bottle") == 1
     grasp = holding.frames["bottle"].seen_from(hand(joints, RIGHT))
     let_go = told.advance(3.0, joints + 0.1, told={"bottle": None})
     assert_at(let_go.frames["bottle"], hand(joints + 0.1, RIGHT).compose(grasp))

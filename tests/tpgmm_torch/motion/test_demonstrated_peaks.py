@@ -50,11 +50,6 @@ def test_one_broken_demonstration_of_many_does_not_count():
     assert 9 < float(demonstrated_peaks(shown, NAMES)[0][0]) < 10
 
 
-def test_joints_are_known_by_their_names():
-    peaks = demonstrated_peaks([swing(), swing(order=("b", "a"))], ("b", "a"))
-    assert [bool(peak[0] < 1e-9) and bool(peak[1] > 4) for peak in peaks] == [True, True]
-
-
 def test_batches_pass_unchanged_and_count_together():
     first, second = [swing(0.1), swing(0.2)], [swing(0.9)]
     peaks = DemonstratedPeaks(NAMES)

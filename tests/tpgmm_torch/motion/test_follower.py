@@ -208,17 +208,6 @@ def test_a_robot_does_not_depend_on_its_batch(jitter):
             )
 
 
-def test_followers_do_not_change():
-    first = Follower.at(bounds(), [0.0, 0.0, 0.0])
-    wanted = torch.full((3,), 0.5, dtype=torch.float64)
-    second = first.advance(wanted, DT)
-    moved = second.reference.clone()
-    again = first.advance(wanted, DT)
-    second.advance(-wanted, DT)
-    assert torch.equal(again.reference, moved) and torch.equal(second.reference, moved)
-    assert first.reference.tolist() == [0.0, 0.0, 0.0]
-
-
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ShapeError, match=r"reference has shape \(..., 3\)"):
         Follower.at(bounds(), [0.0, 0.0])

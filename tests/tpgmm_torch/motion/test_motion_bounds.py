@@ -122,8 +122,3 @@ def test_a_description_without_limits_is_told_once():
         warnings.simplefilter("error")
         assert MotionBounds.of(robot, velocity=0.1).velocity.tolist() == [0.1] * 5
         MotionBounds.of(ROBOT)  # nothing is described, so nothing is missing
-
-
-def test_bounds_have_the_dtype_of_the_robot():
-    bounds = MotionBounds.of(upper_body(dtype=torch.float32), peaks([1.0] * 17, [1.0] * 17))
-    assert {value.dtype for value in vars(bounds).values()} == {torch.float32}

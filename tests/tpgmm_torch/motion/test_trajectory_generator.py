@@ -45,12 +45,6 @@ def test_a_motion_is_stopped_in_the_time_and_room_that_bounds_ask():
     assert -0.1 < low[1] < -0.02 and high[1] == 0
 
 
-def test_a_motion_that_rests_stays_where_it_is():
-    start = np.array([[0.4, -0.3], [0.0, 0.5], [0.0, 0.0]])
-    low, high = stopping_range(start, *BOUNDS[1:])
-    assert (low[0], high[0], low[1]) == (0.4, 0.4, -0.3) and high[1] > -0.3
-
-
 def test_without_bounds_a_motion_stands_or_goes_at_once():
     endless = np.full(2, np.inf)
     start = np.array([[0.5, 0.0], [9.0, 0.0], [0.0, 0.0]])

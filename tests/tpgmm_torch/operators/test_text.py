@@ -13,7 +13,6 @@ from tpgmm_torch import (
     RelativeOrientation,
     RelativePosition,
     Stack,
-    TaskParameters,
 )
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
@@ -28,15 +27,11 @@ OPERATORS = [
     RelativePosition("bottle", "tray"),
     RelativeOrientation("r_hand", "bottle", held=True),
     Stack(RelativePosition("lid", "bottle", held=True), RelativePosition("l_hand", "lid")),
-    TaskParameters("shelf"),
-    TaskParameters("shelf", "l_hand"),
-    TaskParameters("shelf", size=3),
-    Stack(TaskParameters("shelf", "l_hand", 2), Canonical()),
     Canonical(tolerance=0.02),
     Canonical(joints=("left_*", "waist_yaw")),
     Canonical(0.1, ("left_*",)),
     RelativePosition("l_hand", "bottle", tolerance=1e-5),
-    Stack(AbsoluteOrientation("l_hand", tolerance=0.1), TaskParameters("shelf", tolerance=2.0)),
+    Stack(AbsoluteOrientation("l_hand", tolerance=0.1), Canonical(tolerance=2.0)),
     RelativeOrientation("r_hand", "bottle", held=True, tolerance=0.1, geometry="tangent"),
     Stack(AbsoluteOrientation("l_hand", geometry="tangent"), AbsoluteOrientation("r_hand")),
 ]

@@ -1,4 +1,4 @@
-"""The most likely joints within bounds: exact, by two methods that are tested on each other."""
+"""The most likely joints within bounds are exact."""
 
 from functools import partial
 
@@ -7,7 +7,6 @@ import torch
 
 from tests.support.mixtures import CASES, Problem, assert_close, times
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression import joint_limits
 from tpgmm_torch.regression.joint_limits import step_within, within
 
 
@@ -40,37 +39,6 @@ def test_a_batch_and_each_robot_of_it_find_the_minimum(n):
     assert_optimal(together, mean, covariance, lower, upper)
     for one, *problem in zip(together, mean, covariance, lower, upper, strict=True):
         assert_close(within(*problem), one, 1e-9)
-
-
-@pytest.mark.parametrize("without", ["_sides", "_sides_of_one"])
-def test_each_method_finds_it_alone(without, monkeypatch):
-    """The solver of one robot, and block pivoting, which needs no other."""
-    mean, covariance, lower, upper = (x[:1] for x in problems(1, 17, seed=5))
-    both = within(mean, covariance, lower, upper)
-
-    def refuse(*_):
-        assert without == "_sides_of_one", "the solver of one robot failed"
-
-    monkeypatch.setattr(joint_limits, without, refuse)
-    alone = within(mean, covariance, lower, upper)
-    assert_close(alone, both, 1e-9)
-    assert_optimal(alone, mean, covariance, lower, upper)
-
-
-def test_pivoting_that_does_not_end_asks_the_other_method(monkeypatch):
-    monkeypatch.setattr(joint_limits, "MOST", 1)
-    problem = problems(20, 12, seed=2)
-    assert_optimal(within(*problem), *problem)
-
-
-def test_exchanging_all_wrong_joints_may_circle_and_one_at_a_time_ends(monkeypatch):
-    monkeypatch.setattr(joint_limits, "_sides_of_one", lambda *_: None)
-    # one of 300 that circles
-    problem = tuple(x[25:26] for x in problems(300, 3, seed=8))
-    assert_optimal(within(*problem), *problem)
-    monkeypatch.setattr(joint_limits, "PATIENCE", 10**9)
-    with pytest.raises(AssertionError):
-        assert_optimal(within(*problem), *problem)
 
 
 def test_joints_without_room_stand():
@@ -171,3 +139,5 @@ def test_a_step_within_bounds_is_that_of_the_gaussian():
         assert torch.equal(alone, together[one])
     with pytest.raises(DataError, match="the product is not positive definite"):
         step_within(joints, vector, -precision, lower, upper)
+    with pytest.raises(DataError, match="not positive definite, or not finite"):
+        step_within(joints, vector * torch.nan, precision, lower, upper)

@@ -5,7 +5,7 @@ import torch
 
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
 from tpgmm_torch import Frame
-from tpgmm_torch.regression.posture import PostureSearch, _Cost, _descended
+from tpgmm_torch.regression.posture import PostureCost, descend
 
 # shortly before the grasp, where one component has nearly all the weight
 TIME = torch.tensor(4.4, dtype=torch.float64)
@@ -20,12 +20,13 @@ def limits():
 
 def searched(frame, start, ticks, time=TIME, asked=True, **options):
     """What is wanted at each tick, of a robot that is where it wants to be at once."""
-    regression, search, found = small_bottle().regression(), PostureSearch(), []
+    regression, found = small_bottle().regression(), []
+    search = regression.posture_search()
     asked = torch.full(start.shape[:-1], asked)
     for _ in range(ticks):
         estimate = regression.estimate(time, start, {"bottle": frame}, limits())
         start, search = search.advance(
-            regression, time, start, {"bottle": frame}, estimate, limits(), asked, **options
+            time, start, {"bottle": frame}, estimate, limits(), asked, **options
         )
         found.append(start)
     return found, search
@@ -38,7 +39,9 @@ def costs(frame, joints, time=TIME, component=None):
         component = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
     index = torch.as_tensor(component).expand(1, len(joints))
     frames = {"bottle": frame.expand(joints.shape[:1])}
-    return _Cost(regression, index, time, joints, frames, regression.kinematics.state)
+    return PostureCost(
+        regression.posture_search(), index, time, joints, frames, regression.kinematics.state
+    )
 
 
 def neutral():
@@ -63,8 +66,8 @@ def test_the_gradient_is_that_of_the_cost(frame):
 def test_who_is_not_asked_keeps_the_estimate():
     regression = small_bottle().regression()
     estimate = regression.estimate(TIME, neutral(), {"bottle": HIGH}, limits())
-    wanted, search = PostureSearch().advance(
-        regression, TIME, neutral(), {"bottle": HIGH}, estimate, limits(), torch.tensor(False)
+    wanted, search = regression.posture_search().advance(
+        TIME, neutral(), {"bottle": HIGH}, estimate, limits(), torch.tensor(False)
     )
     assert wanted is estimate.joints and search.active is None
 
@@ -81,10 +84,10 @@ def test_what_is_reached_is_left_to_the_regression():
     found, search = searched(REACHED, near, 3)
     assert float((found[-1] - joints).abs().max()) < 1e-3
     estimate = regression.estimate(TIME, near, {"bottle": REACHED}, limits())
-    begun = PostureSearch()
+    begun = regression.posture_search()
     for asked in (True, False):
         wanted, begun = begun.advance(
-            regression, TIME, near, {"bottle": REACHED}, estimate, limits(), torch.tensor(asked)
+            TIME, near, {"bottle": REACHED}, estimate, limits(), torch.tensor(asked)
         )
     assert torch.equal(wanted, estimate.joints) and not bool(begun.active)
 
@@ -106,7 +109,7 @@ def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
     many, damping = lower + (upper - lower) * many, torch.zeros(1, 60, dtype=torch.float64)
     for _ in range(40):
         cost = costs(frame, many[0])
-        many, damping, height, _ = _descended(cost, many, damping, lower, upper)
+        many, damping, height, _ = descend(cost, many, damping, lower, upper)
     here = float(costs(frame, found[-1][None])(found[-1][None, None])[0])
     assert here <= 1.05**2 * float(height.min())
 
@@ -133,7 +136,7 @@ def test_between_two_components_what_cannot_be_reached_is_approached_too():
 
     joints, damping = here[None, None], torch.zeros(1, 1, dtype=torch.float64)
     for _ in range(40):
-        joints, damping, height, _ = _descended(mean, joints, damping, lower, upper)
+        joints, damping, height, _ = descend(mean, joints, damping, lower, upper)
     assert float(mean(here[None, None])[0]) <= 1.02**2 * float(height)
 
 
@@ -164,12 +167,11 @@ def test_a_search_that_ended_begins_anew_where_the_robot_is():
     estimate = regression.estimate(TIME, elsewhere, {"bottle": REACHED}, limits())
     asked = torch.ones(2, dtype=torch.bool)
     steps = [
-        before.advance(
-            regression, TIME, elsewhere, {"bottle": REACHED}, estimate, limits(), asked
-        )[0]
-        for before in (one, PostureSearch(), search)
+        before.advance(TIME, elsewhere, {"bottle": REACHED}, estimate, limits(), asked)[0]
+        for before in (one, regression.posture_search(), search)
     ]
     torch.testing.assert_close(steps[0][0], steps[1][0], rtol=0, atol=1e-12)
     torch.testing.assert_close(steps[0][1], steps[2][1], rtol=0, atol=1e-12)
     assert float((steps[0][0] - steps[2][0]).abs().max()) > 1e-3
-    assert search.ended(asked).active is None and PostureSearch().ended(asked).active is None
+    assert search.ended(asked).active is None
+    assert search.begun().ended(asked).active is None

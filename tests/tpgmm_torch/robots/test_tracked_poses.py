@@ -12,9 +12,9 @@ from sklearn.base import clone
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from tpgmm_torch import quaternions
+from tpgmm_torch import AbsoluteOrientation, quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.robots.tracked_poses import Poses
 
 
@@ -79,35 +79,23 @@ def test_jacobian_gives_velocity_and_angular_velocity() -> None:
 
 @pytest.mark.parametrize("link", ["left", "right"])
 @pytest.mark.parametrize("scale", [1.0, 0.9])
-def test_orientation_map_reaches_any_orientation_exactly(link: str, scale: float) -> None:
+def test_any_orientation_is_reached_exactly_whatever_the_gain(link: str, scale: float) -> None:
     poses = Poses()
-    joints = scale * random_joints(poses, 2)
+    state = poses.state(scale * random_joints(poses, 2))
     wanted = random_joints(poses, 2, seed=1)
-    column = 3 + 7 * poses.links.index(link)
+    eps = wanted[:, state.quaternion_columns(link)]
+    assert type(state[1]) is type(state)
     for gain in (1.0, 2.0):
-        jacobian, matrix, offset = poses.state(joints).orientation_map(link, gain)
-        assert jacobian.shape == (2, 4, 14)
-        eps = wanted[:, column : column + 4]
-        asked = (matrix @ eps[..., None]).squeeze(-1) + offset
-        met = (jacobian @ (wanted - joints)[..., None]).squeeze(-1)
+        at = AbsoluteOrientation(link, gain=gain).linearize(state, {})
+        asked = (at.matrix @ eps[..., None]).squeeze(-1) + at.displacement
+        met = (at.jacobian @ (wanted - state.joints)[..., None]).squeeze(-1)
         torch.testing.assert_close(met, asked)
 
 
-def test_orientation_map_needs_orientation() -> None:
+def test_poses_without_orientation_have_none() -> None:
     state = Poses(("hand",), orientation=False).state([0.0, 0.0, 0.0])
     with pytest.raises(DataError, match="'hand' has no orientation"):
-        state.orientation_map("hand", 2.0)
-    with pytest.raises(UnknownNameError, match="'cup'"):
-        state.orientation_map("cup", 2.0)
-
-
-def test_selected_states_stay_states_of_poses() -> None:
-    poses = Poses()
-    state = poses.state(random_joints(poses, 3))
-    jacobian, _, offset = state[1].orientation_map("right", 2.0)
-    assert type(state[1]) is type(state)
-    assert jacobian.shape == (4, 14)
-    torch.testing.assert_close(offset, -state.joints[1, 10:])
+        AbsoluteOrientation("hand").linearize(state, {})
 
 
 def test_retraction_normalises_quaternions_and_nothing_else() -> None:

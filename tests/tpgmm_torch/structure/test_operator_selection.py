@@ -14,7 +14,6 @@ from tests.support.skills import handlings, hands_model, waves
 from tests.support.worlds import upper_body
 from tpgmm_torch import (
     AbsolutePosition,
-    Affine,
     Canonical,
     Demonstration,
     Frame,
@@ -183,9 +182,7 @@ def test_joints_that_matter_are_found_in_groups():
 
 def test_candidates_are_all_links_in_all_frames(task):
     shown = task.demonstrations(3)[0]
-    shown = replace(
-        shown, frames={"a": shown.frames["a"], "map": Affine(np.eye(3), np.ones(3))}
-    )
+    shown = replace(shown, frames={"a": shown.frames["a"]})
     texts = [format_operator(one) for one in candidate_operators(Poses(["l", "r"]), shown)]
     kinds = ("position", "orientation")
     places = ("l", "r", "l@a", "r@a", "r@l")

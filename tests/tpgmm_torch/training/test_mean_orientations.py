@@ -22,10 +22,10 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.control import localization
-from tpgmm_torch.control.localization import Localizer
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.regression.posture import _Cost
+from tpgmm_torch.regression.conditionals import TimeMarginals
+from tpgmm_torch.regression.posture import PostureCost
+from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 
@@ -319,39 +319,33 @@ def handling():
     return skill.fit(few_bottles())
 
 
-def test_an_instant_of_a_skill_is_found():
-    skill, demonstration = handling(), few_bottles()[0]
-    begin, end = demonstration.time[[0, -1]].tolist()
-    localizer = Localizer(skill.regression(), begin, end)
-    state = skill.kinematics_.state(demonstration.joints)
-    look = localizer.look(state, dict(demonstration.frames))
-    found = localizer.instants[look.log_likelihood().argmax(1)]
-    before = demonstration.time.numpy() < 8  # then it shakes, and instants are alike
-    assert np.median(np.abs(found - demonstration.time.numpy())[before]) < 0.11
-    part = slice(20, 60)
-    np.testing.assert_allclose(
-        look.log_likelihood(part), look.log_likelihood()[:, part], rtol=1e-9
-    )
+def test_the_time_of_a_posture_is_found():
+    skill, demonstration = handling().regression(), few_bottles()[0]
+    times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 400, dtype=torch.float64)
+    state = skill.kinematics.state(demonstration.joints)
+    found = times[skill.log_likelihood(times, state, dict(demonstration.frames)).argmax(1)]
+    before = demonstration.time < 8  # then it shakes, and places are alike
+    assert float((found - demonstration.time)[before].abs().median()) < 0.11
 
 
-def test_the_likelihood_of_an_instant_is_that_of_the_coordinates_then(monkeypatch):
-    monkeypatch.setattr(localization, "SLACK", 0.0)
-    monkeypatch.setattr(localization, "NEGLIGIBLE", 0.0)
+def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
     regression = model(RELATIVE, ABSOLUTE).regression()
-    localizer = Localizer(regression, 0.0, 3.0)
+    time, first = torch.linspace(0, 3, 76, dtype=torch.float64), regression.conditionals[0]
+    marginals = TimeMarginals.of(regression.log_weights, first.time_mean, first.time_variance)
+    parts = regression.kinematics, regression.operators, regression.conditionals, marginals
+    likelihood = TimeLikelihood(*parts, time, slack=0.0, negligible=0.0)
     shown = recordings(seed=4, count=1)[0]
     for state in (HAND.state(shown.joints[[7, 31]]), HAND.state(shown.joints[[11]])):
-        got = localizer.look(state, dict(shown.frames)).log_likelihood()
+        got = likelihood(state, dict(shown.frames))
         for row, joints in zip(got, state.joints, strict=True):
             alone = HAND.state(joints)
-            time = torch.from_numpy(localizer.instants)
             local = [
                 operator.at(time).coordinates(alone, shown.frames)
                 for operator in regression.operators
             ]
-            joint = regression.log_density(time, local).numpy()
-            marginals = regression._marginals.log_activation(time[:, None]).logsumexp(-1)
-            expected = joint - marginals.numpy()
+            joint = regression.log_density(time, local)
+            weights = marginals.log_activation(time[:, None]).logsumexp(-1)
+            expected = (joint - weights).numpy()
             np.testing.assert_allclose(row - row.max(), expected - expected.max(), atol=1e-6)
 
 
@@ -364,9 +358,9 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
     joints = few_bottles()[0].joints[:1].to(torch.float64)
     joints = joints + 0.3 * torch.randn(1, 17, generator=generator, dtype=torch.float64)
     index = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
-    cost = _Cost(
-        regression, index.expand(1, 1), time, joints, {"bottle": frame.expand((1,))},
-        regression.kinematics.state,
+    cost = PostureCost(
+        regression.posture_search(), index.expand(1, 1), time, joints,
+        {"bottle": frame.expand((1,))}, regression.kinematics.state,
     )  # fmt: skip
     _, downhill, _ = cost(joints[None])
     steps = 1e-6 * torch.eye(17, dtype=torch.float64)

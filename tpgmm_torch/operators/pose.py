@@ -1,0 +1,239 @@
+"""Positions and orientations of links: what the rows of Table I have in common.
+
+With ``eps_f`` the orientation of the frame that an operator refers to (the identity in the base
+frame) and ``eps`` that of its link, the matrices M of eqs (6), (14), (15) are bilinear: of a
+position ``R(eps_f)`` in ``eps_f, eps_f``, of an orientation ``g Hbar*(conj eps) H+(eps_f)`` in
+``eps, eps_f``. One product with a constant gives the matrices of all operators of a stack, and
+one selection of rows their Jacobians: a control tick costs per operation, not per number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache
+from itertools import accumulate
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import quaternions
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.gaussians import common_shape
+from tpgmm_torch.operators.base import Linearization, Operator
+from tpgmm_torch.robots.kinematics import RobotState
+
+__all__ = ["PoseOperator", "linearize_poses"]
+
+
+class PoseOperator(Operator):
+    """Position or orientation of a link, in the base frame or as seen from another frame.
+
+    What :class:`AbsolutePosition`, :class:`RelativePosition`, :class:`AbsoluteOrientation` and
+    :class:`RelativeOrientation` share. Relative ones have a ``frame``, and ``held`` says
+    whether it is meant as the thing that the robot may carry.
+    """
+
+    link: str
+    tolerance: float
+    #: The factor g of an orientation; None of a position.
+    gain: Any = None
+
+    def __post_init__(self) -> None:
+        if self.link == self._frame:
+            raise DataError(f"{self.link!r} seen from itself never changes: name another frame")
+        if not isinstance(self._held, bool):
+            raise DataError(f"held is True or False, got {self._held!r}")
+
+    @property
+    def _frame(self) -> str | None:
+        return getattr(self, "frame", None)
+
+    @property
+    def _held(self) -> bool:
+        return getattr(self, "held", False)
+
+    def links(self) -> tuple[str, ...]:
+        """The link; the frame too, if it is the held object that is meant."""
+        return (self.link, self._frame) if self._frame and self._held else (self.link,)
+
+    def references(self) -> tuple[str, ...]:
+        """The frame, if it is a place."""
+        return (self._frame,) if self._frame and not self._held else ()
+
+    @cached_property
+    def term(self) -> _Term:
+        """What its linearisation depends on, for :func:`linearize_poses`."""
+        return _Term(self.link, self._frame, self._held, self.gain)
+
+    def moving_reference(self, state: RobotState) -> str | None:
+        """The link or carried object that coordinates are seen from; None if it is a place."""
+        moving = state.links if self._held else state.robot_links
+        return self._frame if self._frame in moving else None
+
+    def is_bilinear(self, state: RobotState) -> bool:
+        """Whether :func:`linearize_poses` serves."""
+        return True
+
+    def linearize(self, state: RobotState, frames: Mapping[str, Frame]) -> Linearization:
+        """The row of eq. (6) for a position, of eq. (11) for an orientation.
+
+        ``J (q - q_{t-1}) = R mu + p - x_{t-1}``, and
+        ``J (q - q_{t-1}) = g Hbar*(conj eps_{t-1}) H+(eps^(j)) mu``.
+        Seen from a place J is the link's; seen from another link f, whose pose moves too,
+        ``J_p - J_pf + [x - p_f]x J_of`` and ``J_o - J_of``. Between an object and the link
+        that carries it, or two places, this is ``0 = 0``.
+        """
+        return linearize_poses((self,), state, frames)
+
+    def poses(
+        self, state: RobotState, frames: Mapping[str, Frame]
+    ) -> tuple[Frame, Frame | None]:
+        """Of what is seen, and of what it is seen from; None is the base frame."""
+        body = (
+            state.pose(self.link)
+            if self.link in state.links
+            else _place(self.link, state, frames)
+        )
+        if self._frame is None:
+            return body, None
+        moving = self.moving_reference(state)
+        return body, state.pose(moving) if moving else _place(self._frame, state, frames)
+
+
+def _place(name: str, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
+    if name not in frames:
+        known = [*frames, *state.links]
+        raise UnknownNameError("frame", name, "the situation or the robot's links", known)
+    return frames[name]
+
+
+class _Term(NamedTuple):
+    """What the constants of an operator depend on; ``gain`` is None for a position."""
+
+    link: str
+    frame: str | None
+    held: bool
+    gain: float | None
+
+
+def linearize_poses(
+    operators: Iterable[PoseOperator], state: RobotState, frames: Mapping[str, Frame]
+) -> Linearization:
+    """``J``, ``M``, ``c`` and the present quaternions of operators that are stacked.
+
+    Parameters
+    ----------
+    operators : iterable of PoseOperator
+    state : RobotState
+    frames : mapping of str to Frame
+    """
+    terms, like = tuple(operator.term for operator in operators), state.joints
+    at = _constants(terms, state.links, len(state.carriers), like.dtype, like.device)
+    places = [*(_place(name, state, frames) for name in at.places), at.base]
+    batch = common_shape(state.positions.shape[:-2], *(place.batch_shape for place in places))
+    links = [state.positions.expand(*batch, -1, 3), state.orientations.expand(*batch, -1, 4)]
+    others = [(p.position.expand(*batch, 3), p.orientation.expand(*batch, 4)) for p in places]
+    positions, orientations = (
+        torch.cat((own, *(part.unsqueeze(-2) for part in parts)), -2)
+        for own, *parts in zip(links, *others, strict=True)
+    )
+    way = positions.index_select(-2, at.seen_from) - positions.index_select(-2, at.seen)
+    way = way * at.is_position
+    first = orientations.index_select(-2, at.first).unsqueeze(-1)
+    pairs = first * orientations.index_select(-2, at.seen_from).unsqueeze(-2)
+    matrices = _product(pairs.flatten(-3), at.matrix).unflatten(-1, at.shape)
+    # the rows of each link, linear and angular, in threes, and three of zeros
+    threes = state.jacobians.unflatten(-2, (2, 3)).flatten(-4, -3)
+    threes = torch.cat((threes, torch.zeros_like(threes[..., :1, :, :])), -3)
+    jacobian = threes.index_select(-3, at.rows)
+    if at.is_moving:  # what it is seen from moves, and carries the points along
+        angular = threes.index_select(-3, at.angular_rows).expand(*batch, -1, -1, -1)
+        swing = torch.linalg.cross(angular, way[..., None].expand_as(angular), dim=-2)
+        jacobian = jacobian - threes.index_select(-3, at.reference_rows) + swing
+    result = Linearization(
+        jacobian.flatten(-3, -2), matrices[..., :-1, :], way.flatten(-2), matrices[..., -1, :]
+    )
+    carriers = (*range(len(state.robot_links)), *state.carriers, *[-1] * len(places))
+    rigid = [carriers[one] == carriers[other] for one, other in at.bodies]
+    if all(one is False for one in rigid):
+        return result
+    flags = [torch.as_tensor(one, device=like.device).expand(batch) for one in rigid]
+    return result.without(torch.stack(flags, -1).repeat_interleave(3, -1))
+
+
+class _Constants:
+    """The constants of :func:`linearize_poses` for P operators.
+
+    Poses are those of the links, of the ``places`` that the operators refer to, and the base.
+    """
+
+    def __init__(
+        self, terms: Sequence[_Term], links: tuple[str, ...], n_objects: int, **options: Any
+    ) -> None:
+        known = [links if t.held else links[: len(links) - n_objects] for t in terms]
+        names = [t.link for t in terms if t.link not in links]
+        names += [
+            t.frame for t, k in zip(terms, known, strict=True) if t.frame and t.frame not in k
+        ]
+        self.places = tuple(dict.fromkeys(names))
+
+        def pose(name: str | None, moving: tuple[str, ...]) -> int:
+            if name in moving:
+                return moving.index(name)
+            return len(links) + (self.places.index(name) if name else len(self.places))
+
+        seen = [pose(term.link, links) for term in terms]
+        seen_from = [pose(t.frame, k) for t, k in zip(terms, known, strict=True)]
+        self.bodies = list(zip(seen, seen_from, strict=True))
+        self.is_moving = min(seen_from) < len(links)
+        # Hbar(conj a) H+(b) as coefficients (16, 4, 4) of a_i b_j; of a = b, R(a) below right
+        eye = torch.eye(4, dtype=torch.float64)
+        right = quaternions.right_matrix(quaternions.conjugate(eye))
+        bilinear = (right[:, None] @ quaternions.left_matrix(eye)).flatten(0, 1)
+        ends = [*accumulate(3 if term.gain is None else 4 for term in terms)]
+        self.shape = 3 * len(terms) + 1, ends[-1]  # the last row: present quaternions
+        matrix = torch.zeros(len(terms), 16, *self.shape, dtype=torch.float64)
+        for at, (term, end) in enumerate(zip(terms, ends, strict=True)):
+            rows = matrix[at, :, 3 * at : 3 * at + 3, :end]
+            if term.gain is None:
+                rows[..., -3:] = bilinear[:, 1:, 1:]
+            else:
+                rows[..., -4:] = term.gain * bilinear[:, 1:]
+                matrix[at, :, -1, end - 4 : end] = bilinear[:, 0]
+        self.matrix = matrix.flatten(2).flatten(0, 1).to(**options)
+        unit = quaternions.identity(**options)
+        self.base = Frame._from(torch.zeros_like(unit[:3]), unit)
+
+        def index(values: Iterable[int]) -> Tensor:
+            return torch.tensor([*values], device=options["device"])
+
+        angular = [int(term.gain is not None) for term in terms]
+        first = [b if a else f for a, b, f in zip(angular, seen, seen_from, strict=True)]
+        self.first, self.seen, self.seen_from = map(index, (first, seen, seen_from))
+        self.is_position = (1 - index(angular)).to(unit)[:, None]
+        still = index([2 * len(links)])  # of poses that no joint moves
+        self.rows = torch.minimum(2 * self.seen + index(angular), still)
+        self.reference_rows = torch.minimum(2 * self.seen_from + index(angular), still)
+        self.angular_rows = torch.minimum(2 * self.seen_from + 1, still)
+
+
+@lru_cache(maxsize=64)
+def _constants(
+    terms: tuple[_Term, ...],
+    links: tuple[str, ...],
+    n_objects: int,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> _Constants:
+    # a constant made while inference mode is on could not serve where gradients are wanted
+    with torch.inference_mode(False):
+        return _Constants(terms, links, n_objects, dtype=dtype, device=device)
+
+
+def _product(row: Tensor, matrix: Tensor) -> Tensor:
+    """``row @ matrix``; of one robot, for a compiler, a sum: a loop that others can join."""
+    if torch.compiler.is_compiling() and row.numel() == row.shape[-1]:
+        return (row.unsqueeze(-1) * matrix).sum(-2)
+    return row @ matrix
