@@ -20,6 +20,7 @@ from tpgmm_datasets.conversion.assembly import (
 )
 from tpgmm_datasets.conversion.joints import JointColumns, joint_feature
 from tpgmm_datasets.errors import DatasetError, summed_up
+from tpgmm_datasets.events import doubtful_events
 from tpgmm_datasets.lerobot.calibration import Calibration, calibrated_units
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
@@ -28,9 +29,8 @@ from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
 from tpgmm_datasets.units import Unit, Units
-from tpgmm_torch.checks.report import PLAUSIBILITY, Report
+from tpgmm_torch.checks.report import Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
-from tpgmm_torch.events.detection import doubtful_events
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
@@ -48,14 +48,11 @@ class Recording:
         What a demonstration is made of.
     relax : collection of str
         Checks whose problems leave an episode out, and are warned of.
-    plausibility : {"warn", "error", "ignore"}
-        What is done about what is implausible.
     """
 
     episodes: tuple[Episode, ...]
     assembly: Assembly
     relax: Collection[str]
-    plausibility: str = "warn"
 
     def demonstrations(self, check: bool = True) -> Iterator[Demonstration]:
         """Read the wanted episodes, one when it is asked for.
@@ -97,7 +94,7 @@ class Recording:
                     f"are relaxed, {sorted(self.relax)}: {reasons}"
                 )
             if check:
-                self._report(summaries).act(self.plausibility, (PACKAGE,))
+                self._report(summaries).act(packages=(PACKAGE,))
         finally:
             policy.warn()
 
@@ -136,7 +133,6 @@ def open_recording(
     rate: float | None = None,
     trim: float | None = None,
     relax: Collection[str] = (),
-    plausibility: str = "warn",
 ) -> Recording:
     """Check the metadata of a data set, and find out how to read it.
 
@@ -146,16 +142,12 @@ def open_recording(
         As for :func:`load_lerobot`.
     rate, trim, relax
         As for :func:`load_lerobot`.
-    plausibility : {"warn", "error", "ignore"}, default="warn"
-        As for :func:`load_lerobot`.
 
     Raises
     ------
     DatasetError
         As :func:`load_lerobot`.
     """
-    if plausibility not in PLAUSIBILITY:
-        raise DatasetError(f"plausibility is one of {PLAUSIBILITY}, got {plausibility!r}")
     check_robot(robot)
     policy = Relaxed(relax)
     layout = open_layout(local_folder(path))
@@ -192,7 +184,7 @@ def open_recording(
     if stated is not None:
         assembly.joints.values(stated, file="meta/stats.json")
     chosen = tuple(select_episodes(layout, episodes))
-    return Recording(chosen, assembly, policy.names, plausibility)
+    return Recording(chosen, assembly, policy.names)
 
 
 def _calibrated(
@@ -314,11 +306,11 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         if it never changes.
     events : mapping of str to str, Detector or callable, optional
         How events are found, all values of the joint feature given: what
-        :func:`~tpgmm_torch.events.parse_event` takes, as ``"closing:*gripper*"``, or a
+        :func:`~tpgmm_datasets.events.parse_event` takes, as ``"closing:*gripper*"``, or a
         function from the demonstration to a time [s]. Columns ``event.*`` are found by
         themselves, and so are ``close`` and ``open`` (of the gripper on the link's side, known
         by its name) and ``stop`` where a frame is at them. What is found without confidence is
-        no event; it is told of, as ``plausibility`` says.
+        no event, and named in the warning.
     episodes : slice, sequence of int, or str, optional
         Which: of all in order, by index, or those of a task. The default is all.
     rate : float, optional
@@ -328,10 +320,6 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
     relax : collection of str, default=()
         Names of checks (:data:`CHECKS`) that shall not raise: episodes that fail one are
         left out with a :class:`DatasetWarning`, those for one reason together.
-    plausibility : {"warn", "error", "ignore"}, default="warn"
-        What is done about recordings that are unlikely to be what they are taken for
-        (:func:`tpgmm_datasets.check`): one warning, an error, or nothing.
-        What cannot be is an error unless ignored.
 
     Returns
     -------
@@ -344,7 +332,12 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         With file, episode and column, if the set is incomplete or contradicts itself or the
         arguments.
     PlausibilityError
-        If values cannot be what they are taken for.
+        If values cannot be what they are taken for (:func:`tpgmm_datasets.check`).
+
+    Warns
+    -----
+    PlausibilityWarning
+        Once, with all that is unlikely about them.
 
     Examples
     --------
@@ -372,8 +365,6 @@ def iter_lerobot(recording: Recording) -> Iterator[Demonstration]:
         As for :func:`load_lerobot`.
     rate, trim, relax
         As for :func:`load_lerobot`.
-    plausibility : {"warn", "error", "ignore"}, default="warn"
-        As for :func:`load_lerobot`; acted on after the last episode.
 
     Yields
     ------

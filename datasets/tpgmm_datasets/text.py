@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
-from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]

@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
+from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import (
     Hold,
@@ -29,7 +30,6 @@ from tpgmm_torch import (
 from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import check_parameters
-from tpgmm_torch.events.text import parse_event
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
@@ -216,7 +216,7 @@ class TPGMMConfig(StatePolicyConfig):
         to be told them like any frame, but for those at ``start``: they follow from the joints.
     events : dict of str to str, optional
         How training finds events, ``{"close": "closing:*gripper*"}``, as
-        :func:`tpgmm_torch.events.parse_event` takes it. Others are those of the columns
+        :func:`tpgmm_datasets.events.parse_event` takes it. Others are those of the columns
         ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
         frame is are found by themselves, where there is no such column.
     default_environment_state : list of float, optional

@@ -15,9 +15,9 @@ from tests.support.damage import TABLES, WITH_JSON, blocks, bounded, damaged, on
 from tests.support.policies import fitted
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_datasets.situation_files import read_situations
 from tpgmm_torch import Demonstration, Robot, TaskParameterizedGMM
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.situation_files import read_situations
 from tpgmm_torch.exceptions import TPGMMError
 
 DEMONSTRATIONS = 50

@@ -40,8 +40,8 @@ SHOWN = {
     "tpgmm_torch.operators.text": "format_operator parse_operator",
     "tpgmm_tools.plotting": "figure",
     "tpgmm_torch.quaternions": "exp product",
-    "tpgmm_torch.data.situation_files": "read_situations",
-    "tpgmm_torch.data.tables": "demonstrations_from_frame demonstrations_to_frame",
+    "tpgmm_datasets.situation_files": "read_situations",
+    "tpgmm_datasets.tables": "demonstrations_from_frame demonstrations_to_frame",
     "tpgmm_datasets": (
         "FramePose LinkPose Scale describe_lerobot load_lerobot resample save_lerobot trim"
     ),

@@ -42,7 +42,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("names",),
         ("units", "robots"),
         ("checks",),
-        ("lerobot", "motors"),
+        ("events", "lerobot", "motors", "situation_files", "tables"),
         ("conversion",),
         ("description", "reader", "writer"),
         ("episode_batches", "signals"),

@@ -20,6 +20,11 @@ from tests.support.skills import bottle_demonstrations, bottle_model, thinned
 from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, LinkPose, Scale, check, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.tables import (
+    demonstrations_from_frame,
+    demonstrations_to_frame,
+    read_table,
+)
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -31,11 +36,6 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.data.pose_names import POSE_PARTS
-from tpgmm_torch.data.tables import (
-    demonstrations_from_frame,
-    demonstrations_to_frame,
-    read_table,
-)
 
 __all__ = ["MISTAKES", "Mistake"]
 

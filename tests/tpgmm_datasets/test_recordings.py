@@ -19,9 +19,9 @@ from tpgmm_datasets import (
     load_lerobot,
     save_lerobot,
 )
+from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
 from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.data.tables import demonstrations_from_frame, demonstrations_to_frame
 from tpgmm_torch.metrics import joint_rmse
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses

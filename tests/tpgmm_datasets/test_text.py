@@ -2,6 +2,7 @@
 
 import pytest
 
+from tpgmm_datasets.events import SignalEvent, Stop
 from tpgmm_datasets.text import (
     parse_episodes,
     parse_events,
@@ -9,8 +10,6 @@ from tpgmm_datasets.text import (
     parse_joint_names,
     parse_units,
 )
-from tpgmm_torch.events.movement import Stop
-from tpgmm_torch.events.signals import SignalEvent
 from tpgmm_torch.exceptions import DataError
 
 
@@ -71,11 +70,11 @@ def test_events_are_read_from_text():
         (["close"], "not NAME=HOW"),
         (["=closing:a"], "not NAME=HOW"),
         (["a=stop:x", "a=stop:y"], "given twice"),
-        (["a=closing"], "none that can be found. There are closing:SIGNALS"),
+        (["a=closing"], "cannot be found. There are closing:SIGNALS"),
         (["a=closing:b,"], "needs their names"),
-        (["a=shutting:b"], "none that can be found"),
+        (["a=shutting:b"], "cannot be found"),
         (["a=stop:x:0"], "counted from 1"),
-        (["a=stop:x:second"], "none that can be found"),
+        (["a=stop:x:second"], "cannot be found"),
     ],
 )
 def test_an_event_that_is_none_is_refused(texts, told):

@@ -976,6 +976,7 @@ def test_one_situation_is_a_list_of_one():
     assert torch.equal(a.joints, b.joints)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_start_elsewhere_blends_in_without_a_jump():
     start = torch.tensor([0.4, 0.7, -0.3], dtype=torch.float64)
     situation = Situation(start, time=torch.linspace(0, LAST, 101))

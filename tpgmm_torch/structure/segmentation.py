@@ -18,7 +18,7 @@ from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
-from tpgmm_torch.events.boundaries import find_boundaries
+from tpgmm_torch.events import find_boundaries
 from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -62,7 +62,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     In each demonstration a part may end where a gripper closes or opens, where an object is
     taken or let go, and where the robot comes to rest
-    (:func:`~tpgmm_torch.events.boundaries.find_boundaries`). What demonstrations agree on
+    (:func:`~tpgmm_torch.events.find_boundaries`). What demonstrations agree on
     counts: candidates are matched in their order, the boundaries of the demonstration that is
     most like the others are kept which most of these have too, and where one lacks a boundary
     it is in proportion between its neighbours. Within the parts that follow, a boundary is

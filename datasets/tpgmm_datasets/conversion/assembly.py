@@ -12,6 +12,7 @@ from tpgmm_datasets.conversion.joints import JointColumns
 from tpgmm_datasets.conversion.poses import FramePose, LinkPose
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.events import Detector, parse_event, usual_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
 from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
@@ -19,8 +20,6 @@ from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.events.detection import Detector
-from tpgmm_torch.events.text import parse_event, usual_event
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources"]

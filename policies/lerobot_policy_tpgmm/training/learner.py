@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +39,9 @@ from lerobot_policy_tpgmm.training.losses import (
     local_points,
     regression,
 )
+from tpgmm_datasets import check
 from tpgmm_datasets.conversion.assembly import event_sources
+from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import (
@@ -53,8 +56,7 @@ from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.piecewise_linear import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
-from tpgmm_torch.events.detection import Detector, find_events
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
@@ -219,6 +221,14 @@ class Learner:
             )
 
     def _finish(self, recorder: EpochRecorder) -> None:
+        """Learn from the recorded episodes; the configuration says what a warning does."""
+        action = self._config.plausibility
+        with warnings.catch_warnings():
+            if action in ("error", "ignore"):
+                warnings.simplefilter(action, PlausibilityWarning)
+            self._learn(recorder)
+
+    def _learn(self, recorder: EpochRecorder) -> None:
         """Align what was recorded, and learn it unless the policy is fitted already."""
         config, mixture = self._config, self._mixture
         episodes = recorder.episodes
@@ -227,6 +237,7 @@ class Learner:
         demonstrations = self._linked(
             {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
         )
+        check(demonstrations, kinematics).act()
         aligner: Alignment | None
         if config.alignment == "parts":
             demonstrations = Segmentation(kinematics).fit_transform(demonstrations)
@@ -319,7 +330,7 @@ class Learner:
             found = [replace(one, events=stored[n]) for n, one in shown.items()]
         if detectors:
             log.info("finding events: %s", ", ".join(detectors))
-            found = find_events(found, detectors, kinematics, plausibility=config.plausibility)
+            found = find_events(found, detectors, kinematics)
         for event in {pose.event for pose in poses.values()} - {"start", "end"}:
             lost = [n for n, d in zip(shown, found, strict=True) if event not in d.events]
             if lost:

@@ -16,9 +16,9 @@ from tests.support import browser, skills
 from tests.support.command_line import UPPER_BODY, refusal
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
+from tpgmm_datasets.tables import demonstrations_to_frame, read_table, write_table
 from tpgmm_tools.app import page
 from tpgmm_torch import Demonstration, Frame, Situation, TaskParameterizedGMM, quaternions
-from tpgmm_torch.data.tables import demonstrations_to_frame, read_table, write_table
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 

@@ -9,8 +9,8 @@ import pytest
 from tests.support import skills
 from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
+from tpgmm_datasets.tables import demonstrations_to_frame, write_table
 from tpgmm_tools.app import sources
-from tpgmm_torch.data.tables import demonstrations_to_frame, write_table
 from tpgmm_torch.exceptions import DataError
 
 

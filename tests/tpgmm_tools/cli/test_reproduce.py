@@ -8,12 +8,12 @@ import torch
 
 from tests.support.command_line import output, refusal
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.data.tables import (
+from tpgmm_datasets.tables import (
     demonstrations_from_frame,
     read_table,
     trajectories_from_frame,
 )
+from tpgmm_torch import TaskParameterizedGMM
 
 
 def arrays(path):

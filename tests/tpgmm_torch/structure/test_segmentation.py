@@ -10,7 +10,7 @@ from tests.support.skills import generator
 from tpgmm_torch import Demonstration, Frame, OperatorSelection, Segmentation, Situation
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.data.arrays import as_array
-from tpgmm_torch.events.boundaries import find_boundaries, find_stops
+from tpgmm_torch.events import find_boundaries, find_stops
 from tpgmm_torch.exceptions import NotFittedError
 
 

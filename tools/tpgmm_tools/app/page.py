@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from tpgmm_datasets.checks.check import check
+from tpgmm_datasets.tables import trajectories_to_frame, write_table
 from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
 from tpgmm_tools.cli.application import explain
 from tpgmm_tools.cli.options import ROBOTS, RobotOptions, align
@@ -22,7 +23,6 @@ from tpgmm_tools.viewing import write_motion
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.tables import trajectories_to_frame, write_table
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator

@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 
 from tpgmm_datasets.bottle.skill import BottleShaking, upper_body
 from tpgmm_datasets.reader import load_lerobot
+from tpgmm_datasets.tables import demonstrations_from_frame, read_table
 from tpgmm_datasets.text import parse_frames
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.tables import demonstrations_from_frame, read_table
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -42,7 +42,7 @@ def uploaded(
     ----------
     files : sequence of str or Path
         One ``.zip`` of the folder of a LeRobot data set; or tables, ``.csv`` or ``.parquet``,
-        as :func:`~tpgmm_torch.data.tables.demonstrations_from_frame` reads them. A table
+        as :func:`~tpgmm_datasets.tables.demonstrations_from_frame` reads them. A table
         without the column ``episode`` is one demonstration.
     robot : Kinematics, optional
         Gives the order of the joints.

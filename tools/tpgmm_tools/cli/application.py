@@ -120,9 +120,10 @@ def explain(error: Exception) -> str | None:
         return "aborted"
     if isinstance(error, ModuleNotFoundError) and error.name in OPTIONAL:
         return f"this command needs {error.name}: pip install 'tpgmm-torch[cli]'"
-    from tpgmm_torch.exceptions import TPGMMError
+    from tpgmm_torch.exceptions import PlausibilityWarning, TPGMMError
 
-    return str(error) if isinstance(error, TPGMMError | OSError) else None
+    expected = isinstance(error, TPGMMError | OSError | PlausibilityWarning)
+    return str(error) if expected else None
 
 
 def _say(message: str) -> None:

@@ -126,6 +126,7 @@ def fit(
     write = model_format(output_format)
     if modes != 1 and batch_episodes is not None:
         raise DataError("--modes compares all episodes: it goes without --batch-episodes")
+    options.filter_plausibility(plausibility)
     robot = described.read()
     holds = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
     model = TaskParameterizedGMM(
@@ -139,7 +140,7 @@ def fit(
         **settings,
     )
     check_parameters(model)
-    given = data.arguments(robot) | {"plausibility": plausibility}
+    given = data.arguments(robot)
     with joined_processes() as processes:
         episodes: Any
         if batch_episodes is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import warnings
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
@@ -226,6 +227,18 @@ class RobotOptions:
         )
 
 
+def filter_plausibility(action: str) -> None:
+    """Show, make an error of, or ignore what is unlikely about recordings."""
+    from tpgmm_torch.exceptions import PlausibilityWarning
+
+    actions: dict[str, Literal["always", "error", "ignore"]] = {
+        "warn": "always",
+        "error": "error",
+        "ignore": "ignore",
+    }
+    warnings.simplefilter(actions[action], PlausibilityWarning)
+
+
 def command(
     app: typer.Typer, example: str, generated: Collection[Parameter] = ()
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -335,8 +348,8 @@ def wanted(
     data, robot : DataOptions, Kinematics
         Which demonstrations are read, and the order of their joints.
     """
+    from tpgmm_datasets.situation_files import read_situations
     from tpgmm_torch.data.demonstrations import Situation
-    from tpgmm_torch.data.situation_files import read_situations
 
     shown = [] if dataset is None else data.read(dataset, robot)
     if situations is not None:

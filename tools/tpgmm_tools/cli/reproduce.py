@@ -58,7 +58,7 @@ def reproduce(
     """Reproduce a skill in new situations.
 
     Writes joint references over time and their covariance: a table with one row per time step
-    (.parquet, .csv), as tpgmm_torch.data.tables.trajectories_from_frame reads it back, or
+    (.parquet, .csv), as tpgmm_datasets.tables.trajectories_from_frame reads it back, or
     arrays (.npz). Prints a line per situation.
     """
     from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -121,9 +121,9 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
 def _write(trajectories: list[Trajectory], situations: list[Situation], out: Path) -> None:
     import numpy as np
 
+    from tpgmm_datasets.tables import trajectories_to_frame, write_table
     from tpgmm_torch.atomic import replacing
     from tpgmm_torch.data.arrays import as_array
-    from tpgmm_torch.data.tables import trajectories_to_frame, write_table
 
     if out.suffix != ".npz":
         pairs = zip(trajectories, situations, strict=True)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from tpgmm_datasets.events import ObjectMoves, Stop
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.events.detection import LEAST_CONFIDENCE
-from tpgmm_torch.events.movement import ObjectMoves, Stop
+from tpgmm_torch.events import LEAST_CONFIDENCE
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots.tracked_poses import Poses
 

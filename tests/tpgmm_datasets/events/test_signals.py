@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tpgmm_datasets.events import SignalEvent, gripper_signals
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.events.detection import LEAST_CONFIDENCE
-from tpgmm_torch.events.signals import SignalEvent, gripper_signals
+from tpgmm_torch.events import LEAST_CONFIDENCE
 from tpgmm_torch.exceptions import DataError
 
 TIME = np.arange(0, 12, 1 / 30)

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from tpgmm_torch.data.situation_files import read_situations
+from tpgmm_datasets.situation_files import read_situations
 from tpgmm_torch.exceptions import DataError
 
 NAMES = ("shoulder", "elbow")

@@ -11,9 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.skills import HANDS, canonical, handlings, hands, waves
-from tpgmm_torch import Demonstration, Frame
-from tpgmm_torch.data.pose_names import POSE_PARTS
-from tpgmm_torch.data.tables import (
+from tpgmm_datasets.tables import (
     demonstrations_from_frame,
     demonstrations_to_frame,
     read_table,
@@ -21,6 +19,8 @@ from tpgmm_torch.data.tables import (
     trajectories_to_frame,
     write_table,
 )
+from tpgmm_torch import Demonstration, Frame
+from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
 NAMES = ("shoulder", "elbow")
