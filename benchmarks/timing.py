@@ -3,6 +3,7 @@
 import gc
 import statistics
 from collections.abc import Callable, Mapping
+from functools import partial
 from time import perf_counter
 
 __all__ = ["in_turns", "medians", "per_call", "per_iteration", "seconds"]
@@ -11,30 +12,34 @@ Work = Callable[[], object]
 Measurement = Callable[[], float]
 
 
-def seconds(work: Work) -> float:
-    """Wall time of one call [s], without garbage collection, as timeit does it."""
+def seconds(work: Work, clock: Measurement | None = None) -> float:
+    """Wall time of one call [s], or another clock's, without garbage collection (as timeit)."""
+    clock = clock or perf_counter
     gc.disable()
     try:
-        began = perf_counter()
+        began = clock()
         work()
-        return perf_counter() - began
+        return clock() - began
     finally:
         gc.enable()
 
 
-def per_call(work: Work, calls: int) -> Measurement:
+def per_call(work: Work, calls: int, clock: Measurement | None = None) -> Measurement:
     """A measurement of many calls, for what takes microseconds: seconds of one."""
 
-    def measure() -> float:
-        began = perf_counter()
+    def repeat() -> None:
         for _ in range(calls):
             work()
-        return (perf_counter() - began) / calls
+
+    def measure() -> float:
+        return seconds(repeat, clock) / calls
 
     return measure
 
 
-def per_iteration(fit: Callable[[int], object], few: int, many: int) -> Measurement:
+def per_iteration(
+    fit: Callable[[int], object], few: int, many: int, clock: Measurement | None = None
+) -> Measurement:
     """A measurement of one iteration, as the difference of two fits.
 
     Parameters
@@ -43,10 +48,12 @@ def per_iteration(fit: Callable[[int], object], few: int, many: int) -> Measurem
         ``fit(n)`` makes n iterations, besides what does not depend on n.
     few, many : int
         Numbers of iterations.
+    clock : callable, optional
+        As :func:`seconds`.
     """
 
     def measure() -> float:
-        short, long = seconds(lambda: fit(few)), seconds(lambda: fit(many))
+        short, long = (seconds(partial(fit, n), clock) for n in (few, many))
         return (long - short) / (many - few)
 
     return measure

@@ -199,7 +199,7 @@ def timed(root: Path, small: bool) -> Measured:
     """Seconds of the main work, measured by the checkout at ``root`` with its own code."""
     with tempfile.TemporaryDirectory() as out:
         command = [sys.executable, "-m", "benchmarks", "--only", "main", "--out", out]
-        command += ["--sizes", "tiny"] if small else []
+        command += ["--repeat", "1"] if small else []
         env = os.environ | {"PYTHONPATH": import_paths(root)}
         subprocess.run(command, cwd=root, env=env, check=True, stdout=subprocess.DEVNULL)
         rows = json.loads((Path(out) / "main.json").read_text(encoding="utf-8"))["rows"]
