@@ -9,7 +9,6 @@ __all__ = ["CASES", "Settings"]
 
 #: Name on the command line -> module beside this file, whose ``measure(settings)`` yields rows.
 CASES = {
-    "main": "main_times",
     "import": "start_up",
     "em-13k": "em_small",
     "em-1m": "em_large",
@@ -23,6 +22,7 @@ CASES = {
     "batch": "batched_step",
     "predict": "prediction",
     "curves": "curves",
+    "main": "main_times",
 }
 
 
