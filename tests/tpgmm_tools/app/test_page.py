@@ -105,8 +105,8 @@ def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwa
     _, report = learned([*bottles, bottles[0]])
     assert "**To be looked at:**\n- " in report and "copy of" in report
     assert not len(recwarn)
-    with pytest.raises(AttributeError):  # no error that a user can mend
-        learned([None])
+    with pytest.raises(ZeroDivisionError):  # no error that a user can mend
+        page.learn("mine", None, "none", None, "", "", 4, {"mine": lambda: 1 / 0})
 
 
 def test_objects_are_turned_about_the_vertical_through_them():

@@ -75,12 +75,6 @@ def test_generated_demonstrations_are_those_of_the_skill_with_that_seed(tmp_path
     assert found.problems == ()
 
 
-def test_generated_demonstrations_may_share_one_rhythm(tmp_path):
-    output(*generate(tmp_path / "set", "--steady-rhythm"))
-    expected = BottleShaking(rate=RATE, steady_rhythm=True).demonstrations(2, seed=0)
-    assert_same(load_lerobot(tmp_path / "set"), expected, 1e-6)
-
-
 def test_appended_episodes_follow_those_that_were_there(tmp_path):
     root = tmp_path / "set"
     for seed in (0, 1):
@@ -88,15 +82,6 @@ def test_appended_episodes_follow_those_that_were_there(tmp_path):
     skill = BottleShaking(rate=RATE)
     expected = skill.demonstrations(2, seed=0) + skill.demonstrations(2, seed=1)
     assert_same(load_lerobot(root), expected, 1e-6)
-
-
-def test_converted_coordinates_keep_their_unit(tmp_path):
-    name = write(tmp_path / "arm")[0].joint_names[-1]
-    undeclared(tmp_path / "arm", 1.0)
-    output("dataset", "convert", tmp_path / "arm", tmp_path / "set", "--units", f"{name}=raw")
-    info = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())
-    joints = info["features"]["observation.state"]
-    assert dict(zip(joints["names"], joints["info"]["units"], strict=True))[name] == "raw"
 
 
 @pytest.mark.parametrize("command", ["generate", "convert"])
@@ -194,11 +179,6 @@ def test_rate_resamples_and_task_names_all_episodes(arm, tmp_path):
     assert describe_lerobot(tmp_path / "new").tasks == ("wave",)
 
 
-def test_a_rate_that_is_no_whole_number_is_refused(arm, tmp_path):
-    line = refusal("dataset", "convert", arm[0], tmp_path / "new", "--rate", 12.5)
-    assert "fps as a whole number" in line
-
-
 @pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])
 def test_an_episode_that_has_not_one_task_of_its_own_needs_to_be_told(arm, tmp_path, tasks):
     root = to_v21(arm[0], tmp_path / "old")
@@ -262,33 +242,14 @@ def test_check_tells_what_is_implausible_and_fails_where_it_must(tmp_path, gener
     assert result.exit_code == 2 and "is none of the values" in result.stderr
 
 
-def test_what_cannot_be_loaded_is_no_good_set(tmp_path, generated):
-    root = tmp_path / "stretched"
-    shutil.copytree(generated, root)
-
-    def stretch(poses):
-        return np.concatenate((poses[:, :3], 1.3 * poses[:, 3:]), axis=1)
-
-    change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", stretch))
-    result = run("dataset", "check", root)
-    assert result.exit_code == 1 and "norm of a quaternion" in result.stdout
-    assert "and 1 more like it: episode 1" in result.stdout
-
-
 def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, generated):
     root = tmp_path / "one"
     shutil.copytree(generated, root)
 
     def stretch(poses):
-        return np.concatenate((poses[:1, :3], 1.3 * poses[:1, 3:]), axis=1), poses[1:]
+        return np.concatenate((poses[:1] * np.repeat([1.0, 1.3], [3, 4]), poses[1:]))
 
-    change_table(
-        root,
-        DATA,
-        lambda t: set_column(
-            t, "observation.environment_state", lambda poses: np.concatenate(stretch(poses))
-        ),
-    )
+    change_table(root, DATA, lambda t: set_column(t, "observation.environment_state", stretch))
     result = run("dataset", "check", root)
     assert result.exit_code == 1 and "error: left out or not checked: " in result.stdout
     assert "episode 0" in result.stdout
@@ -339,9 +300,3 @@ def bad_set(folder, wrong):
         table.at[10 * episode + 3, "observation.state"] = state
     table.to_parquet(file)
     return folder
-
-
-def test_a_picture_is_not_put_below_a_file(generated, tmp_path):
-    (tmp_path / "file").write_text("")
-    line = refusal("dataset", "plot", generated, "--out", tmp_path / "file" / "d.png")
-    assert str(tmp_path / "file") in line

@@ -17,7 +17,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from tpgmm_tools.viewing.curves import Panel, as_html, motion_marks, motion_panels
+from tpgmm_tools.viewing.curves import as_html, motion_marks, motion_panels
 from tpgmm_tools.viewing.scene import COLORS, STANDARD_DEVIATIONS, Drawing, MotionScene, Node
 from tpgmm_tools.viewing.visuals import Shape, mesh, unit_ball
 from tpgmm_torch import quaternions
@@ -297,9 +297,9 @@ class LiveView:
     """Serve motions to a browser; a context manager.
 
     The page has a time line, a choice of situations, and a handle on every object that stands
-    still: where it is let go, the skill is reproduced again. Beside it are stiffness and each
-    operator's share over time. With "controller", a :class:`Controller` leads the robot
-    instead: objects can be moved meanwhile, and the robot be held.
+    still: where it is let go, the skill is reproduced again. With "controller", a
+    :class:`Controller` leads the robot instead: objects can be moved meanwhile, and the robot
+    be held.
 
     Parameters
     ----------
@@ -349,7 +349,6 @@ class LiveView:
         self._model, self._situations = model, list(situations)
         self._scene = MotionScene(model, demonstrations, **how)
         self._handles: dict[str, Any] = {}
-        self._plots: list[Any] = []
         self._controller: Controller | None = None
         self.command: Command | None = None
         self.clock, self._posture = 0.0, self._situations[first].joints
@@ -441,12 +440,6 @@ class LiveView:
                 self.server.scene, self.drawing, "", self._handles, self.move_frame
             )
             trajectory = self.drawing.trajectory
-            plots = [_plot_options(one) for one in motion_panels(self._model, trajectory)]
-            if not self._plots:
-                gui = self.server.gui
-                self._plots = [gui.add_uplot(height=160, **options) for options in plots]
-            for plot, options in zip(self._plots, plots, strict=True):
-                plot.scales, plot.data = options["scales"], options["data"]
             marks = motion_marks(self._model, trajectory)
             self._marks.content = "  \n".join(f"{m.time:.1f} s: {m.label}" for m in marks)
             self._slider.max = max(float(self.drawing.time[-1]), 0.01)
@@ -481,15 +474,3 @@ class LiveView:
     def _switched(self, event: Any) -> None:
         if event.client is not None:
             (self.start_controller if event.target.value else self.stop_controller)()
-
-
-def _plot_options(panel: Panel) -> dict[str, Any]:
-    """A panel as viser's plots have it."""
-    lines = [{"label": c.label, "stroke": c.color, "width": 1.5} for c in panel.curves]
-    return {
-        "title": panel.title,
-        "data": (panel.time, *(curve.values for curve in panel.curves)),
-        "series": ({"label": "time [s]"}, *lines),
-        "padding": (12, 24, 0, 0),
-        "scales": {"x": {"time": False}, "y": {"range": (0.0, panel.top)}},
-    }
