@@ -19,13 +19,14 @@ from tpgmm_tools.plotting import (
     legend,
     plot_candidates,
     plot_components,
+    plot_joints,
     plot_local,
     plot_relevance,
     save,
     shade,
 )
 from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 
 
@@ -57,6 +58,24 @@ def test_phases_are_bands_with_names():
         (2.0, 4.0),
     ]
     assert [(t.get_text(), t.xy[0]) for t in axes.texts] == [("reach", 1.0), ("shake", 3.0)]
+
+
+def test_joints_are_drawn_with_bands_and_events_in_the_panels_given():
+    [shown, _] = handlings(2)
+    axes = plot_joints(shown, ["left.z", "left.x"], color="k")
+    assert [panel.get_ylabel() for panel in axes] == ["left.z", "left.x"]
+    at = [shown.joint_names.index(name) for name in ("left.z", "left.x")]
+    marks = 1 + len(shown.events)
+    for panel, column in zip(axes, at, strict=True):
+        assert len(panel.lines) == marks
+        np.testing.assert_array_equal(panel.lines[0].get_ydata(), shown.joints[:, column])
+    [trajectory] = hands().predict([shown])
+    assert plot_joints(trajectory, ["left.z", "left.x"], axes) == axes
+    [band] = axes[0].collections
+    high = trajectory.joints[:, at[0]] + 2 * trajectory.covariance[:, at[0], at[0]].sqrt()
+    assert band.get_paths()[0].vertices[:, 1].max() == pytest.approx(float(high.max()))
+    with pytest.raises(UnknownNameError, match="knee"):
+        plot_joints(shown, ["knee"])
 
 
 def test_components_are_contours_of_one_standard_deviation():

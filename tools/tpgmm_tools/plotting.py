@@ -15,7 +15,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DependencyError
+from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.structure.segmentation import Segmentation
@@ -31,6 +31,7 @@ __all__ = [
     "legend",
     "plot_candidates",
     "plot_components",
+    "plot_joints",
     "plot_local",
     "plot_parts",
     "plot_relevance",
@@ -165,6 +166,61 @@ def shade(axes: Axes, spans: Mapping[str, tuple[float, float]]) -> None:
             fontsize="x-small",
             color="0.4",
         )
+
+
+def plot_joints(
+    motion: Demonstration | Trajectory,
+    joints: Sequence[str] | None = None,
+    axes: Sequence[Axes] | None = None,
+    **line: Any,
+) -> list[Axes]:
+    """Draw joints over time, one panel each.
+
+    A trajectory has bands of two standard deviations, a demonstration marks at its events.
+
+    Parameters
+    ----------
+    motion : Demonstration or Trajectory
+        ``"joint_0"`` and so on name joints without names.
+    joints : sequence of str, optional
+        Names of those to draw; all by default.
+    axes : sequence of matplotlib Axes, optional
+        Panels to draw into, those of another motion for example; a new :func:`figure` by
+        default.
+    **line
+        As for ``Axes.plot``.
+
+    Raises
+    ------
+    UnknownNameError, DependencyError
+        If there is no such joint, or no matplotlib.
+    """
+    names = list(motion.joint_names or (f"joint_{i}" for i in range(motion.joints.shape[1])))
+    for name in joints or ():
+        if name not in names:
+            raise UnknownNameError("joint", name, "the motion", names)
+    chosen = names if joints is None else list(joints)
+    panels = figure(len(chosen), "", height=1.1).axes if axes is None else list(axes)
+    time = as_array(motion.time)
+    for name, panel in zip(chosen, panels, strict=True):
+        at = names.index(name)
+        values = as_array(motion.joints[:, at])
+        [curve] = panel.plot(time, values, **line)
+        panel.set_ylabel(name, fontsize="small")
+        if isinstance(motion, Trajectory):
+            band = 2 * as_array(motion.covariance[:, at, at]).clip(min=0) ** 0.5
+            color = curve.get_color()
+            panel.fill_between(time, values - band, values + band, color=color, alpha=0.2, lw=0)
+            continue
+        for event, instant in motion.events.items():
+            panel.axvline(instant, color="0.7", linewidth=0.8, zorder=0)
+            if panel is panels[0]:
+                place: dict[str, Any] = {
+                    "xy": (instant, 1),
+                    "xycoords": ("data", "axes fraction"),
+                }
+                panel.annotate(event, **place, fontsize="x-small")
+    return panels
 
 
 def plot_components(

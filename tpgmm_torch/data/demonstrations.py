@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.arrays import as_array, as_tensor
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
-from tpgmm_torch.notebook import Tabular, listed, panels
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["Demonstration", "Situation", "check_demonstrations", "check_robot"]
 
@@ -65,7 +64,7 @@ def _set(frozen: object, **attributes: Any) -> None:
         object.__setattr__(frozen, name, value)
 
 
-class _PlainFrames(Tabular):
+class _PlainFrames:
     """Pickle the read-only views of frames and events as plain dicts."""
 
     def __getstate__(self) -> dict[str, Any]:
@@ -220,55 +219,6 @@ class Demonstration(_PlainFrames):
             return self
         return replace(self, joints=self.joints[:, columns], joint_names=tuple(joint_names))
 
-    def plot(
-        self,
-        joints: Sequence[str] | None = None,
-        axes: Sequence[Axes] | None = None,
-        **line: Any,
-    ) -> list[Axes]:
-        """Draw the joints over time, one panel each, with a mark at each event.
-
-        Parameters
-        ----------
-        joints : sequence of str, optional
-            Names of those to draw, ``"joint_0"`` where they have none; all by default.
-        axes : sequence of matplotlib Axes, optional
-            Panels to draw into, those of another picture for example; new ones by default.
-        **line
-            As for ``Axes.plot``.
-
-        Returns
-        -------
-        list of matplotlib Axes
-
-        Raises
-        ------
-        UnknownNameError, DependencyError
-            If there is no such joint, or no matplotlib.
-        """
-        names = self.joint_names or [f"joint_{i}" for i in range(self.n_joints)]
-        chosen = panels(names, joints, axes)
-        time = as_array(self.time)
-        for column, panel in chosen.values():
-            panel.plot(time, as_array(self.joints[:, column]), **line)
-            for instant in self.events.values() if axes is None else ():
-                panel.axvline(instant, color="0.7", linewidth=0.8, zorder=0)
-        drawn = [panel for _, panel in chosen.values()]
-        for name, instant in self.events.items() if axes is None else ():
-            drawn[0].annotate(
-                name, (instant, 1), xycoords=("data", "axes fraction"), fontsize="x-small"
-            )
-        return drawn
-
-    def _rows(self) -> dict[str, object]:
-        moving = [name for name, frame in self.frames.items() if frame.batch_shape]
-        return {
-            "steps": f"{len(self)} in {self.duration:.2f} s",
-            "joints": listed(self.joint_names or [self.n_joints]),
-            "frames": listed(f"{n} (moves)" if n in moving else n for n in self.frames),
-            "events": listed(f"{name} {at:.2f} s" for name, at in self.events.items()),
-        }
-
     def __repr__(self) -> str:
         return (
             f"Demonstration({len(self)} steps, {self.duration:.2f} s, {self.n_joints} joints, "
@@ -374,16 +324,6 @@ class Situation(_PlainFrames):
     def __repr__(self) -> str:
         time = "" if self.time is None else f", {len(self.time)} steps"
         return f"Situation({len(self.joints)} joints, frames={sorted(self.frames)}{time})"
-
-    def _rows(self) -> dict[str, object]:
-        names = self.joint_names or [f"joint_{i}" for i in range(len(self.joints))]
-        start = zip(names, self.joints.tolist(), strict=True)
-        rows: dict[str, object] = {"start": listed(f"{n} {value:.3f}" for n, value in start)}
-        for name, frame in self.frames.items():
-            place = " ".join(f"{value:.3f}" for value in frame.position.flatten().tolist()[:3])
-            rows[name] = "moves" if frame.batch_shape else f"at {place} m"
-        own = "the model's" if self.time is None else f"{len(self.time)} steps"
-        return rows | {"time": own}
 
     def frames_at(self, time: Tensor) -> dict[str, Frame]:
         """The frames, those that move as they are at other times.

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from tpgmm_torch.data.arrays import as_array
-from tpgmm_torch.notebook import Tabular, listed, panels
-
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 __all__ = ["Candidate", "Trajectory"]
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate(Tabular):
+class Candidate:
     """What one operator alone asks of the joints (one colour of the paper's figure 6).
 
     Parameters
@@ -39,16 +35,9 @@ class Candidate(Tabular):
     def __repr__(self) -> str:
         return f"Candidate(shape {tuple(self.mean.shape)}, mean share {self.share.mean():.2f})"
 
-    def _rows(self) -> dict[str, object]:
-        shares = self.share.flatten(0, -2).mean(0).tolist()
-        return {
-            "shape": tuple(self.mean.shape),
-            "mean share of each joint": listed(f"{share:.2f}" for share in shares),
-        }
-
 
 @dataclass(frozen=True, eq=False)
-class Trajectory(Tabular):
+class Trajectory:
     """A reproduction: joint references over time, and where they come from.
 
     Parameters
@@ -80,54 +69,6 @@ class Trajectory(Tabular):
     def __len__(self) -> int:
         """Number of time steps T."""
         return len(self.time)
-
-    def plot(
-        self,
-        joints: Sequence[str] | None = None,
-        axes: Sequence[Axes] | None = None,
-        **line: Any,
-    ) -> list[Axes]:
-        """Draw the joints over time, one panel each, with bands of two standard deviations.
-
-        Parameters
-        ----------
-        joints : sequence of str, optional
-            Names of those to draw; all by default.
-        axes : sequence of matplotlib Axes, optional
-            Panels to draw into, those of a demonstration for example; new ones by default.
-        **line
-            As for ``Axes.plot``.
-
-        Returns
-        -------
-        list of matplotlib Axes
-
-        Raises
-        ------
-        UnknownNameError, DependencyError
-            If there is no such joint, or no matplotlib.
-        """
-        chosen = panels(self.joint_names, joints, axes)
-        time, mean = as_array(self.time), as_array(self.joints)
-        variance = as_array(self.covariance.diagonal(dim1=-2, dim2=-1))
-        band = 2 * variance.clip(min=0) ** 0.5
-        for column, panel in chosen.values():
-            [curve] = panel.plot(time, mean[:, column], **line)
-            low, high = mean - band, mean + band
-            panel.fill_between(
-                time, low[:, column], high[:, column], color=curve.get_color(), alpha=0.2, lw=0
-            )
-        return [panel for _, panel in chosen.values()]
-
-    def _rows(self) -> dict[str, object]:
-        duration = float(self.time[-1] - self.time[0])
-        novelty = "-" if self.novelty is None else f"{self.novelty:.2f}"
-        return {
-            "steps": f"{len(self)} in {duration:.2f} s",
-            "joints": listed(self.joint_names),
-            "candidates": len(self.candidates),
-            "novelty": novelty,
-        }
 
     def __repr__(self) -> str:
         return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,7 +14,6 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
-from tpgmm_torch.notebook import Tabular
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -70,7 +69,7 @@ class Linearization:
         )
 
 
-class Operator(Tabular, ABC):
+class Operator(ABC):
     """A candidate projection operator: a row of the paper's Table I.
 
     Subclass it for an operator of your own: give :meth:`dimension`, :meth:`linearize` and
@@ -91,12 +90,6 @@ class Operator(Tabular, ABC):
     @abstractmethod
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """The local coordinates X_t of a state, shape (..., D)."""
-
-    def _rows(self) -> dict[str, object]:
-        rows: dict[str, object] = {"what": (type(self).__doc__ or "").partition("\n")[0]}
-        if is_dataclass(self):
-            rows |= {field.name: getattr(self, field.name) for field in fields(self)}
-        return rows
 
     def quaternion_starts(self, kinematics: Kinematics | None) -> tuple[int, ...]:
         """Where unit quaternions begin among the local coordinates; none by default."""

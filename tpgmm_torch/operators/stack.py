@@ -170,9 +170,6 @@ class Stack(Operator):
         """If one of the members does."""
         return any(operator.determines_joints for operator in self.operators)
 
-    def _rows(self) -> dict[str, object]:
-        return {str(number): member for number, member in enumerate(self.operators, 1)}
-
     def __repr__(self) -> str:
         return f"Stack({', '.join(map(repr, self.operators))})"
 

@@ -22,7 +22,6 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
-from tpgmm_torch.notebook import Tabular, listed
 
 __all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]
 
@@ -252,7 +251,7 @@ class RobotState:
         return self.links.index(link)
 
 
-class Kinematics(Tabular, abc.ABC):
+class Kinematics(abc.ABC):
     """What the operators need of a robot; derive from it to bring your own.
 
     A subclass sets the attributes below and defines :meth:`state`, nothing else. It must not
@@ -332,13 +331,6 @@ class Kinematics(Tabular, abc.ABC):
         free = ~moved.flatten(end_dim=-2).any(0) if self.links else torch.ones_like(named)
         found = named.to(free.device) & free
         return found if bool(found.any()) else None
-
-    def _rows(self) -> dict[str, object]:
-        limits = zip(self.joint_names, self.lower.tolist(), self.upper.tolist(), strict=True)
-        return {
-            "links": listed(self.links),
-            "joints and their limits": listed(f"{n} [{a:.4g}, {b:.4g}]" for n, a, b in limits),
-        }
 
     @abc.abstractmethod
     def state(self, joints: Any) -> RobotState:
