@@ -6,6 +6,7 @@ import shutil
 import tomllib
 from collections.abc import Iterator
 from dataclasses import fields
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,8 @@ def run(command: str) -> None:
             if requirement.name != "lerobot":
                 known = PROJECTS[requirement.name]["optional-dependencies"]
                 assert requirement.extras <= known.keys(), command
+    elif program == "python" and arguments[0] == "-m":
+        assert find_spec(arguments[1]), f"no such module: {command}"
     elif program == "python":
         assert (ROOT / arguments[0]).is_file(), f"no such script: {command}"
     elif program == "torchrun":
