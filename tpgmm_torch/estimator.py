@@ -24,7 +24,6 @@ from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.checks.training import EpisodeSummary, check, summarize, unit_findings
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.control.clock_text import parse_clock
 from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
@@ -63,6 +62,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.structure.component_selection import ComponentSelection
 from tpgmm_torch.structure.operator_selection import (
     OperatorSelection,
@@ -767,19 +767,12 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 self.time_,
                 self.summary_,
             ).act(self.plausibility)
-        via = self._conditioning()
+        skill: Any = self._running()
         trajectories = rollout(
-            self.regression(),
-            situations,
-            self.time_,
-            self.blend,
-            bounds,
-            candidates,
-            self.holds_,
-            via,
+            skill, situations, bounds=bounds, blend=self.blend, candidates=candidates
         )
-        if via is not None:
-            self._missed(via, situations, trajectories).act(self.plausibility)
+        if self.via_points_:
+            self._missed(skill.conditioning, situations, trajectories).act(self.plausibility)
         if self.summary_ is None:
             return trajectories
         summary = self.summary_
@@ -899,28 +892,23 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         frames = self._completed(joints, frames or {})
         for operator in self.operators_:
             operator.check(self.kinematics_, frames)
-        if bounds or self._limited:
-            if not isinstance(bounds, MotionBounds):
-                bounds = self.motion_bounds(**(bounds or {}))
-        else:
-            bounds = None
+        known: Any = bounds
+        if not self.keep_limits:
+            known = None
+        elif bounds is None:
+            known = "robot"
         self._examine_tick(self.time_[0], joints, frames)
         return Controller(
-            self.regression(),
+            self._running(),
             joints,
             frames,
-            begin=float(self.time_[0]),
-            end=float(self.time_[-1]),
-            clock=parse_clock(clock),
+            clock=clock,
             blend=self.blend,
-            bounds=bounds if self.keep_limits else None,
+            bounds=known,
             trust=trust,
             smoothing=smoothing,
             feedback=feedback,
-            impedance=impedance or Impedance(self.kinematics_),
-            holds=self.holds_,
-            novelty=self.summary_,
-            via=self._conditioning(),
+            impedance=impedance,
         )
 
     def with_via_points(self, points: Iterable[ViaPoint | str], fade: float = 1.0) -> Self:
@@ -1004,11 +992,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ]
         return Report.of(findings, f"{len(situations)} situations with via-points")
 
-    def _conditioning(self) -> Conditioning | None:
-        """Of the reproduction on the via-points, if there are some."""
+    def _running(self) -> Any:
+        """The skill that is run, with via-points if there are some."""
         if not self.via_points_:
-            return None
-        return Conditioning.of(self.regression(), self.via_points_, self.via_fade_)
+            return self.regression()
+        return ViaPoints(self.regression(), self.via_points_, self.via_fade_)
 
     def sample(
         self,
@@ -1169,6 +1157,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 end=float(self.time_[-1]),
                 holds=tuple(self.holds_),
                 motion_bounds=self.motion_bounds() if limited else None,
+                peaks=None if self.jerk_ is None else (as_tensor(self.acceleration_, "peaks"), self.jerk_),
                 summary=self.summary_,
             )
             self._prepared = prepared = (key, self.means_, regression)

@@ -698,10 +698,9 @@ class MultimodalController:
     def _switch(self, mode: int, time: float, frames: Mapping[str, Frame]) -> None:
         """From the next step on the robot goes another way."""
         skill = _silent(self._model.models_[mode])
-        other = skill.controller(self._start, frames, clock=self._clock, **self._settings)
         regression, end = skill.regression(), float(skill.time_[-1])
         progress = self._clock.start(regression, self.reference, frames, time, end)
-        self.controller, self.mode = self.controller.switched(other, progress), mode
+        self.controller, self.mode = self.controller.switched(regression, progress), mode
 
     def _progress(self, mode: int) -> float:
         """The present progress, as the time of a mode [s]."""

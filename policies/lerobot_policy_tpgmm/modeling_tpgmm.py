@@ -41,7 +41,7 @@ from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.hub import describe, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import recover
-from tpgmm_torch.control.controller import SkillController
+from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
     ModelFileError,
@@ -71,9 +71,9 @@ class Chunk:
 
     Parameters
     ----------
-    first : SkillController
+    first : Controller
         After its first action: what it was told last.
-    moments : list of SkillController
+    moments : list of Controller
         After each of its actions.
     joints : Tensor of shape (B, chunk_size, n_joints)
         The references.
@@ -84,8 +84,8 @@ class Chunk:
         Actions per second.
     """
 
-    first: SkillController
-    moments: list[SkillController]
+    first: Controller
+    moments: list[Controller]
     joints: Tensor
     actions: Tensor
     timestamp: float | None
@@ -328,7 +328,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
-        self._controller: SkillController | None = None
+        self._controller: Controller | None = None
         self._chunk: Chunk | None = None
         self._ticks = TickDurations()
 
@@ -411,7 +411,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Whether ``lerobot-rollout --inference.type=rtc`` may be used: yes."""
         return True
 
-    def _begin(self, batch: Mapping[str, Tensor]) -> SkillController:
+    def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
         model = self.to_estimator()
         joints, frames = self._observed(batch), self.frames.frames(batch)
@@ -420,7 +420,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return model.controller(joints, frames, **self.config.control())
 
     def _told(
-        self, batch: Mapping[str, Tensor], controller: SkillController
+        self, batch: Mapping[str, Tensor], controller: Controller
     ) -> tuple[Tensor | None, dict[str, Any] | None]:
         """Joints and poses that a controller is told."""
         shape, config, measured = controller.reference.shape, self.config, self._observed(batch)
@@ -438,7 +438,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return measured if config.closed_loop else None, poses or None
 
     def _step(
-        self, controller: SkillController, batch: Mapping[str, Tensor], passed: Any = None
+        self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
     ) -> Tensor:
         """The references (B, n_joints) of the next action."""
         start, first = controller.reference, controller.command is None

@@ -5,137 +5,120 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Protocol, Self, TypeVar
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import START
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.control.clocks import Clock, EvenClock, Progress
+from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clocks import Clock, Progress
 from tpgmm_torch.control.command import Command, Status
+from tpgmm_torch.control.displacement import Displacement
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
+from tpgmm_torch.control.localizing_clock import LocalizingClock
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
-from tpgmm_torch.skills.skill import Observation
+from tpgmm_torch.skills.skill import Observation, Skill
 
-__all__ = ["Controller", "SkillController"]
+__all__ = ["Controller"]
 
-#: For so long a robot that was moved is remembered to have been [s].
-PUSH_MEMORY = 0.5
-#: Below that share of its speed, time stands, and a robot is led.
-STANDS = 0.05
-#: The share of the usual lead of robots that hold something.
-CAREFUL = 1 / 3
-#: What is wanted is a multiple of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
-#: another one for each size, ends there, before whoever follows enlarges it.
+#: Below that share of the clock's speed a robot waits, and is led.
+WAITING_RATE = 0.05
+#: Share of the usual lead of waiting robots that hold something.
+HOLDING_LEAD = 1 / 3
+#: Wanted postures are multiples of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
+#: another one for each size, ends there, before the follower enlarges it.
 GRID = 2.0**32
-
-#: What passes for a robot whose time did not increase, and which is held [s].
+#: Duration of a tick for robots whose time did not increase, and which are held [s].
 INSTANT = 1e-6
 
-_Joints = TypeVar("_Joints", Tensor, Tensor | None)
 
+@dataclass
+class _Tick:
+    """What is known of one tick: durations, measurements, progress.
 
-class SkillController(Protocol):
-    """What runs a skill, of one way or of several, on one robot or a batch of them."""
+    Parameters
+    ----------
+    seconds : float or array of shape (...)
+        Duration of the tick, at most the longest step that is trusted.
+    passed : float or Tensor of shape (...)
+        The same, 0 for robots that are held.
+    measured : Tensor of shape (..., n_joints), optional
+        NaN where nothing was accepted.
+    halted, late : Tensor of bool of shape (...), optional
+        Robots without accepted inputs, and those whose time did not increase.
+    ended : Tensor of bool of shape (...), optional
+        Robots that have been at the end of the skill for a tick.
+    waits : Tensor of bool of shape (...), optional
+        Robots whose clock stands.
+    following : Follower, optional
+        At the wanted posture, where all robots can follow it.
+    """
 
-    command: Command | None
-
-    @property
-    def reference(self) -> Tensor:
-        """See :class:`Controller`."""
-
-    @property
-    def time(self) -> Tensor:
-        """See :class:`Controller`."""
-
-    @property
-    def finished(self) -> bool:
-        """See :attr:`Controller.finished`."""
-
-    def step(
-        self,
-        dt: float | Tensor,
-        joints: Any = None,
-        frames: Mapping[str, Any] | None = None,
-        *,
-        told: Mapping[str, str | None] | None = None,
-        ages: Mapping[str, float] | None = None,
-    ) -> Command:
-        """See :meth:`Controller.step`."""
-
-    def copy(self) -> Self:
-        """See :meth:`Controller.copy`."""
-
-    def ahead(self) -> Self:
-        """See :meth:`Controller.ahead`."""
-
-    def resumed(
-        self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
-    ) -> Self:
-        """See :meth:`Controller.resumed`."""
+    seconds: Seconds
+    passed: float | Tensor
+    measured: Tensor | None
+    halted: Tensor | None
+    late: Tensor | None
+    ended: Tensor | None = None
+    waits: Tensor | None = None
+    following: Follower | None = None
 
 
 class Controller:
     """A batch of robots that run a skill, each at its own pace, from its beginning to its end.
 
-    At each step a clock says how far each robot is, from what is observed; the model says which
-    posture is wanted there; a follower goes there within the bounds of motion. What cannot be
-    believed is not used, and a robot that has nothing to believe stands until there is
-    something. After the end the last reference is held. Robots of a batch do not know of each
-    other.
+    At each step a clock says how far each robot is, from what is measured; the skill gives the
+    estimate there; a follower goes there within the bounds of motion. Inputs that cannot be
+    right are rejected, and a robot without accepted inputs is held until there are some. After
+    the end the last reference is held. Robots of a batch do not influence each other.
 
     Parameters
     ----------
-    regression : Regression
-        What is asked for the joints at each step.
+    skill : Skill
+        A fitted model's ``skill``, or one that holds others.
     joints : array-like of shape (..., n_joints)
         The start postures.
     frames : mapping of str to Frame, optional
-        Poses of the objects until others are told, of shapes that broadcast with the batch.
-    begin, end : float
-        When the skill begins and ends [s].
-    clock : Clock, optional
-        How the skill goes on; evenly by default.
-    blend : float
-        How long the difference between posture and model fades, at the start and whenever a
-        robot goes on from somewhere else [s]. The difference goes by a minimum-jerk step.
-    bounds : MotionBounds, optional
-        Of position, speed, acceleration and jerk; None takes each estimate for a reference.
+        Poses of the objects until a step is given others, of shapes that broadcast with the
+        batch.
+    clock : Clock or str
+        How the time of the skill goes on; text is for :func:`parse_clock`. Without measured
+        joints, every clock runs evenly.
     trust : Trust, optional
-        When to believe what is told; None believes everything, and raises on what is wrong.
+        Which measurements are accepted; None accepts everything, and raises on what is wrong.
     smoothing : OneEuro, optional
-        What takes the noise from poses that come at each step; only with ``trust``.
-    holds : sequence of Hold
-        From when to when which link holds which object.
-    at_rest : bool
-        Whether robots stand when the skill begins; else they move as the model does.
+        Filter of poses that come at each step; only with ``trust``.
+    bounds : MotionBounds, mapping of str to bounds, "robot" or None
+        Of position, speed, acceleration and jerk: "robot" takes those of the robot and of the
+        demonstrations, a mapping tightens these (:meth:`MotionBounds.of`), and None takes each
+        estimate for a reference.
+    blend : float
+        How long the difference between posture and estimate fades, by a minimum-jerk step, at
+        the start and whenever a robot goes on from somewhere else [s].
     feedback : {"reference", "measured"}
         What q_{t-1} is: the last reference, or the measured posture.
     impedance : Impedance, optional
-        What stiffness and damping are made with.
-    novelty : TrainingSummary, optional
-        What tells how new the situation is.
-    via : Conditioning, optional
-        Via-points through which the robots pass.
+        Stiffness and damping of the commands.
+    begin, end : float, optional
+        Run a part of the skill [s].
+    at_rest : bool
+        Whether robots stand when the skill begins; else they move as the skill does.
 
     Attributes
     ----------
@@ -148,80 +131,86 @@ class Controller:
     command : Command or None
         What the last step returned.
     measured : Tensor of shape (..., n_joints) or None
-        Where the robots stood at the last step, NaN where that was not believed; None if
-        nothing was measured.
+        Measured joints at the last step, NaN where they were rejected; None if there were none.
 
     Raises
     ------
-    ShapeError, DataError
-        If the postures do not fit the robot.
+    ShapeError, DataError, UnknownNameError
+        If the postures do not fit the robot, frames are missing, or bounds contradict each
+        other.
     """
 
     def __init__(
         self,
-        regression: Regression,
+        skill: Skill,
         joints: Any,
         frames: Mapping[str, Frame] | None = None,
         *,
-        begin: float,
-        end: float,
-        clock: Clock = EvenClock(),  # noqa: B008  (frozen)
-        blend: float = 0.0,
-        bounds: MotionBounds | None = None,
-        trust: Trust | None = None,
-        smoothing: OneEuro | None = None,
-        holds: Sequence[Hold] = (),
-        at_rest: bool = True,
+        clock: Clock | str = LocalizingClock(),  # noqa: B008  (frozen)
+        trust: Trust | None = Trust(),  # noqa: B008  (frozen)
+        smoothing: OneEuro | None = OneEuro(),  # noqa: B008  (frozen)
+        bounds: MotionBounds | Mapping[str, Any] | str | None = "robot",
+        blend: float = 1.0,
         feedback: str = "reference",
         impedance: Impedance | None = None,
-        novelty: TrainingSummary | None = None,
-        via: Conditioning | None = None,
+        begin: float | None = None,
+        end: float | None = None,
+        at_rest: bool = True,
     ) -> None:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
-        kinematics = regression.kinematics
+        kinematics = skill.kinematics
         self.reference = kinematics.joint_tensor(joints)
+        self._frames = self._first_frames = self._converted(kinematics, frames or {})
+        self._skill = skill = skill.start(self.reference, self._frames)
+        self._end = skill.end if end is None else end
         self.command: Command | None = None
         self.measured: Tensor | None = None
-        self._regression, self._end, self._blend = regression, end, blend
-        self._measured_feedback, self._impedance = feedback == "measured", impedance
+        self._measured_feedback, self._blend = feedback == "measured", blend
+        self._impedance = impedance or Impedance(kinematics)
         self._gripping = kinematics.gripping()
-        self._frames = self._converted(frames or {})
-        self.holding = Holding.start(kinematics, regression.operators, holds, self._frames)
-        self._trust, self._watch = trust, HoldWatch(kinematics)
-        self._begins: dict[str, float] = {}  # when the skill first holds what it holds
+        self._bounds = _motion_bounds(skill, bounds)
+        self._progress = parse_clock(clock).start(
+            skill, self.reference, self._frames, begin, end
+        )
+        self._start_sensing(trust, smoothing)
+        self._start_motion(at_rest)
+
+    def _start_sensing(self, trust: Trust | None, smoothing: OneEuro | None) -> None:
+        kinematics, progress = self._skill.kinematics, self._progress
+        self.holding = Holding.start(
+            kinematics, self._skill.carried_names, self._skill.holds, self._frames
+        )
+        self._watch = HoldWatch(kinematics)
+        self._first_holds: dict[str, float] = {}  # start of the first hold of each object
         for hold in self.holding.holds:
-            self._begins[hold.frame] = min(hold.begin, self._begins.get(hold.frame, math.inf))
-        self._said: frozenset[str] = frozenset()  # of whose holds somebody told
-        self._inputs: Inputs | None = None
+            earlier = self._first_holds.get(hold.frame, math.inf)
+            self._first_holds[hold.frame] = min(hold.begin, earlier)
+        self._given_holds: frozenset[str] = frozenset()  # objects whose holds were given
+        self._trust, self._inputs = trust, None
         if trust is not None:
             self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
-        self._progress = clock.start(regression, self.reference, self._frames, begin, end)
-        self._novelty, self._at_first = novelty, self._frames
-        # who begins in the middle of the skill stands where nobody starts
-        midway = self._progress.time > begin + START * (end - begin)
+        # robots that begin in the middle of the skill stand where no demonstration starts
+        midway = progress.time > progress.begin + START * (progress.end - progress.begin)
         self._start = torch.where(midway.unsqueeze(-1), torch.nan, self.reference)
+        none = torch.zeros(self.reference.shape[:-1], dtype=torch.bool).to(midway.device)
+        self._waiting, self._displaced = none, none
+        self._displacement = Displacement()
+
+    def _start_motion(self, at_rest: bool) -> None:
         self._follower: Follower | None = None
-        self._bounds, self._position_bounds = bounds, None
-        if bounds is not None:
+        self._position_bounds = None
+        if (bounds := self._bounds) is not None:
             self._follower = Follower.at(bounds, self.reference) if at_rest else None
-            # what is rounded keeps within them
+            # rounded postures stay within these
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
             self._position_bounds = low / GRID, high / GRID
-        self._search, self._via = regression.posture_search(), via
-        self._late: Tensor | None = None  # robots whose time did not increase in this tick
-        self._taken: Follower | None = None  # of this tick, where all can be followed
+        self._search = self._skill.posture_search()
         self._velocity = torch.zeros_like(self.reference)
-        self._wanted = self._asked = self.reference
-        self._gap_before: NDArray[np.float64] | None = None  # reference and robot, last tick
-        self._pushed: NDArray[np.float64] | float = 0.0
-        shape = self.reference.shape[:-1]
-        self._codes = torch.zeros(shape, dtype=torch.int8, device=self.reference.device)
-        none = torch.zeros(shape, dtype=torch.bool, device=self.reference.device)
-        self._led, self._brought = none, none
-        self._gap, self._since = self._velocity, torch.full_like(self._velocity[..., 0], -1.0)
-        self._lasting = torch.full_like(self._since, blend)
-        self._fading = blend > 0
+        self._wanted = self._target = self.reference  # of estimates, and for clocks
+        self._fading = self._blend > 0
+        self._gap, self._fade_time = self._velocity, torch.full_like(self._start[..., 0], -1.0)
+        self._fade_duration = torch.full_like(self._fade_time, self._blend)
 
     @property
     def time(self) -> Tensor:
@@ -251,7 +240,7 @@ class Controller:
             the beginning, whatever it is. A robot whose time did not increase is held for this
             step.
         joints : array-like of shape (..., n_joints), optional
-            Where the robots stand [rad].
+            Measured joints [rad].
         frames : mapping of str to Frame, optional
             Poses of the objects from now on. With ``trust`` also arrays (..., 7) of positions
             and quaternions (w, x, y, z), which need not be finite, or None for a lost one.
@@ -270,85 +259,19 @@ class Controller:
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
         """
-        last, self._late = self.command, None
-        seconds: Seconds
-        if isinstance(dt, Tensor):
-            seconds, late = _durations(dt)
-            self._late = None if last is None else late
-        else:
-            seconds = dt
-        nothing = not isinstance(seconds, np.ndarray) and not 0 < seconds < math.inf
-        if last is not None and nothing:
-            return self._refuse(last, f"time did not increase: dt = {seconds} s")
-        measured, halted = self._hear(seconds, joints, frames, ages)
-        self.measured = measured
-        before = self._progress
-        if last is not None and self._trust is not None:
-            seconds = np.minimum(seconds, self._trust.longest_step)
-        passed = _of_each(seconds, torch.float64)
-        for robots in (halted, self._late):
-            if robots is not None:
-                going = torch.as_tensor(passed, dtype=torch.float64)
-                passed = torch.where(robots, 0.0, going)
-        if last is not None:
-            holding = self.holding
-            away = None if measured is None else self._driven_away(measured, seconds)
-            observed = Observation(
-                self._unbent(measured), self._unbent(self._asked), None,
-                holding.frames, last.estimate,
-                holding.state if holding.carries else None, away,
-            )  # fmt: skip
-            self._progress = before.advance(passed, observed)
-            if measured is not None:
-                if away is not None:
-                    self._stand(away, measured)
-                    self._brought = self._brought | away
-                if bool((moved := self._progress.relocalized).any()):
-                    self._stand(moved, measured)
-                    self._brought = self._brought & ~moved
-        time, ended = self._progress.time, None
-        if last is not None and bool((time >= self._end).any()):
-            ended = (time >= self._end) & (before.time >= self._end)
-            if bool(ended.all()):  # nothing more is asked: the follower comes to rest
-                return self._send(last.estimate, self._wanted, seconds, halted, ended)
-        at = self.reference
-        if self._measured_feedback and measured is not None:
-            at = torch.where(measured.isnan(), at, measured)
-        seen = None if frames is None else dict(self._frames)
-        stands = at if measured is None else torch.where(measured.isnan(), at, measured)
-        self._said = self._said.union(told or ())
-        if self._inputs is not None and self._inputs.poses and not told:
-            begins, now = self._begins, time.expand(stands.shape[:-1])
-            said = begins.keys() & self._said
-            self._watch, self.holding, seen = self._watch.look(
-                self._inputs.poses.keys() - said, self._frames, stands, self.holding,
-                _of_each(seconds, stands), {n: now < at for n, at in begins.items()},
-            )  # fmt: skip
-        shares = {} if self._inputs is None else self._inputs.shares
-        self.holding = self.holding.advance(
-            time, stands, seen, told, dt=_of_each(seconds, stands), shares=shares
-        )
-        at = self._unbent(at)
-        estimate = self._estimated(time, at)
-        if self._via is not None:
-            estimate, self._via = self._conditioned(time, estimate)
-        shift = self._fade(estimate.joints, 0.0 if last is None else seconds)
-        wanted = self._shifted(estimate.joints, shift)
-        # robots that via-points lead are late for another reason than what is searched for
-        bent = self._via is not None and self._via.shift is not None
-        following = self._follower is not None and last is not None and not bent
-        if following and not self._follows(wanted, seconds):
-            wanted = self._shifted(self._searched(time, at, estimate, wanted, seconds), shift)
-        if last is not None and ended is not None and bool(ended.any()):
-            # for them it is as if all had come to the end
-            wanted = torch.where(ended.unsqueeze(-1), self._wanted, wanted)
-            estimate = _choose(ended, last.estimate, estimate)
-        goal = None
-        if measured is not None and self._trust is not None and last is not None:
-            waits = (time - before.time < STANDS * passed).expand(self._led.shape)
-            waits = waits if ended is None else waits & ~ended
-            goal = self._leading(estimate.joints, wanted, measured, waits)
-        return self._send(estimate, wanted, seconds, halted, ended, goal)
+        seconds, late = _durations(dt)
+        first = self.command is None
+        if not first and not isinstance(seconds, np.ndarray) and not 0 < seconds < math.inf:
+            return self._refused(f"time did not increase: dt = {seconds} s")
+        tick = self._sensed(seconds, None if first else late, joints, frames, ages)
+        if not first:
+            self._locate(tick)
+            if tick.ended is not None and bool(tick.ended.all()):
+                assert self.command is not None
+                return self._sent(tick, self.command.estimate, self._wanted)
+        self._update_holds(tick, None if frames is None else dict(self._frames), told)
+        estimate, wanted = self._estimated(tick)
+        return self._sent(tick, estimate, wanted, self._lead(tick, estimate, wanted))
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
@@ -363,7 +286,7 @@ class Controller:
     def resumed(
         self, moment: Self, passed: float, joints: Any, frames: Mapping[str, Any] | None = None
     ) -> Self:
-        """What was looked ahead to has come, and what is told counts again.
+        """A moment that was looked ahead to, with measurements from then on.
 
         Parameters
         ----------
@@ -381,90 +304,220 @@ class Controller:
             other._frames = other._inputs.frames
         return other
 
-    def switched(self, other: Self, progress: Progress) -> Self:
+    def switched(self, skill: Skill, progress: Progress) -> Self:
         """The same robots from here on with another skill, into which they are faded.
 
         Parameters
         ----------
-        other : Controller
-            Of that skill, for the same robots and objects.
+        skill : Skill
         progress : Progress
             Where they are in it.
         """
-        skill = self.copy()
-        skill._regression, skill._end, skill._progress = other._regression, other._end, progress
-        skill._novelty, skill._via, skill._search = (
-            other._novelty,
-            other._via,
-            other._search.begun(),
-        )
+        other = self.copy()
+        other._skill, other._end, other._progress = skill, skill.end, progress
+        other._search = skill.posture_search()
         if not self.holding.held:
-            skill.holding = other.holding
-        skill._restart_fading(torch.ones_like(self._led))
-        return skill
+            other.holding = Holding.start(
+                skill.kinematics, skill.carried_names, skill.holds, self.holding.frames
+            )
+        other._restart_fading(torch.ones_like(self._waiting))
+        return other
 
-    def _hear(
+    # Sensing
+
+    def _sensed(
         self,
-        dt: Seconds,
+        seconds: Seconds,
+        late: Tensor | None,
         joints: Any,
         frames: Mapping[str, Any] | None,
         ages: Mapping[str, float] | None,
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """Measured joints, and robots that are halted; frames are kept.
-
-        Of joints that grip it is as if they were not measured: what they hold keeps them from
-        their references.
-        """
-        measured, halted = self._told(dt, joints, frames, ages)
-        if measured is not None and self._gripping is not None:
-            measured = torch.where(self._gripping, torch.nan, measured)
-        return measured, halted
-
-    def _told(
-        self,
-        dt: Seconds,
-        joints: Any,
-        frames: Mapping[str, Any] | None,
-        ages: Mapping[str, float] | None,
-    ) -> tuple[Tensor | None, Tensor | None]:
+    ) -> _Tick:
+        """Accepted measurements, and how long this tick is for each robot."""
+        measured, halted = None, None
         if self._inputs is None:
             if frames is not None:
-                self._frames = self._converted(frames)
-            return self._checked(joints), None
-        dt = dt if self.command else np.maximum(dt, 1e-3)
-        self._inputs = inputs = self._inputs.update(dt, joints, frames, ages)
-        self._frames = inputs.frames
-        untrusted = inputs.untrusted()
-        halted = None if untrusted is None else torch.as_tensor(untrusted)
-        return inputs.measured, halted
+                self._frames = self._converted(self._skill.kinematics, frames)
+            measured = self._validated(joints)
+        else:
+            known = seconds if self.command else np.maximum(seconds, 1e-3)
+            self._inputs = self._inputs.update(known, joints, frames, ages)
+            self._frames, measured = self._inputs.frames, self._inputs.measured
+            untrusted = self._inputs.untrusted()
+            halted = None if untrusted is None else torch.as_tensor(untrusted)
+        if measured is not None and self._gripping is not None:
+            # the objects that they hold keep gripping joints from their references
+            measured = torch.where(self._gripping, torch.nan, measured)
+        self.measured = measured
+        if self.command is not None and self._trust is not None:
+            seconds = np.minimum(seconds, self._trust.longest_step)
+        passed = _each(seconds, torch.float64)
+        for robots in (halted, late):
+            if robots is not None:
+                going = torch.as_tensor(passed, dtype=torch.float64)
+                passed = torch.where(robots, 0.0, going)
+        return _Tick(seconds, passed, measured, halted, late)
 
-    def _shifted(self, joints: Tensor, shift: Tensor | None) -> Tensor:
-        if shift is not None:
-            joints = joints + shift
-        joints = self._regression.kinematics.retract(joints)
-        if self._bounds is None:
-            return joints
-        rounded = (joints.detach() * GRID).round() / GRID
-        return joints + (rounded - joints).detach() if joints.requires_grad else rounded
+    def _validated(self, joints: Any) -> Tensor | None:
+        if joints is None:
+            return None
+        measured = self._skill.kinematics.joint_tensor(joints)
+        if measured.shape != self.reference.shape:
+            raise ShapeError(
+                f"the skill began with joints of shape {tuple(self.reference.shape)}, now "
+                f"there are {tuple(measured.shape)}: start another controller for other robots"
+            )
+        return measured
 
-    def _follows(self, wanted: Tensor, dt: Seconds) -> bool:
-        """Whether all robots can be where they are wanted, as in an ordinary tick."""
-        if self._search.active is not None or self._follower is None:
-            return False
-        self._taken = self._follower.take(wanted, dt)
-        return self._taken is not None
+    @staticmethod
+    def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
+        return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
 
-    def _searched(
-        self, time: Tensor, at: Tensor, estimate: Estimate, wanted: Tensor, dt: Seconds
-    ) -> Tensor:
-        """What is wanted where one step of the linearised product leads too far."""
-        assert self._follower is not None and self._position_bounds is not None
-        asked = ~self._follower.fits(wanted, dt) & wanted.isfinite().all(-1)
+    # Progress
+
+    def _locate(self, tick: _Tick) -> None:
+        """Progress of each robot; displaced robots restart from where they are."""
+        assert self.command is not None
+        measured, before, displaced = tick.measured, self._progress, None
+        if measured is not None and self._trust is not None and self._inputs is not None:
+            displaced, self._displacement = self._displacement.detect(
+                measured, self.reference, self._velocity, tick.seconds, self._trust
+            )
         holding = self.holding
+        observation = Observation(
+            measured, self._target, None, holding.frames, self.command.estimate,
+            holding.state if holding.carries else None, displaced,
+        )  # fmt: skip
+        self._progress = before.advance(tick.passed, observation)
+        if measured is not None:
+            if displaced is not None:
+                self._restart_from(measured, displaced)
+                self._displaced = self._displaced | displaced
+            if bool((moved := self._progress.relocalized).any()):
+                self._restart_from(measured, moved)
+                self._displaced = self._displaced & ~moved
+        time = self._progress.time
+        if bool((time >= self._end).any()):
+            tick.ended = (time >= self._end) & (before.time >= self._end)
+        if measured is not None and self._trust is not None:
+            waits = time - before.time < WAITING_RATE * tick.passed
+            tick.waits = waits.expand(self._waiting.shape)
+            if tick.ended is not None:
+                tick.waits = tick.waits & ~tick.ended
+
+    def _restart_from(self, measured: Tensor, robots: Tensor) -> None:
+        """References of some robots are where these stand, at rest."""
+        joints = robots.unsqueeze(-1) & ~measured.isnan()
+        self.reference = torch.where(joints, measured, self.reference)
+        self._velocity = torch.where(joints, 0.0, self._velocity)
+        if self._follower is not None:
+            self._follower = self._follower.put(joints, self.reference)
+        if self._search is not None:
+            self._search = self._search.ended(robots)
+        self._displacement = self._displacement.forget(joints)
+        self._restart_fading(robots)
+
+    # Holds
+
+    def _update_holds(
+        self,
+        tick: _Tick,
+        frames: Mapping[str, Frame] | None,
+        told: Mapping[str, str | None] | None,
+    ) -> None:
+        """What the robots hold: by the skill's times, by what was given, and as it is seen."""
+        time, stands = self._progress.time, self._postures(tick, measured=True)
+        seconds = _each(tick.seconds, stands)
+        self._given_holds = self._given_holds.union(told or ())
+        shares: Mapping[str, Tensor] = {}
+        if self._inputs is not None:
+            shares = self._inputs.shares
+            if self._inputs.poses and not told:
+                now = time.expand(stands.shape[:-1])
+                given = self._first_holds.keys() & self._given_holds
+                self._watch, self.holding, frames = self._watch.look(
+                    self._inputs.poses.keys() - given, self._frames, stands, self.holding,
+                    seconds, {n: now < at for n, at in self._first_holds.items()},
+                )  # fmt: skip
+        self.holding = self.holding.advance(
+            time, stands, frames, told, dt=seconds, shares=shares
+        )
+
+    def _postures(self, tick: _Tick, measured: bool) -> Tensor:
+        """References, or measured joints where there are some."""
+        if not measured or tick.measured is None:
+            return self.reference
+        return torch.where(tick.measured.isnan(), self.reference, tick.measured)
+
+    # Estimate
+
+    def _estimated(self, tick: _Tick) -> tuple[Estimate, Tensor]:
+        """The skill's estimate, and the posture that is wanted."""
+        time, last = self._progress.time, self.command
+        at = self._postures(tick, self._measured_feedback)
+        estimate = self._estimate(time, at)
+        self._skill = self._skill.advance(estimate)
+        seconds = 0.0 if last is None else tick.seconds
+        shift = self._faded(estimate.joints, seconds)
+        wanted = self._rounded(estimate.joints, shift)
+        if last is not None and self._cannot_follow(tick, wanted):
+            wanted = self._rounded(self._nearest(tick, at, estimate, wanted), shift)
+        if last is not None and tick.ended is not None and bool(tick.ended.any()):
+            # for them it is as if all had come to the end
+            wanted = torch.where(tick.ended.unsqueeze(-1), self._wanted, wanted)
+            estimate = _choose(tick.ended, last.estimate, estimate)
+        return estimate, wanted
+
+    def _estimate(self, time: Tensor, at: Tensor) -> Estimate:
+        """The skill's estimate; not finite for robots for which it has none."""
+        state: Tensor | RobotState = at
+        if self.holding.carries:
+            state = self._state(at)
+        given = self.holding.frames, self._position_bounds
         try:
-            joints, self._search = self._search.advance(
-                time, at, holding.frames, estimate, self._position_bounds,
-                asked, self._carrying if holding.carries else None,
+            return self._skill.estimate(time, state, *given)
+        except TPGMMError:
+            if self._trust is None or self.command is None:
+                raise  # nothing moves yet, or inputs are the caller's own
+        # one robot's failure is not its batch's
+        known, batch = self.command.estimate, at.shape[:-1]
+        joints = torch.full_like(at, torch.nan)
+        covariance = known.covariance.expand(*at.shape, -1).clone()
+        activation = known.activation.expand(*batch, -1).clone()
+        frames, bounds = given
+        for index in np.ndindex(*batch):
+            here = {n: f.expand(batch)[index] for n, f in frames.items()}
+            now = time[index] if time.ndim else time
+            try:
+                estimate = self._skill.estimate(now, state[index], here, bounds)
+            except TPGMMError:
+                continue
+            joints[index], covariance[index] = estimate.joints, estimate.covariance
+            activation[index] = estimate.activation
+        return Estimate(joints, covariance, activation)
+
+    def _state(self, joints: Tensor) -> RobotState:
+        """With the objects that the robots hold."""
+        return self.holding.state(self._skill.kinematics.state(joints))
+
+    def _cannot_follow(self, tick: _Tick, wanted: Tensor) -> bool:
+        """Whether a robot cannot be at its estimate, or is searched for already."""
+        if self._follower is None or self._skill.posture_search() is None:
+            return False
+        if self._search is None or self._search.active is None:
+            tick.following = self._follower.take(wanted, tick.seconds)
+        return tick.following is None
+
+    def _nearest(self, tick: _Tick, at: Tensor, estimate: Estimate, wanted: Tensor) -> Tensor:
+        """The nearest posture where an estimate, one linearised step, leads too far."""
+        assert self._follower is not None and self._position_bounds is not None
+        search = self._search or self._skill.posture_search()
+        assert search is not None
+        asked = ~self._follower.fits(wanted, tick.seconds) & wanted.isfinite().all(-1)
+        try:
+            joints, self._search = search.advance(
+                self._progress.time, at, self.holding.frames, estimate, self._position_bounds,
+                asked, self._state if self.holding.carries else None,
             )  # fmt: skip
         except TPGMMError:
             if self._trust is None:
@@ -472,251 +525,194 @@ class Controller:
             return estimate.joints
         return joints
 
-    def _carrying(self, joints: Tensor) -> RobotState:
-        return self.holding.state(self._regression.kinematics.state(joints))
+    def _rounded(self, joints: Tensor, shift: Tensor | None) -> Tensor:
+        """Wanted postures; where there are bounds, on a grid."""
+        if shift is not None:
+            joints = joints + shift
+        joints = self._skill.kinematics.retract(joints)
+        if self._bounds is None:
+            return joints
+        rounded = (joints.detach() * GRID).round() / GRID
+        return joints + (rounded - joints).detach() if joints.requires_grad else rounded
 
-    @property
-    def _bend(self) -> Tensor | float:
-        """By how much via-points moved the last estimate."""
-        shift = None if self._via is None else self._via.shift
-        return 0.0 if shift is None else shift
-
-    def _unbent(self, joints: _Joints) -> _Joints:
-        """Joints as they would be without via-points, for what knows of none."""
-        return joints if joints is None or self._via is None else joints - self._bend
-
-    def _conditioned(self, time: Tensor, free: Estimate) -> tuple[Estimate, Conditioning]:
-        """The estimate, given the via-points; as it is where they cannot be told."""
-        assert self._via is not None
-        holding = self.holding
-        attach = holding.state if holding.carries else None
-        try:
-            return self._via.advance(time, free, holding.frames, self._position_bounds, attach)
-        except TPGMMError:
-            if self._trust is None or self.command is None:
-                raise
-            return free, self._via
-
-    def _estimated(self, time: Tensor, at: Tensor) -> Estimate:
-        """What the model asks for; not finite for robots of which it cannot tell."""
-        state: Tensor | RobotState = at
-        if self.holding.carries:
-            state = self.holding.state(self._regression.kinematics.state(at))
-        frames, bounds = self.holding.frames, self._position_bounds
-        try:
-            return self._regression.estimate(time, state, frames, bounds)
-        except TPGMMError:
-            if self._trust is None or self.command is None:
-                raise  # nothing moves yet, or who predicts wants to know
-        # one robot's trouble is not its batch's
-        unknown = self.command.estimate
-        batch = at.shape[:-1]
-        joints = torch.full_like(at, torch.nan)
-        covariance = unknown.covariance.expand(*at.shape, -1).clone()
-        activation = unknown.activation.expand(*batch, -1).clone()
-        for index in np.ndindex(*batch) if batch else ():
-            one = state[index]
-            here = {n: f.expand(batch)[index] for n, f in frames.items()}
-            now = time[index] if time.ndim else time
-            try:
-                estimate = self._regression.estimate(now, one, here, bounds)
-            except TPGMMError:
-                continue
-            joints[index], covariance[index] = estimate.joints, estimate.covariance
-            activation[index] = estimate.activation
-        return Estimate(joints, covariance, activation)
-
-    def _driven_away(self, measured: Tensor, dt: Seconds) -> Tensor | None:
-        """Robots that somebody else has moved from their references; None if there is none.
-
-        A robot that is slow, or stopped, is left behind as fast as its reference moves; one
-        that is moved goes faster.
-        """
-        if self._inputs is None:
-            return None
-        trust = self._inputs.trust  # in numpy, which takes a third of the time of torch
-        stands, reference = measured.numpy(force=True), self.reference.numpy(force=True)
-        gap, speed = np.abs(stands - reference), np.abs(self._velocity.numpy(force=True))
-        before, unknown = self._gap_before, np.isnan(gap)
-        if before is None:
-            self._gap_before = np.where(unknown, 0.0, gap)
-            return None
-        if unknown.any():
-            gap = np.where(unknown, before, gap)
-        each = dt[..., None] if isinstance(dt, np.ndarray) else dt
-        kept = self._pushed * np.maximum(0.0, 1 - each / PUSH_MEMORY)
-        pushed = np.maximum(kept + gap - before - speed * each, 0.0)
-        far = (gap > trust.largest_gap + trust.lag * speed) | (pushed > trust.largest_push)
-        self._gap_before, self._pushed = gap, pushed
-        if not far.any():
-            return None
-        return torch.as_tensor(far.any(-1), device=self.reference.device)
-
-    def _stand(self, robots: Tensor, measured: Tensor) -> None:
-        """References of robots that were brought elsewhere begin anew where they stand."""
-        joints = robots.unsqueeze(-1) & ~measured.isnan()
-        self.reference = torch.where(joints, measured, self.reference)
-        self._velocity = torch.where(joints, 0.0, self._velocity)
-        if self._follower is not None:
-            self._follower = self._follower.put(joints, self.reference)
-        self._search = self._search.ended(robots)
-        if self._gap_before is not None:
-            rows = joints.numpy(force=True)
-            self._gap_before = np.where(rows, 0.0, self._gap_before)
-            self._pushed = np.where(rows, 0.0, self._pushed)
-        self._restart_fading(robots)
-
-    def _leading(
-        self, asked: Tensor, wanted: Tensor, measured: Tensor, waits: Tensor
-    ) -> Tensor | None:
-        """Where robots are led that do not follow; None if all do."""
-        assert self._trust is not None
-        if bool(self._brought.any()):
-            back = (asked - measured).abs().nan_to_num(0.0).amax(-1) <= 2 * self._trust.lead
-            self._brought = self._brought & ~back
-        if bool((follow := self._led & ~waits).any()):
-            self._restart_fading(follow)  # from where they were led to
-        self._led = waits
-        if not bool(waits.any()):
-            return None
-        # what holds them is not fought, and joints go on together, as a held object needs it
-        way = wanted - measured
-        size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
-        most = way.new_full(waits.shape, self._trust.lead)
-        most = torch.where(self.holding.busy(waits), CAREFUL * most, most).unsqueeze(-1)
-        lead = way * (most / torch.maximum(size, most))
-        return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + lead, wanted)
-
-    def _checked(self, joints: Any) -> Tensor | None:
-        if joints is None:
-            return None
-        measured = self._regression.kinematics.joint_tensor(joints)
-        if measured.shape != self.reference.shape:
-            raise ShapeError(
-                f"the skill began with joints of shape {tuple(self.reference.shape)}, now "
-                f"there are {tuple(measured.shape)}: begin it anew for other robots"
-            )
-        return measured
-
-    def _refuse(self, last: Command, reason: str) -> Command:
-        """The last command again: nothing moves, and why."""
-        codes = torch.full_like(self._codes, Status.HOLDING.code)
-        robots = np.ndindex(*self._codes.shape)
-        self.command = replace(last, codes=codes, reasons=dict.fromkeys(robots, reason))
-        return self.command
-
-    def _converted(self, frames: Mapping[str, Frame]) -> dict[str, Frame]:
-        like = self._regression.kinematics.lower
-        return {name: frame.to(like) for name, frame in frames.items()}
+    # Fading from where robots start
 
     def _restart_fading(self, robots: Tensor) -> None:
-        self._since = torch.where(robots, -1.0, self._since)  # their gap is not known yet
+        self._fade_time = torch.where(robots, -1.0, self._fade_time)  # the gap is not known yet
         self._fading = self._blend > 0
 
-    def _fade(self, estimate: Tensor, dt: Seconds) -> Tensor | None:
-        """What is left of the difference between where robots went on and the estimate."""
+    def _faded(self, estimate: Tensor, dt: Seconds) -> Tensor | None:
+        """The rest of the difference between where robots went on and the estimate."""
         if not self._fading:
             return None
-        fresh = self._since < 0
+        fresh = self._fade_time < 0
         if bool(fresh.any()):
-            gap = self.reference - estimate
-            self._gap = torch.where(fresh.unsqueeze(-1), gap.nan_to_num(0.0), self._gap)
+            gap = (self.reference - estimate).nan_to_num(0.0)
+            self._gap = torch.where(fresh.unsqueeze(-1), gap, self._gap)
             if self.command is not None:
-                lasting = fading_time(self._gap, self._blend)
-                self._lasting = torch.where(fresh, lasting, self._lasting)
-        self._since = torch.where(fresh, 0.0, self._since + _of_each(dt, estimate))
-        left = 1 - minimum_jerk(self._since / self._lasting)
+                duration = fading_time(self._gap, self._blend)
+                self._fade_duration = torch.where(fresh, duration, self._fade_duration)
+        self._fade_time = torch.where(fresh, 0.0, self._fade_time + _each(dt, estimate))
+        left = 1 - minimum_jerk(self._fade_time / self._fade_duration)
         self._fading = bool((left > 0).any())
         return left.unsqueeze(-1) * self._gap
 
-    def _send(
-        self,
-        estimate: Estimate,
-        wanted: Tensor,
-        dt: Seconds,
-        halted: Tensor | None,
-        ended: Tensor | None,
-        goal: Tensor | None = None,
+    # Following
+
+    def _lead(self, tick: _Tick, estimate: Estimate, wanted: Tensor) -> Tensor | None:
+        """Postures to which waiting robots are led; None if none waits."""
+        if tick.waits is None or tick.measured is None:
+            return None
+        assert self._trust is not None
+        measured, waits, lead = tick.measured, tick.waits, self._trust.lead
+        if bool(self._displaced.any()):
+            gap = (estimate.joints - measured).abs().nan_to_num(0.0).amax(-1)
+            self._displaced = self._displaced & ~(gap <= 2 * lead)
+        if bool((follow := self._waiting & ~waits).any()):
+            self._restart_fading(follow)  # from where they were led to
+        self._waiting = waits
+        if not bool(waits.any()):
+            return None
+        # whatever holds them is not fought, and joints go on together, as a held object needs
+        way = wanted - measured
+        size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
+        most = way.new_full(waits.shape, lead)
+        most = torch.where(self.holding.busy(waits), HOLDING_LEAD * most, most).unsqueeze(-1)
+        step = way * (most / torch.maximum(size, most))
+        return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + step, wanted)
+
+    def _sent(
+        self, tick: _Tick, estimate: Estimate, wanted: Tensor, goal: Tensor | None = None
     ) -> Command:
-        """The command that brings robots to where they are wanted, or are led."""
-        last, wanted_before, lost = self.reference, self._wanted, None
-        self._wanted = wanted
-        wanted = wanted if goal is None else goal
-        each = _of_each(dt, last)
-        each = each.unsqueeze(-1) if isinstance(each, Tensor) else each
+        """The command that brings robots to the wanted postures, or to where they are led."""
+        before, self._wanted = self._wanted, wanted
+        to = wanted if goal is None else goal
+        lost = None
         if self._bounds is None:
-            for still in (halted, self._late):
-                if still is not None:
-                    wanted = torch.where(still.unsqueeze(-1), last, wanted)
-            if self.command is not None:
-                self._velocity = (wanted - last) / each
-            self.reference = wanted
+            self._set_reference(tick, to)
         elif self.command is not None:  # the first reference is where robots stand
-            if halted is not None:  # what is not finite brings a robot to rest
-                wanted = torch.where(halted.unsqueeze(-1), torch.nan, wanted)
-            if self._follower is None:  # a gap to where the skill begins is no speed
-                fastest = self._bounds.velocity
-                moving = ((wanted - wanted_before) / each).clamp(-fastest, fastest)
-                self._follower = Follower.at(self._bounds, last, moving)
-            before, (follower, self._taken) = self._follower, (self._taken, None)
-            if follower is None or follower.reference is not wanted:
-                follower = self._follower.advance(wanted, dt)
-                lost = ~wanted.isfinite().all(-1)  # and is brought to rest
-            if self._late is not None:
-                follower = follower.undone(self._late, before)
-            self._follower = follower
-            self.reference, self._velocity = follower.reference, follower.velocity
-        # who is led or was brought elsewhere is not where it should be, however near its
-        # reference is
-        self._asked = self.reference
+            lost = self._follow(tick, to, before)
+        # the clock compares with the estimate where a robot is led, or was displaced
+        self._target = self.reference
         if goal is not None:
-            self._asked = torch.where(self._led.unsqueeze(-1), self._wanted, self._asked)
-        if self._trust is not None and bool(self._brought.any()):
-            known = self._brought.unsqueeze(-1) & estimate.joints.isfinite()
-            self._asked = torch.where(known, estimate.joints, self._asked)
-        codes = self._codes
-        reasons: Mapping[tuple[int, ...], str] = {}
-        if ended is not None and bool(ended.any()):
-            codes = torch.where(ended, Status.FINISHED.code, codes)
-        if lost is not None and bool(lost.any()):
-            codes = torch.where(lost, Status.HOLDING.code, codes)
-            robots = map(tuple, np.argwhere(lost.numpy(force=True)).tolist())
-            reasons = dict.fromkeys(robots, "the model has no finite answer here")
-        if self._late is not None:
-            codes = torch.where(self._late, Status.HOLDING.code, codes)
-            late = map(tuple, np.argwhere(self._late.numpy(force=True)).tolist())
-            reasons = {**reasons, **dict.fromkeys(late, "time did not increase")}
-        if halted is not None and self._inputs is not None:
-            codes = torch.where(halted, Status.HOLDING.code, codes)
-            reasons = {**reasons, **self._inputs.reasons(halted.numpy(force=True))}
+            self._target = torch.where(self._waiting.unsqueeze(-1), wanted, self._target)
+        if self._trust is not None and bool(self._displaced.any()):
+            known = self._displaced.unsqueeze(-1) & estimate.joints.isfinite()
+            self._target = torch.where(known, estimate.joints, self._target)
+        codes, reasons = self._statuses(tick, lost)
         self.command = Command(
             self.reference,
             self._velocity,
             self.time,
             estimate,
-            codes.to(torch.int8),
+            codes,
             reasons,
             self._impedance,
             self._situation_novelty(),
         )
         return self.command
 
+    def _set_reference(self, tick: _Tick, to: Tensor) -> None:
+        """Without bounds, the wanted posture is the reference."""
+        last = self.reference
+        for still in (tick.halted, tick.late):
+            if still is not None:
+                to = torch.where(still.unsqueeze(-1), last, to)
+        if self.command is not None:
+            self._velocity = (to - last) / _column(tick.seconds, last)
+        self.reference = to
+
+    def _follow(self, tick: _Tick, to: Tensor, before: Tensor) -> Tensor | None:
+        """Within bounds; robots without a finite posture, which come to rest."""
+        assert self._bounds is not None
+        if tick.halted is not None:  # what is not finite brings a robot to rest
+            to = torch.where(tick.halted.unsqueeze(-1), torch.nan, to)
+        if self._follower is None:  # a gap to where the skill begins is no speed
+            fastest = self._bounds.velocity
+            moving = (to - before) / _column(tick.seconds, self.reference)
+            moving = moving.clamp(-fastest, fastest)
+            self._follower = Follower.at(self._bounds, self.reference, moving)
+        last, lost = self._follower, None
+        follower = tick.following
+        if follower is None or follower.reference is not to:
+            follower = last.advance(to, tick.seconds)
+            lost = ~to.isfinite().all(-1)
+        if tick.late is not None:
+            follower = follower.undone(tick.late, last)
+        self._follower = follower
+        self.reference, self._velocity = follower.reference, follower.velocity
+        return lost
+
+    # Status
+
+    def _statuses(
+        self, tick: _Tick, lost: Tensor | None
+    ) -> tuple[Tensor, dict[tuple[int, ...], str]]:
+        """Status of each robot, and why one is held."""
+        codes = torch.zeros_like(self._waiting, dtype=torch.int8)
+        reasons: dict[tuple[int, ...], str] = {}
+        if tick.ended is not None:
+            codes = torch.where(tick.ended, Status.FINISHED.code, codes)
+        held = ((lost, "the model has no finite answer here"), (tick.late, NOT_INCREASED))
+        for robots, reason in held:
+            if robots is not None and bool(robots.any()):
+                codes = torch.where(robots, Status.HOLDING.code, codes)
+                indices = map(tuple, np.argwhere(robots.numpy(force=True)).tolist())
+                reasons |= dict.fromkeys(indices, reason)
+        if tick.halted is not None and self._inputs is not None:
+            codes = torch.where(tick.halted, Status.HOLDING.code, codes)
+            reasons |= self._inputs.reasons(tick.halted.numpy(force=True))
+        return codes.to(torch.int8), reasons
+
+    def _refused(self, reason: str) -> Command:
+        """The last command, while nothing moves."""
+        assert self.command is not None
+        codes = torch.full_like(self.command.codes, Status.HOLDING.code)
+        robots = np.ndindex(*codes.shape)
+        self.command = replace(self.command, codes=codes, reasons=dict.fromkeys(robots, reason))
+        return self.command
+
     def _situation_novelty(self) -> Callable[[], Tensor] | None:
-        """What tells how new it is where robots began and objects are, or were last free."""
-        if self._novelty is None:
+        """Novelty of where robots began and objects are, or were last free."""
+        summary = self._skill.summary
+        if summary is None:
             return None
-        return functools.partial(
-            _ratio, self._novelty, self._start, self.holding.frames, self._at_first
-        )
+        places = self.holding.frames, self._first_frames
+        return functools.partial(_novelty, summary, self._start, *places)
 
 
-def _of_each(seconds: Seconds, like: Tensor | torch.dtype) -> float | Tensor:
+#: Why a robot is held whose time stood still.
+NOT_INCREASED = "time did not increase"
+
+
+def _motion_bounds(
+    skill: Skill, bounds: MotionBounds | Mapping[str, Any] | str | None
+) -> MotionBounds | None:
+    """Bounds as a controller takes them."""
+    if isinstance(bounds, Mapping):
+        return MotionBounds.of(skill.kinematics, skill.peaks, **bounds)
+    if not isinstance(bounds, str):
+        return bounds
+    if bounds != "robot":
+        raise DataError(f"bounds are MotionBounds, a mapping, 'robot' or None, got {bounds!r}")
+    return skill.motion_bounds
+
+
+def _each(seconds: Seconds, like: Tensor | torch.dtype) -> float | Tensor:
     """A tensor, if each robot has a duration of its own."""
     return torch.as_tensor(seconds).to(like) if isinstance(seconds, np.ndarray) else seconds
 
 
-def _durations(dt: Tensor) -> tuple[Seconds, Tensor | None]:
-    """Of the tick, of each robot or of all, and the robots whose time did not increase."""
+def _column(seconds: Seconds, like: Tensor) -> float | Tensor:
+    """Durations for the joints of each robot."""
+    each = _each(seconds, like)
+    return each.unsqueeze(-1) if isinstance(each, Tensor) else each
+
+
+def _durations(dt: float | Tensor) -> tuple[Seconds, Tensor | None]:
+    """Duration of a tick, of each robot or of all, and robots whose time did not increase."""
+    if not isinstance(dt, Tensor):
+        return dt, None
     increased = (dt > 0) & dt.isfinite()
     seconds = torch.where(increased, dt, INSTANT).double().numpy(force=True)
     if not bool(increased.any()):
@@ -727,7 +723,7 @@ def _durations(dt: Tensor) -> tuple[Seconds, Tensor | None]:
     return seconds, ~increased
 
 
-def _ratio(
+def _novelty(
     summary: TrainingSummary,
     start: Tensor,
     frames: Mapping[str, Frame],

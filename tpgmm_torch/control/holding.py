@@ -15,8 +15,6 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import UnknownNameError
-from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.base import carried_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["Held", "Holding", "choose"]
@@ -113,7 +111,7 @@ class Holding:
     def start(
         cls,
         kinematics: Kinematics,
-        operators: Sequence[Operator],
+        objects: Sequence[str],
         holds: Sequence[Hold],
         frames: Mapping[str, Frame],
     ) -> Self:
@@ -122,8 +120,8 @@ class Holding:
         Parameters
         ----------
         kinematics : Kinematics
-        operators : sequence of Operator
-            What refers to objects.
+        objects : sequence of str
+            Those that operators refer to as things.
         holds : sequence of Hold
             Those of the model, or others.
         frames : mapping of str to Frame
@@ -137,7 +135,7 @@ class Holding:
         # whatever is not there yet has to be seen before it is asked for
         names = frames or [hold.frame for hold in holds]
         checked = check_holds(holds, names, kinematics.links)
-        return cls(kinematics, checked, carried_objects(operators, kinematics), dict(frames))
+        return cls(kinematics, checked, tuple(objects), dict(frames))
 
     @property
     def carries(self) -> bool:

@@ -4,53 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
+from tpgmm_torch.control.clocks import EvenClock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.regression.regression import PART, Regression
+from tpgmm_torch.regression.regression import PART
+from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["rollout"]
 
 
 def rollout(
-    regression: Regression,
+    skill: Skill,
     situations: Sequence[Situation],
-    skill_time: torch.Tensor,
-    blend: float,
-    bounds: MotionBounds | None,
-    candidates: bool,
-    holds: Sequence[Hold] = (),
-    via: Conditioning | None = None,
+    *,
+    bounds: MotionBounds | str | None = None,
+    blend: float = 0.0,
+    candidates: bool = False,
 ) -> list[Trajectory]:
-    """Closed kinematic loop: each reference is the state q_{t-1} of the next step.
+    """Reproduce a skill in new situations: each reference is the q_{t-1} of the next step.
 
     Parameters
     ----------
-    regression : Regression
-        What is asked for the joints at each step.
+    skill : Skill
     situations : sequence of Situation
         With time grids.
-    skill_time : Tensor of shape (T,)
-        From when to when the skill lasts [s]: what comes before or after is held.
-    blend : float
-        How long the difference between the start posture and the first reference fades [s].
-    bounds : MotionBounds or None
-        What references keep within.
-    candidates : bool
+    bounds : MotionBounds, "robot" or None, default=None
+        Of position, speed, acceleration and jerk; "robot" takes those of the robot and of the
+        demonstrations, None takes the estimates for references.
+    blend : float, default=0.0
+        How long the difference between the start posture and the first reference fades, by a
+        minimum-jerk step [s].
+    candidates : bool, default=False
         Whether to keep each operator's own estimate.
-    holds : sequence of Hold, default=()
-        From when to when links hold objects.
-    via : Conditioning, optional
-        Via-points through which they pass.
 
     Returns
     -------
@@ -60,9 +54,7 @@ def rollout(
     trajectories: dict[int, Trajectory] = {}
     for members in _groups(situations):
         batch = [situations[index] for index in members]
-        together = _run_together(
-            regression, batch, skill_time, blend, bounds, candidates, holds, via
-        )
+        together = _run_together(skill, batch, bounds, blend, candidates)
         trajectories.update(zip(members, together, strict=True))
     return [trajectories[index] for index in range(len(situations))]
 
@@ -78,14 +70,11 @@ def _groups(situations: Sequence[Situation]) -> list[list[int]]:
 
 
 def _run_together(
-    regression: Regression,
+    skill: Skill,
     situations: Sequence[Situation],
-    skill_time: torch.Tensor,
+    bounds: MotionBounds | str | None,
     blend: float,
-    bounds: MotionBounds | None,
     candidates: bool,
-    holds: Sequence[Hold],
-    via: Conditioning | None,
 ) -> list[Trajectory]:
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
@@ -98,18 +87,19 @@ def _run_together(
     alone = len(situations) == 1  # one robot is sooner computed without a batch
     poses = {name: frame[..., 0] if alone else frame for name, frame in frames.items()}
     moving = {name for name, frame in frames.items() if len(frame.batch_shape) == 2}
-    held = time.clamp(skill_time[0], skill_time[-1])  # nothing is extrapolated
+    held = time.clamp(skill.begin, skill.end)  # nothing is extrapolated
     grid = held.tolist()
     controller = Controller(
-        regression,
+        skill,
         start[0] if alone else start,
         poses,
+        clock=EvenClock(),
+        trust=None,
+        smoothing=None,
+        bounds=bounds,
+        blend=blend,
         begin=grid[0],
         end=grid[-1],
-        blend=blend,
-        holds=holds,
-        bounds=bounds,
-        via=via,
         at_rest=False,  # a situation does not say how its robot moves
     )
     references: list[torch.Tensor] = []
@@ -142,7 +132,7 @@ def _run_together(
     own: list[Candidate] = []
     if candidates:
         states = torch.cat((start[None], joints[:-1]))
-        own = _candidates(regression, held, states, frames, holdings, whole)
+        own = _candidates(skill, held, states, frames, holdings, whole)
     return [
         Trajectory(
             time,
@@ -152,14 +142,14 @@ def _run_together(
                 Candidate(one.mean[:, row], one.covariance[:, row], one.share[:, row])
                 for one in own
             ),
-            regression.kinematics.joint_names,
+            skill.kinematics.joint_names,
         )
         for row in range(len(situations))
     ]
 
 
 def _candidates(
-    regression: Regression,
+    skill: Any,
     time: torch.Tensor,
     joints: torch.Tensor,
     frames: Mapping[str, Frame],
@@ -175,9 +165,9 @@ def _candidates(
     for now in _stretches(holdings, size):
         estimate = Estimate(whole.joints[now], whole.covariance[now], activation[now])
         holding = _together(holdings[now], _at(frames, now), joints.shape[1:2])
-        state = holding.state(regression.kinematics.state(joints[now]))
+        state = holding.state(skill.kinematics.state(joints[now]))
         at = time[now].unsqueeze(-1)
-        parts.append(regression.candidates(at, state, holding.frames, estimate))
+        parts.append(skill.candidates(at, state, holding.frames, estimate))
     return [
         Candidate(*(torch.cat(field) for field in zip(*map(_fields, over_time), strict=True)))
         for over_time in zip(*parts, strict=True)

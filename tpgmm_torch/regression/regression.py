@@ -120,6 +120,8 @@ class Regression:
         Intervals in which a link holds an object.
     motion_bounds : MotionBounds, optional
         Of position, speed, acceleration and jerk.
+    peaks : tuple of two Tensor of shape (n_joints,), optional
+        Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
     summary : TrainingSummary, optional
         Distance of a situation from the demonstrations.
     """
@@ -139,6 +141,7 @@ class Regression:
     end: float = math.inf
     holds: tuple[Hold, ...] = ()
     motion_bounds: MotionBounds | None = None
+    peaks: tuple[Tensor, Tensor] | None = None
     summary: TrainingSummary | None = None
 
     def step(

@@ -96,6 +96,11 @@ class Skill(Protocol):
         return None
 
     @property
+    def peaks(self) -> tuple[Tensor, Tensor] | None:
+        """Largest accelerations and jerks (n_joints,) of the demonstrations, or None."""
+        return None
+
+    @property
     def summary(self) -> TrainingSummary | None:
         """Distance of a situation from the demonstrations; None if that is not known."""
         return None

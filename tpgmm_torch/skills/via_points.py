@@ -1,0 +1,133 @@
+"""Via-points: a skill that passes through given coordinates at given times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.regression.conditioning import Conditioning
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.posture import PostureSearch
+from tpgmm_torch.regression.via_points import ViaPoint
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.skills.skill import Skill
+
+__all__ = ["ViaPoints"]
+
+
+@dataclass(frozen=True, eq=False)
+class ConditionedEstimate(Estimate):
+    """An estimate given via-points, and where the next one starts from."""
+
+    conditioning: Conditioning | None = None
+
+
+class ViaPoints:
+    """A skill conditioned on via-points; at other times it is the skill itself.
+
+    Parameters
+    ----------
+    skill : Skill
+    points : iterable of ViaPoint or str
+        Between begin and end of the skill; text is for :meth:`ViaPoint.parse`.
+    fade : float, default=1.0
+        For how long before and after a via-point the skill is changed [s].
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If a via-point does not fit the skill.
+    """
+
+    def __init__(self, skill: Any, points: Iterable[ViaPoint | str], fade: float = 1.0) -> None:
+        given = [ViaPoint.parse(one) if isinstance(one, str) else one for one in points]
+        for point in given:
+            if not isinstance(point, ViaPoint):
+                raise DataError(f"via-points are ViaPoint objects, got {type(point).__name__}")
+            if not skill.begin <= point.time <= skill.end:
+                raise DataError(
+                    f"the via-point {point} is at {point.time:g} s, but the skill lasts from "
+                    f"{skill.begin:g} to {skill.end:g} s"
+                )
+            references, kinematics = point.operator.references(), skill.kinematics
+            point.operator.check(kinematics, references)
+            if strangers := set(point.operator.links()) - set(kinematics.links):
+                raise UnknownNameError("link", strangers.pop(), "the robot", kinematics.links)
+        self.skill, self.points, self.fade = skill, tuple(given), float(fade)
+        self.conditioning = Conditioning.of(skill, self.points, self.fade)
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Frames of the skill and of the via-points."""
+        links = self.skill.kinematics.links
+        asked = [name for one in self.points for name in one.operator.references()]
+        names = [*self.skill.frame_names, *(name for name in asked if name not in links)]
+        return tuple(dict.fromkeys(names))
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "skill":
+            raise AttributeError(name)
+        return getattr(self.skill, name)
+
+    def estimate(
+        self,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """The skill's estimate, given the via-points; see :meth:`Skill.estimate`."""
+        joints = state.joints if isinstance(state, RobotState) else state
+        shift = self.conditioning.shift
+        if shift is not None and shift.shape != joints.shape:
+            shift = None  # of other robots than those of the last tick
+        free = joints if shift is None else joints - shift
+
+        def attach(bare: RobotState) -> RobotState:
+            """Objects that the robots hold move with their links."""
+            assert isinstance(state, RobotState)
+            return _attached(bare, state)
+
+        holds = attach if isinstance(state, RobotState) and state.carriers is not None else None
+        given: Tensor | RobotState = free
+        if holds is not None:
+            given = holds(self.skill.kinematics.state(free))
+        unconditioned = self.skill.estimate(time, given, frames, bounds)
+        estimate, after = self.conditioning.advance(time, unconditioned, frames, bounds, holds)
+        return ConditionedEstimate(**vars(estimate), conditioning=after)
+
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
+        """Conditioned on the same points; see :meth:`Skill.start`."""
+        return ViaPoints(self.skill.start(joints, frames), self.points, self.fade)
+
+    def advance(self, estimate: Estimate) -> Skill:
+        """Go on from the last conditioned estimate; see :meth:`Skill.advance`."""
+        if not isinstance(estimate, ConditionedEstimate) or estimate.conditioning is None:
+            return self
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), conditioning=estimate.conditioning)
+        return other
+
+    def posture_search(self) -> PostureSearch | None:
+        """The skill's search where no via-point counts; see :meth:`Skill.posture_search`."""
+        # a search would undo what via-points ask for
+        return None if self.conditioning.shift is not None else self.skill.posture_search()
+
+
+def _attached(state: RobotState, like: RobotState) -> RobotState:
+    """A state of the robot alone with the objects of another state, in the same grasps."""
+    assert like.carriers is not None
+    for index, name in enumerate(like.links[len(like.robot_links) :]):
+        pose, carrier = like.pose(name), like.carriers[..., index]
+        state = state.with_link(name, None, pose)
+        for one in carrier.unique().tolist():
+            if one >= 0:
+                link = like.links[one]
+                grasp = pose.seen_from(like.pose(link))
+                state = state.with_link(name, link, grasp, carrier == one)
+    return state
