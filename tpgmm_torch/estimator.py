@@ -1157,7 +1157,9 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 end=float(self.time_[-1]),
                 holds=tuple(self.holds_),
                 motion_bounds=self.motion_bounds() if limited else None,
-                peaks=None if self.jerk_ is None else (as_tensor(self.acceleration_, "peaks"), self.jerk_),
+                peaks=None
+                if self.jerk_ is None
+                else (as_tensor(self.acceleration_, "peaks"), self.jerk_),
                 summary=self.summary_,
             )
             self._prepared = prepared = (key, self.means_, regression)

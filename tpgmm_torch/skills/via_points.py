@@ -93,7 +93,7 @@ class ViaPoints:
             assert isinstance(state, RobotState)
             return _attached(bare, state)
 
-        holds = attach if isinstance(state, RobotState) and state.carriers is not None else None
+        holds = attach if isinstance(state, RobotState) and state.carriers else None
         given: Tensor | RobotState = free
         if holds is not None:
             given = holds(self.skill.kinematics.state(free))
@@ -121,13 +121,14 @@ class ViaPoints:
 
 def _attached(state: RobotState, like: RobotState) -> RobotState:
     """A state of the robot alone with the objects of another state, in the same grasps."""
-    assert like.carriers is not None
-    for index, name in enumerate(like.links[len(like.robot_links) :]):
-        pose, carrier = like.pose(name), like.carriers[..., index]
+    names = like.links[len(like.robot_links) :]
+    for name, carrier in zip(names, like.carriers, strict=True):
+        pose = like.pose(name)
         state = state.with_link(name, None, pose)
-        for one in carrier.unique().tolist():
-            if one >= 0:
-                link = like.links[one]
-                grasp = pose.seen_from(like.pose(link))
-                state = state.with_link(name, link, grasp, carrier == one)
+        each = [carrier] if isinstance(carrier, int) else carrier.unique().tolist()
+        for index in each:
+            if index >= 0:
+                grasp = pose.seen_from(like.pose(like.links[index]))
+                where = None if isinstance(carrier, int) else carrier == index
+                state = state.with_link(name, like.links[index], grasp, where)
     return state

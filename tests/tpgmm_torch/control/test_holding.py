@@ -27,10 +27,12 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators.base import carried_objects
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
 
+CARRIED = carried_objects(operators(), upper_body())
 LATER = Frame([0.5, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0])
 
 
@@ -38,7 +40,7 @@ def begun(*batch: int, holds=(HELD,), seed: int = 3) -> tuple[Holding, torch.Ten
     scene = scenes(max(1, int(np.prod(batch))), seed)
     joints = scene.start if batch else scene.start[0]
     frames = scene.frames if batch else scene[0].frames
-    return Holding.start(upper_body(), operators(), holds, frames), joints
+    return Holding.start(upper_body(), CARRIED, holds, frames), joints
 
 
 def hand(joints, link=HAND):
@@ -145,7 +147,7 @@ def test_noise_does_not_hide_how_a_hand_holds_what_it_lifts(seed):
         bottle = hand(now).compose(grasp) if k >= 100 else place
         error = Frame(noise(3, 1e-3), quaternions.exp(noise(3, 0.009)))
         seen, measured = bottle.compose(error), now + noise(17, 2e-3)
-        inputs = inputs.hear(dt, measured, {"bottle": seen})
+        inputs = inputs.update(dt, measured, {"bottle": seen})
         time = HELD.begin if k > 30 else 0.0
         holding = holding.advance(
             time, inputs.measured, inputs.frames, dt=dt, shares=inputs.shares
@@ -170,7 +172,7 @@ def test_robots_whose_objects_are_seen_late_are_each_as_if_alone():
         random.manual_seed(0)
         first = joints[rows], {n: f[rows] for n, f in start.frames.items()}
         inputs = Inputs(upper_body(), *first, Trust(), OneEuro())
-        holding = Holding.start(upper_body(), operators(), [HELD], first[1])
+        holding = Holding.start(upper_body(), CARRIED, [HELD], first[1])
         for k, now in enumerate(path):
             taken = HELD.begin * (k >= begins).double()
             bottle = Frame.stack(
@@ -181,7 +183,7 @@ def test_robots_whose_objects_are_seen_late_are_each_as_if_alone():
             )
             noise = 1e-3 * torch.randn(3, 3, generator=random, dtype=torch.float64)
             seen = Frame(bottle.position + noise, bottle.orientation)[rows]
-            inputs = inputs.hear(0.01, now[rows], {"bottle": seen})
+            inputs = inputs.update(0.01, now[rows], {"bottle": seen})
             holding = holding.advance(
                 taken[rows], now[rows], inputs.frames, dt=0.01, shares=inputs.shares
             )
@@ -231,7 +233,7 @@ def test_each_robot_of_a_batch_sees_how_it_holds():
     seen = {"bottle": LATER.expand((3,))}
     later = together.advance(HELD.begin, joints + 0.2 * rates, seen)
     for row in range(3):
-        alone = Holding.start(upper_body(), operators(), [HELD], scenes(3, 3)[row].frames)
+        alone = Holding.start(upper_body(), CARRIED, [HELD], scenes(3, 3)[row].frames)
         alone, _ = closing(alone, joints[row], shifts=True, carries=rates[row])
         assert_at(together.held["bottle"].grasp[row], alone.held["bottle"].grasp)
         alone = alone.advance(HELD.begin, joints[row] + 0.2 * rates[row], {"bottle": LATER})
@@ -305,7 +307,7 @@ def test_from_hand_to_hand_what_is_learned_is_what_is_seen_in_control():
     )
     passed = replace(shown, frames={**shown.frames, "bottle": bottle})
     first = {name: f[0] if f.batch_shape else f for name, f in passed.frames.items()}
-    holding = Holding.start(robot, PASSING, HANDS, first)
+    holding = Holding.start(robot, carried_objects(PASSING, robot), HANDS, first)
     learned = [operator.local(passed, robot, HANDS) for operator in PASSING]
     for i, now in enumerate(time.tolist()):
         joints = shown.joints[i]
@@ -366,7 +368,7 @@ def test_robots_at_their_own_times_are_each_as_if_alone():
         holding = holding.advance(ticks[k], path[k], seen[k])
     state = holding.state(upper_body().state(path[3]))
     for row in range(4):
-        alone = Holding.start(upper_body(), operators(), [HELD], scenes(4, 3)[row].frames)
+        alone = Holding.start(upper_body(), CARRIED, [HELD], scenes(4, 3)[row].frames)
         for k in range(4):
             frames = None if seen[k] is None else {n: f[row] for n, f in seen[k].items()}
             alone = alone.advance(float(ticks[k][row]), path[k][row], frames)
@@ -531,7 +533,7 @@ def test_recorded_objects_are_followed_as_they_were_held():
 
 
 def test_objects_that_are_first_seen_on_the_way_are_held_from_then_on():
-    holding = Holding.start(upper_body(), operators(), [HELD], {})
+    holding = Holding.start(upper_body(), CARRIED, [HELD], {})
     _, joints = begun()
     assert holding.advance(1.0, joints).frames == {}
     seen = holding.advance(3.0, joints, {"bottle": LATER})

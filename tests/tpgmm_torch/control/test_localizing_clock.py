@@ -257,7 +257,7 @@ def test_a_robot_that_carries_something_is_localised_with_it():
     """On its way to the tray it is pushed back by a second; the bottle stays in the hand."""
     scene, model = scenes(1, seed=7)[0], carrying_model()
     regression, time = model.regression(), model.time_
-    holding = Holding.start(upper_body(), regression.operators, [HELD], scene.frames)
+    holding = Holding.start(upper_body(), regression.carried_names, [HELD], scene.frames)
     joints = scene.start
     progress = LOCALIZING.start(regression, joints, scene.frames, 0.0, float(time[-1]))
     passed, pushed, estimate, moves = [joints], 0, None, 0
