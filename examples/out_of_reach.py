@@ -21,7 +21,6 @@ import argparse
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -32,7 +31,7 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.clocks import EvenProgress
-from tpgmm_torch.regression.posture import NEGLIGIBLE, _Cost, _descended, _with_means
+from tpgmm_torch.regression.posture import NEGLIGIBLE, PostureCost, descend
 from tpgmm_torch.skills.skill import Skill
 
 #: When the hands are at the bottle, shortly before it is moved [s].
@@ -117,16 +116,27 @@ def distances(
 
     def cost(count: int) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:
         every = index.repeat(count).unsqueeze(-1).expand(-1, len(joints))
-        state = regression.kinematics.state
-        of_each = _Cost(regression, every, time, joints, frames, state)
-        return partial(_with_means, of_each, weights, 0)
+        search, state = regression.posture_search(), regression.kinematics.state
+        of_each = PostureCost(search, every, time, joints, frames, state)
+
+        def mean(postures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            found = of_each(postures.repeat_interleave(len(index), 0))
+            height, vector, precision = (one.unflatten(0, (count, -1)) for one in found)
+            share = weights[..., None]
+            return (
+                (weights * height).sum(1),
+                (share * vector).sum(1),
+                (share[..., None] * precision).sum(1),
+            )
+
+        return mean
 
     generator = torch.Generator().manual_seed(1)
     share = torch.rand(starts, *joints.shape, generator=generator, dtype=torch.float64)
     many = robot.lower + (robot.upper - robot.lower) * share
     damping, looked = torch.zeros(many.shape[:-1], dtype=torch.float64), cost(starts)
     for _ in range(steps):
-        many, damping, height, _ = _descended(looked, many, damping, robot.lower, robot.upper)
+        many, damping, height, _ = descend(looked, many, damping, robot.lower, robot.upper)
     # from where they are, too: nobody is nearer than the nearest
     here = cost(1)(joints.unsqueeze(0))[0][0]
     least = torch.minimum(height.amin(0), here)

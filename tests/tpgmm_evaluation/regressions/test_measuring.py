@@ -74,6 +74,14 @@ def test_golden_references_say_the_same_twice(tmp_path):
     assert once["same:references"].shape[0] == 10
 
 
+def test_sections_find_what_they_measure_with(tmp_path):
+    plan = Plan(tmp_path, small=True, root=ROOT, data=tmp_path)
+    named = ("goldens", "mistakes", "demo", "times", "recordings", "reach")
+    found = {section: [name for name, _ in SECTIONS[section](plan)] for section in named}
+    assert found["recordings"] == [] and found["goldens"] == list(GOLDENS)
+    assert all(found[section] for section in set(named) - {"recordings"})
+
+
 def test_rollouts_are_compared_episode_by_episode(tmp_path, monkeypatch):
     def compare(settings, out, policies, counts, *_):
         for n in counts:
