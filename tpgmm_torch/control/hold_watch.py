@@ -112,7 +112,7 @@ class HoldWatch:
         rests, found, places = dict(self.rests), self.found, dict(frames)
         for name, not_held in free_yet.items():
             if name in found and not bool(not_held.all()):
-                holding = holding.untold(name, ~not_held)
+                holding = holding.ungiven(name, ~not_held)
             if not bool(not_held.any()):  # the skill knows where it is
                 found, names = found - {name}, names - {name}
                 rests.pop(name, None)

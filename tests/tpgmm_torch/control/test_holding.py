@@ -221,7 +221,7 @@ def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
     # once it is carried after all, it is held as it is seen then
     rides, left = ~rides | rides, 0.004 * (~rides[:, None]).double()
     held = looked(looked(held, 0.02, left), 0.1, left)
-    assert held.held["bottle"].stood.position.isinf().all()
+    assert held.held["bottle"].moves_along.all()
     there = hand(elsewhere).compose(seen.seen_from(hand(joints + left)))
     assert_at(held.state(upper_body().state(elsewhere)).pose("bottle"), there)
 
@@ -385,19 +385,19 @@ def test_robots_at_their_own_times_are_each_as_if_alone():
 
 def test_what_is_told_counts_from_then_on_for_those_of_whom_it_is_told():
     holding, joints = begun(2)
-    told = holding.advance(1.0, joints, told={"bottle": RIGHT})
+    told = holding.advance(1.0, joints, given={"bottle": RIGHT})
     assert told.state(upper_body().state(joints)).carrier("bottle") == 1
     grasp = holding.frames["bottle"].seen_from(hand(joints, RIGHT))
-    let_go = told.advance(3.0, joints + 0.1, told={"bottle": None})
+    let_go = told.advance(3.0, joints + 0.1, given={"bottle": None})
     assert_at(let_go.frames["bottle"], hand(joints + 0.1, RIGHT).compose(grasp))
     assert let_go.advance(3.1, joints).held["bottle"].carrier == -1  # whatever the model says
     first = torch.tensor([True, False])
-    mixed = holding.advance(1.0, joints, told={"bottle": RIGHT}, where=first)
+    mixed = holding.advance(1.0, joints, given={"bottle": RIGHT}, where=first)
     assert mixed.held["bottle"].carrier.tolist() == [1, -1]
     later = mixed.advance(3.0, joints)
     assert later.held["bottle"].carrier.tolist() == [1, 0]
     assert later.advance(5.5, joints).held["bottle"].carrier.tolist() == [1, -1]
-    handed = later.advance(3.5, joints + 0.1, told={"bottle": LEFT}, where=first)
+    handed = later.advance(3.5, joints + 0.1, given={"bottle": LEFT}, where=first)
     assert handed.held["bottle"].carrier.tolist() == [0, 0]
     assert torch.equal(handed.frames["bottle"].position, holding.frames["bottle"].position)
     assert_at(
@@ -419,11 +419,11 @@ def test_objects_that_no_link_holds_cost_and_change_nothing():
 def test_names_that_do_not_exist_are_refused():
     holding, joints = begun()
     with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['bottle', 'tray'\]"):
-        holding.advance(1.0, joints, told={"cup": None})
+        holding.advance(1.0, joints, given={"cup": None})
     with pytest.raises(
         UnknownNameError, match=r"link 'tail' is not in .*\['l_hand', 'r_hand'\]"
     ):
-        holding.advance(1.0, joints, told={"bottle": "tail"})
+        holding.advance(1.0, joints, given={"bottle": "tail"})
     with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in"):
         begun(holds=[Hold("cup", HAND)])
     with pytest.raises(DataError, match="twice at once"):
