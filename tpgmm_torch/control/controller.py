@@ -352,10 +352,10 @@ class Controller:
         if self.command is not None and self._trust is not None:
             seconds = np.minimum(seconds, self._trust.longest_step)
         passed = _each(seconds, torch.float64)
-        for robots in (halted, late):
-            if robots is not None:
-                going = torch.as_tensor(passed, dtype=torch.float64)
-                passed = torch.where(robots, 0.0, going)
+        still = [robots for robots in (halted, late) if robots is not None]
+        if still:
+            going = torch.as_tensor(passed, dtype=torch.float64)
+            passed = torch.where(torch.stack(still).any(0), 0.0, going)
         return _Tick(seconds, passed, measured, halted, late)
 
     def _validated(self, joints: Any) -> Tensor | None:
@@ -390,12 +390,7 @@ class Controller:
         )  # fmt: skip
         self._progress = before.advance(tick.passed, observation)
         if measured is not None:
-            if displaced is not None:
-                self._restart_from(measured, displaced)
-                self._displaced = self._displaced | displaced
-            if bool((moved := self._progress.relocalized).any()):
-                self._restart_from(measured, moved)
-                self._displaced = self._displaced & ~moved
+            self._restart_displaced(measured, displaced)
         time = self._progress.time
         if bool((time >= self._end).any()):
             tick.ended = (time >= self._end) & (before.time >= self._end)
@@ -404,6 +399,15 @@ class Controller:
             tick.waits = waits.expand(self._waiting.shape)
             if tick.ended is not None:
                 tick.waits = tick.waits & ~tick.ended
+
+    def _restart_displaced(self, measured: Tensor, displaced: Tensor | None) -> None:
+        """Robots that were displaced, and those whose place was found."""
+        if displaced is not None:
+            self._restart_from(measured, displaced)
+            self._displaced = self._displaced | displaced
+        if bool((moved := self._progress.relocalized).any()):
+            self._restart_from(measured, moved)
+            self._displaced = self._displaced & ~moved
 
     def _restart_from(self, measured: Tensor, robots: Tensor) -> None:
         """References of some robots are where these stand, at rest."""
@@ -435,7 +439,7 @@ class Controller:
             if self._inputs.poses and not told:
                 now = time.expand(stands.shape[:-1])
                 given = self._first_holds.keys() & self._given_holds
-                self._watch, self.holding, frames = self._watch.look(
+                self._watch, self.holding, frames = self._watch.update(
                     self._inputs.poses.keys() - given, self._frames, stands, self.holding,
                     seconds, {n: now < at for n, at in self._first_holds.items()},
                 )  # fmt: skip

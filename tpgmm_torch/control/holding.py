@@ -210,26 +210,23 @@ class Holding:
         if not self.holds and not self.held and not given:
             return self if not seen else replace(self, frames={**self.frames, **seen})
         places, held = {**self.frames, **seen}, dict(self.held)
-        now = torch.as_tensor(time)
         state_now = cache(lambda: self.kinematics.state(joints))
         for name in dict.fromkeys((*(hold.frame for hold in self.holds), *held, *given)):
-            if name in places:
-                before = held.get(name, FREE)
-                if name in seen and before.apart is not None:
-                    before = before.later(joints, shares.get(name))
-                carrier, is_given = self._carrier(name, now, before, given, where)
-                place = self.frames.get(name, places[name])
-                pose = seen.get(name)
-                after, places[name] = self._changed(
-                    name, before, carrier, is_given, place, pose, state_now
-                )
-                if pose is not None and before.taken is not None and before.apart is not None:
-                    live = after.is_held & (carrier == before.carrier)
-                    live = live & ~_same(pose, before.taken)
-                    if bool(live.any()):
-                        after = self._observed(after, pose, live, state_now(), dt)
-                if after is not FREE:
-                    held[name] = after
+            if name not in places:
+                continue
+            before, pose = self.held.get(name, FREE), seen.get(name)
+            if pose is not None and before.apart is not None:
+                before = before.later(joints, shares.get(name))
+            carrier = self._carrier(name, torch.as_tensor(time), before, given, where)
+            place = self.frames.get(name, places[name])
+            after, places[name] = self._changed(name, before, carrier, place, pose, state_now)
+            if pose is not None and before.taken is not None and before.apart is not None:
+                live = after.is_held & (after.carrier == before.carrier)
+                live = live & ~_same(pose, before.taken)
+                if bool(live.any()):
+                    after = self._observed(after, pose, live, state_now(), dt)
+            if after is not FREE:
+                held[name] = after
         same = held.keys() == self.held.keys() and all(held[n] is self.held[n] for n in held)
         return replace(self, frames=places, held=self.held if same else held)
 
@@ -332,13 +329,13 @@ class Holding:
         self,
         name: str,
         before: Held,
-        carrier: Tensor,
-        given: Tensor,
+        now_held: tuple[Tensor, Tensor],
         place: Frame,
         seen: Frame | None,
         state_now: Callable[[], RobotState],
     ) -> tuple[Held, Frame]:
         """An object after its carrier may have changed, and its place."""
+        carrier, given = now_held
         if bool((carrier == before.carrier).all()):
             pose = _unless(before.taken, place if seen is None else seen, place)
             same = given is before.given

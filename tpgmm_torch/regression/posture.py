@@ -182,22 +182,14 @@ class PostureSearch:
         count, index = len(weights), weights.any(-1).nonzero()[:, 0]
         weights = weights[index] / weights.sum(0)
         lower, upper = (bound.expand_as(like)[where] for bound in bounds)
-        # a search begins where the robot stands
-        minima = reference.expand(count + 2, *batch, -1)
-        damping = like.new_zeros(count + 2, *batch)
-        age = torch.zeros(batch, dtype=torch.long, device=like.device)
-        if self.active is not None and self.minima is not None:
-            assert self.damping is not None and self.age is not None
-            minima = torch.where(self.active.unsqueeze(-1), self.minima, minima)
-            damping = torch.where(self.active, self.damping, damping)
-            age = torch.where(self.active, self.age, age)
+        minima, damping, age = self._state(reference, count)
 
         def state(joints: Tensor) -> RobotState:
             if state_at is None:
                 return self.kinematics.state(joints)
             everyone = reference.expand(len(joints), *batch, -1).clone()
-            everyone[(slice(None), *where)] = joints
-            return state_at(everyone)[(slice(None), *where)]
+            everyone[of_all] = joints
+            return state_at(everyone)[of_all]
 
         # rows: a step of the heaviest component from where the robot stands, the components'
         # searches, that of their mean cost, and the same from elsewhere
@@ -226,22 +218,11 @@ class PostureSearch:
             upper,
         )
         found, damped, height = found[1:], damped[1:], height[1:]
-        low = height.gather(0, heaviest)[0]
-        reached, least = low < SLACK, BETTER * height[-2] - SLACK
-        better = (here % LOOK == LOOK - 1) & (height[-1] < least) & ~reached
-        nearest = torch.where(better.unsqueeze(-1), found[-1], found[:-1])
-        # out of reach the components' minima lie apart, and what is between them is none
-        mixed = torch.clamp((weights.unsqueeze(-1) * nearest[:-1]).sum(0), lower, upper)
-        share = torch.clamp(low / SLACK - 1, 0, 1).unsqueeze(-1)
-        sought = torch.lerp(mixed, nearest[-1], share)
-        # how much nearer to its minimum one step of the linearised problem leads; out of
-        # reach, where components of little weight may lead astray, of the whole mixture
-        goal = nearest.gather(0, heaviest.unsqueeze(-1).expand(1, *begun.shape))[0]
-        goal = torch.where(reached.unsqueeze(-1), goal, sought)
-        step = torch.where(reached.unsqueeze(-1), stepped[0], estimate.joints[where])
-        away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
+        asked = begun, stepped[0], estimate.joints[where]
         trust = like.new_ones(batch)
-        trust[where] = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
+        sought, nearest, trust[where] = _nearest(
+            weights, found, height, here, asked, (lower, upper)
+        )
         wanted = like.clone()
         wanted[where] = sought
         # a component that counts only later begins where the others are
@@ -256,6 +237,54 @@ class PostureSearch:
         age = age + 1
         age[where] = torch.where(hopeless, (here // LOOK + 1) * LOOK, age[where])
         return wanted, trust, minima, damping, age
+
+    def _state(self, reference: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Minima, damping and age; a search begins where the robot stands."""
+        batch = reference.shape[:-1]
+        minima = reference.expand(count + 2, *batch, -1)
+        damping = reference.new_zeros(count + 2, *batch)
+        age = torch.zeros(batch, dtype=torch.long, device=reference.device)
+        if self.active is None or self.minima is None:
+            return minima, damping, age
+        assert self.damping is not None and self.age is not None
+        return (
+            torch.where(self.active.unsqueeze(-1), self.minima, minima),
+            torch.where(self.active, self.damping, damping),
+            torch.where(self.active, self.age, age),
+        )
+
+
+def _nearest(
+    weights: Tensor,
+    found: Tensor,
+    height: Tensor,
+    age: Tensor,
+    asked: tuple[Tensor, Tensor, Tensor],
+    bounds: tuple[Tensor, Tensor],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Wanted postures (R, n), minima (S + 1, R, n), and trust in the estimates (R,).
+
+    Of the components' minima, that of their mean cost, and one that was looked for elsewhere;
+    ``asked`` are where robots stand, a step of the heaviest component, and the estimates.
+    """
+    heaviest = weights.argmax(0, keepdim=True)
+    low = height.gather(0, heaviest)[0]
+    reached, least = low < SLACK, BETTER * height[-2] - SLACK
+    better = (age % LOOK == LOOK - 1) & (height[-1] < least) & ~reached
+    nearest = torch.where(better.unsqueeze(-1), found[-1], found[:-1])
+    # out of reach the components' minima lie apart, and what is between them is none
+    mixed = torch.clamp((weights.unsqueeze(-1) * nearest[:-1]).sum(0), *bounds)
+    share = torch.clamp(low / SLACK - 1, 0, 1).unsqueeze(-1)
+    sought = torch.lerp(mixed, nearest[-1], share)
+    # how much nearer to its minimum one step of the linearised problem leads; out of
+    # reach, where components of little weight may lead astray, of the whole mixture
+    begun, stepped, estimates = asked
+    goal = nearest.gather(0, heaviest.unsqueeze(-1).expand(1, *begun.shape))[0]
+    goal = torch.where(reached.unsqueeze(-1), goal, sought)
+    step = torch.where(reached.unsqueeze(-1), stepped, estimates)
+    away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
+    trust = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
+    return sought, nearest, trust
 
 
 def _with_means(
