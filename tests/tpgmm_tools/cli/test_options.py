@@ -31,19 +31,33 @@ def test_options_follow_signature_and_docstring():
     app, given = typer.Typer(), {}
 
     @options.command(app, "tpgmm made", options.options_of(Made, "Made", {"other"}))
-    def made(data: options.DataOptions, **settings):
-        given.update(settings, rate=data.rate, frames=data.frame)
+    def made(place, *, data: options.DataOptions, count_: int = 2, **settings):
+        """Make one.
+
+        Parameters
+        ----------
+        place : ``DIR``
+            Where.
+        count_ : int >= 1
+            How many.
+        """
+        given.update(settings, place=place, count=count_, rate=data.rate, frames=data.frame)
 
     def run(*arguments):
         return CliRunner().invoke(app, arguments)
 
-    assert run("--share", "1e-3", "--kind", "auto", "--strict", "--frame", "a").exit_code == 0
+    assert run("out", "--share", "1e-3", "--kind", "auto", "--strict").exit_code == 0
     assert given == {
-        "share": 0.001, "kind": "auto", "strict": True, "rate": None, "frames": ["a"],
+        "share": 0.001, "kind": "auto", "strict": True, "rate": None, "frames": None,
+        "place": "out", "count": 2,
     }  # fmt: skip
+    assert run("out", "--frame", "a", "--frame", "b", "--count", "3").exit_code == 0
+    assert (given["frames"], given["count"], given["share"]) == (["a", "b"], 3, 0.5)
+    assert run("out", "--count", "0").exit_code == 2
     text = " ".join(run("--help").output.replace("│", " ").split())
     assert "How much, see tpgmm.other. [default: 0.5]" in text
     assert "Of both kinds [m]." in text and "--other" not in text
+    assert "Make one." in text and "{DIR}" in text and "Parameters" not in text
 
 
 @pytest.mark.parametrize(

@@ -27,24 +27,15 @@ def demo(tmp_path_factory):
 
 
 def test_view_shows_what_the_demo_wrote(demo):
-    text = output("view", demo, "--fps", 2, "--situation", 1)
+    arguments = "--situation", 1, "--situation", 0, "--object", "bottle=sphere:0.07"
+    text = output("view", demo, "--fps", 2, *arguments)
     page = demo.parent / f"{demo.name}.html"
     assert re.fullmatch(r"[\d.]+ s of motion, [\d.]+ MB, in (.*)\n", text)[1] == str(page)
     recording = Recording(page)
-    assert f"{demo.name}, situation 1" in recording.page
-    bottle = skills.generator().demonstrations(2)[1].frames["bottle"]
-    np.testing.assert_allclose(
-        recording.pose("/frames/bottle", 0)[:3], bottle.position, atol=1e-6
-    )
-
-
-def test_view_shows_situations_side_by_side_and_objects(demo, tmp_path):
-    out = tmp_path / "m.html"
-    arguments = "--situation", 0, "--situation", 1, "--object", "bottle=sphere:0.07"
-    output("view", demo, "--fps", 1, *arguments, "--out", out)
-    recording = Recording(out)
-    assert "situation 0, 1" in recording.page
-    for root in ("", "/1"):
+    assert f"{demo.name}, situation 1, 0" in recording.page
+    for root, one in zip(("/1", ""), skills.generator().demonstrations(2), strict=True):
+        bottle = recording.pose(f"{root}/frames/bottle", 0)[:3]
+        np.testing.assert_allclose(bottle, one.frames["bottle"].position, atol=1e-6)
         assert recording.props(f"{root}/frames/bottle/shape")["radius"] == 0.07
 
 

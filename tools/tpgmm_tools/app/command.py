@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -21,7 +21,6 @@ app = typer.Typer(add_completion=False)
 LARGEST = "500mb"
 #: What the browser has; gradio's own would be fetched from elsewhere.
 FONTS = ("ui-sans-serif", "system-ui", "sans-serif")
-serving = options.in_panel("Serving")
 EXAMPLE = (
     "tpgmm app\n\n"
     "Example: tpgmm app out/demo/dataset --robot upper_body --link l_hand --link r_hand"
@@ -30,25 +29,26 @@ EXAMPLE = (
 
 @options.command(app, EXAMPLE)
 def page(
+    dataset: str | None = None,
+    *,
     described: options.RobotOptions,
     data: options.DataOptions,
-    dataset: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="DATASET",
-            help="A LeRobot data set that is offered beside the generated one; others can be "
-            "uploaded.",
-        ),
-    ] = None,
-    host: Annotated[
-        str, serving("Address to listen on; who reaches it can have anything learned.")
-    ] = "127.0.0.1",
-    port: Annotated[int, serving("Port; 0 for any that is free.", min=0, max=65535)] = 7860,
+    host: str = "127.0.0.1",
+    port: int = 7860,
 ) -> None:
     """Learn and look in the browser: a data set in, a moving picture out.
 
     Serves a page on which recordings are chosen or uploaded, learned, and reproduced with
     objects elsewhere; what is implausible is said in words. Needs the extra 'app'.
+
+    Parameters
+    ----------
+    dataset : ``DATASET``
+        A LeRobot data set that is offered beside the generated one; others can be uploaded.
+    host : str
+        Address to listen on; who reaches it can have anything learned.
+    port : int >= 0
+        Port; 0 for any that is free.
     """
     import torch
 

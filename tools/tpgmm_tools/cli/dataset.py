@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -24,16 +24,20 @@ app = typer.Typer(
     add_completion=False,
 )
 
-Target = Annotated[Path, typer.Argument(help="Folder of the set to write.")]
-Append = Annotated[
-    bool, typer.Option("--append", help="Add the episodes to the set in PATH, if there is one.")
-]
 CONVERT = "tpgmm dataset convert recordings/arm out/arm --units deg --rate 30"
 
 
 @options.command(app, "tpgmm dataset info out/demo/dataset")
-def info(path: options.Dataset) -> None:
-    """Print what a data set holds: features, names, units and ranges, episodes, problems."""
+def info(
+    path: str,
+) -> None:
+    """Print what a data set holds: features, names, units and ranges, episodes, problems.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    """
     from tpgmm_datasets.description import describe_lerobot
     from tpgmm_datasets.errors import summed_up
     from tpgmm_torch.notebook import in_columns
@@ -50,17 +54,23 @@ def info(path: options.Dataset) -> None:
 
 @options.command(app, "tpgmm dataset check arm --robot arm.urdf && tpgmm fit ...")
 def check(
-    path: options.Dataset,
+    path: str,
+    *,
     described: options.RobotOptions,
     data: options.DataOptions,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Fail for what is only unlikely, too.")
-    ] = False,
+    strict: bool = False,
 ) -> None:
     """List all problems of a data set, and what is implausible in it.
 
     The exit code is 1 if there are problems or something cannot be: values beyond any limit of
     the robot, for example. What is unlikely is listed; with --strict it fails too.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    strict : bool
+        Fail for what is only unlikely, too.
     """
     from tpgmm_datasets.description import describe_lerobot
     from tpgmm_datasets.errors import (
@@ -103,11 +113,20 @@ def check(
 
 @options.command(app, "tpgmm dataset plot out/demo/dataset --out out/dataset.png")
 def plot(
-    path: options.Dataset,
-    out: Annotated[Path, typer.Option(metavar="FILE.png", help="Where the picture goes.")],
+    path: str,
+    *,
+    out: Path,
     data: options.DataOptions,
 ) -> None:
-    """Draw the joints and the positions of the frames over time, a line per episode."""
+    """Draw the joints and the positions of the frames over time, a line per episode.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    out : ``FILE.png``
+        Where the picture goes.
+    """
     import numpy as np
 
     from tpgmm_tools.plotting import figure, save
@@ -135,22 +154,31 @@ def plot(
 
 @options.command(app, "tpgmm dataset generate out/shake --n-demonstrations 20")
 def generate(
-    path: Target,
-    n_demonstrations: Annotated[int, typer.Option(min=1, help="How many episodes.")] = 10,
-    random_state: Annotated[
-        int, typer.Option(min=0, help="Seed; appended episodes differ if it does.")
-    ] = 0,
-    rate: Annotated[int, typer.Option(min=1, help="Time steps per second.")] = 100,
-    steady_rhythm: Annotated[
-        bool,
-        typer.Option(
-            "--steady-rhythm",
-            help="Shake equally fast in all, as the environment 'bottle_shaking' asks.",
-        ),
-    ] = False,
-    append: Append = False,
+    path: Path,
+    *,
+    n_demonstrations: int = 10,
+    random_state: int = 0,
+    rate: int = 100,
+    steady_rhythm: bool = False,
+    append: bool = False,
 ) -> None:
-    """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'."""
+    """Write generated demonstrations of shaking a bottle with two hands, as in 'tpgmm demo'.
+
+    Parameters
+    ----------
+    path : Path
+        Folder of the set to write.
+    n_demonstrations : int >= 1
+        How many episodes.
+    random_state : int >= 0
+        Seed; appended episodes differ if it does.
+    rate : int >= 1
+        Time steps per second.
+    steady_rhythm : bool
+        Shake equally fast in all, as the environment 'bottle_shaking' asks.
+    append : bool
+        Add the episodes to the set in PATH, if there is one.
+    """
     from tpgmm_datasets.bottle.skill import TASK, BottleShaking
     from tpgmm_datasets.errors import DatasetError
 
@@ -163,20 +191,30 @@ def generate(
 
 @options.command(app, CONVERT)
 def convert(
-    source: options.Dataset,
-    path: Target,
+    source: str,
+    path: Path,
+    *,
     described: options.RobotOptions,
     data: options.DataOptions,
-    append: Append = False,
-    task: Annotated[
-        str | None, typer.Option(help="What is done, for all. Default: each episode's own.")
-    ] = None,
+    append: bool = False,
+    task: str | None = None,
 ) -> None:
-    """Write a data set anew: layout v3.0, joints in radians, episodes and joints as chosen.
+    """Write a converted data set: layout v3.0, joints in radians, some episodes or joints.
 
     Reads any set that the other commands read, v2.1 too. Joints, actions,
     frames and events are kept, as float32; where there are no actions of the
     same joints they become the next joint state. Pictures stay behind.
+
+    Parameters
+    ----------
+    source : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    path : Path
+        Folder of the set to write.
+    append : bool
+        Add the episodes to the set in PATH, if there is one.
+    task : str
+        What is done, for all. Default: each episode's own.
     """
     from tpgmm_datasets.conversion.timing import resample
     from tpgmm_datasets.reader import open_recording

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
+
+from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -33,28 +35,36 @@ CAPTION = (
 ORIENTATION = "grasp orientation error [deg]"
 
 
-@app.command(epilog="Example: tpgmm demo --out out/demo --n-components 20")
+@options.command(app, "tpgmm demo --out out/demo --n-components 20")
 def demo(
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where data set, model and figures go.")
-    ] = Path("out/demo"),
-    n_components: Annotated[int, typer.Option(min=1, help="K, the number of Gaussians.")] = 30,
-    n_demonstrations: Annotated[
-        int, typer.Option(min=1, help="Demonstrations to learn from.")
-    ] = 10,
-    n_situations: Annotated[
-        int, typer.Option(min=1, help="Bottle poses and start postures to reproduce for.")
-    ] = 50,
-    random_state: Annotated[int, typer.Option(min=0, help="Seed of all that is random.")] = 0,
-    rate: Annotated[
-        int, typer.Option(min=1, help="Time steps per second; fewer are quicker and coarser.")
-    ] = 100,
+    *,
+    out: Path = Path("out/demo"),
+    n_components: int = 30,
+    n_demonstrations: int = 10,
+    n_situations: int = 50,
+    random_state: int = 0,
+    rate: int = 100,
 ) -> None:
     """Run the paper's experiment: ten demonstrations of shaking a bottle with two hands.
 
     Generates demonstrations, writes them as a LeRobot data set and reads it back, aligns and
     learns them, reproduces the skill for bottle poses never seen, measures how well, and draws
     the paper's figures 3 to 6.
+
+    Parameters
+    ----------
+    out : ``DIR``
+        Where data set, model and figures go.
+    n_components : int >= 1
+        K, the number of Gaussians.
+    n_demonstrations : int >= 1
+        Demonstrations to learn from.
+    n_situations : int >= 1
+        Bottle poses and start postures to reproduce for.
+    random_state : int >= 0
+        Seed of all that is random.
+    rate : int >= 1
+        Time steps per second; fewer are quicker and coarser.
     """
     import torch
     from rich.console import Console

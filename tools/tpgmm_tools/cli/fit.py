@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 import typer
 
@@ -30,7 +30,6 @@ EXAMPLE = (
     "tpgmm fit out/demo/dataset --robot upper_body --link l_hand --link r_hand --frame bottle "
     "--n-components 30 --out out/model"
 )
-learning = options.in_panel("Learning")
 #: Parameters of the model that have an option below, or none.
 OTHERS = (
     "n_components", "operators", "robot", "parts", "holds", "operator_weights", "plausibility",
@@ -41,79 +40,21 @@ SETTINGS = options.options_of(TaskParameterizedGMM, "Learning", OTHERS)
 
 @options.command(app, EXAMPLE, SETTINGS)
 def fit(
-    dataset: options.Dataset,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the model goes.")],
+    dataset: str,
+    *,
+    out: Path,
     described: options.RobotOptions,
     data: options.DataOptions,
-    output_format: Annotated[
-        str,
-        typer.Option(
-            "--format",
-            metavar="tpgmm | lerobot",
-            help="'tpgmm' for Python and the other commands here; 'lerobot' for a policy that "
-            "lerobot-eval and lerobot-rollout take, if lerobot_policy_tpgmm is installed.",
-        ),
-    ] = OWN,
-    plausibility: options.Plausibility = "warn",
-    alignment: options.AlignmentMethod = "dtw",
-    batch_episodes: Annotated[
-        int | None,
-        options.of_data(
-            "For sets larger than memory: read so many episodes at a time. The first N "
-            "decide on the common clock. Default: all at once.",
-            min=1,
-            metavar="N",
-        ),
-    ] = None,
-    operator: Annotated[
-        list[str] | None,
-        learning(
-            "What is learned together, repeatable: 'canonical' (the joints), "
-            "'position:LINK@FRAME', 'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), "
-            "without @FRAME in the base frame; FRAME may be another link, or held:FRAME an "
-            "object as it is carried, which LINK may be too; 'canonical:left_*' some joints; "
-            "'+' stacks. 'auto' finds what matters and says why. "
-            "Default: the poses of all links in all frames, stacked, and canonical."
-        ),
-    ] = None,
-    hold: Annotated[
-        list[str] | None,
-        learning(
-            "When a link holds an object, repeatable: FRAME@LINK:BEGIN-END in seconds, as in "
-            "'bottle@l_hand:4.3-' to the end; or 'none'. Default: found in episodes whose "
-            "frames were recorded over time."
-        ),
-    ] = None,
-    n_components: Annotated[
-        Any,
-        learning(
-            "K, the number of Gaussians; 'auto' finds it by the likelihood of episodes that "
-            "are left out.",
-            parser=options.value,
-            metavar="auto | INTEGER",
-        ),
-    ] = 10,
-    parts: Annotated[
-        str | None,
-        learning(
-            "Where the skill has parts that are learned one by one, each with its share of "
-            "--n-components and, with --operator auto, what matters in it: 'auto' finds and "
-            "explains them; or when they end, as seconds and events joined by commas. "
-            "See --alignment parts.",
-            metavar="auto | 4.2,8.1 | grasp,rest",
-        ),
-    ] = None,
-    modes: Annotated[
-        Any,
-        learning(
-            "In how many ways the skill is done, each a model of its own; 'auto' finds it. "
-            "'tpgmm reproduce' takes several as a whole, all else one of them, DIR/mode_0; a "
-            "policy holds them all.",
-            parser=options.value,
-            metavar="auto | INTEGER",
-        ),
-    ] = 1,
-    random_state: Annotated[int, learning("Seed of what is random.")] = 0,
+    format_: str = OWN,
+    plausibility: Literal["warn", "error", "ignore"] = "warn",
+    alignment: options.Alignments = "dtw",
+    batch_episodes: int | None = None,
+    operator: list[str] | None = None,
+    hold: list[str] | None = None,
+    n_components: Any = 10,
+    parts: str | None = None,
+    modes: Any = 1,
+    random_state: int = 0,
     **settings: Any,
 ) -> None:
     """Learn a skill from a LeRobot data set.
@@ -122,8 +63,51 @@ def fit(
     and learned as one Gaussian mixture over all of them. The model is a folder of JSON and
     safetensors that 'tpgmm reproduce' and 'tpgmm plot' take. Several processes learn together
     under torchrun.
+
+    Parameters
+    ----------
+    dataset : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    out : ``DIR``
+        Where the model goes.
+    format_ : ``tpgmm | lerobot``
+        'tpgmm' for Python and the other commands here; 'lerobot' for a policy that lerobot-eval
+        and lerobot-rollout take, if lerobot_policy_tpgmm is installed.
+    plausibility : str
+        What is done about recordings that are unlikely to be what they are taken for: units,
+        order, clock, outliers.
+    alignment : str
+        Bring episodes onto one clock: by time warping onto the most typical one, onto their
+        average, by stretching time, by stretching it between events, by warping it between
+        events, by stretching each of the parts that are found, or not at all.
+    batch_episodes : int >= 1
+        For sets larger than memory: read so many episodes at a time. The first decide on the
+        common clock. Default: all at once.
+    operator : str
+        What is learned together, repeatable: 'canonical' (the joints), 'position:LINK@FRAME',
+        'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), without @FRAME in the base frame;
+        FRAME may be another link, or held:FRAME an object as it is carried, which LINK may be
+        too; 'canonical:left_*' some joints; '+' stacks. 'auto' finds what matters and says why.
+        Default: the poses of all links in all frames, stacked, and canonical.
+    hold : str
+        When a link holds an object, repeatable: FRAME@LINK:BEGIN-END in seconds, as in
+        'bottle@l_hand:4.3-' to the end; or 'none'. Default: found in episodes whose frames were
+        recorded over time.
+    n_components : ``auto | INTEGER``
+        K, the number of Gaussians; 'auto' finds it by the likelihood of episodes that are left
+        out.
+    parts : ``auto | 4.2,8.1 | grasp,rest``
+        Where the skill has parts that are learned one by one, each with its share of
+        --n-components and, with --operator auto, what matters in it: 'auto' finds and explains
+        them; or when they end, as seconds and events joined by commas. See --alignment parts.
+    modes : ``auto | INTEGER``
+        In how many ways the skill is done, each a model of its own; 'auto' finds it. 'tpgmm
+        reproduce' takes several as a whole, all else one of them, DIR/mode_0; a policy holds
+        them all.
+    random_state : int
+        Seed of what is random.
     """
-    write = model_format(output_format)
+    write = model_format(format_)
     if modes != 1 and batch_episodes is not None:
         raise DataError("--modes compares all episodes: it goes without --batch-episodes")
     options.filter_plausibility(plausibility)

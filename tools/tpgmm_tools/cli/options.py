@@ -1,16 +1,16 @@
-"""Options that several commands share, in groups, and options made from a signature."""
+"""Options made from signatures and docstrings, in groups that several commands share."""
 
 from __future__ import annotations
 
 import ast
 import re
 import warnings
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from inspect import Parameter, getdoc, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,113 +22,52 @@ if TYPE_CHECKING:
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "DataOptions", "RobotOptions", "align", "aligner", "command", "in_panel", "load",
+    "Alignments", "DataOptions", "RobotOptions", "align", "aligner", "command", "load",
     "options_of", "wanted",
 ]  # fmt: skip
 
-
-def in_panel(panel: str) -> Callable[..., Any]:
-    """A ``typer.Option`` that is shown in a panel of the help; its text comes first.
-
-    Parameters
-    ----------
-    panel : str
-        The heading.
-    """
-
-    def option(text: str, *names: str, **settings: Any) -> Any:
-        return typer.Option(*names, help=text, rich_help_panel=panel, **settings)
-
-    return option
-
-
-of_data, of_robot = in_panel("Data set"), in_panel("Robot")
-
-#: Those that come with the package.
+#: Robots that come with the package.
 ROBOTS = ("so101", "upper_body")
-
-Dataset = Annotated[
-    str, typer.Argument(help="A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.")
-]
-Model = Annotated[Path, typer.Argument(metavar="DIR", help="A model that 'tpgmm fit' saved.")]
-Situations = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE.json",
-        help="Situations, start postures and frames, instead of those of a data set.",
-    ),
-]
-Plausibility = Annotated[
-    Literal["warn", "error", "ignore"],
-    of_data(
-        "What is done about recordings that are unlikely to be what they are taken for: "
-        "units, order, clock, outliers."
-    ),
-]
-AlignmentMethod = Annotated[
-    Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"],
-    of_data(
-        "Bring episodes onto one clock: by time warping onto the most typical one, onto "
-        "their average, by stretching time, by stretching it between events, by warping it "
-        "between events, by stretching each of the parts that are found, or not at all."
-    ),
-]
+Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
 @dataclass(frozen=True)
 class DataOptions:
-    """Options that describe what is read of a LeRobot data set."""
+    """Data set.
 
-    frame: Annotated[
-        list[str] | None,
-        of_data(
-            "An object's pose, repeatable: NAME (found by the names in "
-            "observation.environment_state), NAME=FEATURE, NAME=FEATURE\\[7:14], or "
-            "NAME=LINK@EVENT, where a link of the robot is at an event: one of the set, of "
-            "--event, 'close', 'open' or 'stop' of that link, 'start' or 'end'. Default: all "
-            "poses that the set names.",
-            metavar="NAME[=SOURCE]",
-        ),
-    ] = None
-    event: Annotated[
-        list[str] | None,
-        of_data(
-            "How an event is found, repeatable: NAME=closing:SIGNALS or opening:SIGNALS (when "
-            "a gripper's are low), contact: or release:SIGNALS (high), moving:FRAME, "
-            "stop:LINK; SIGNALS are names or patterns of joints, joined by commas.",
-            metavar="NAME=HOW",
-        ),
-    ] = None
-    episodes: Annotated[
-        str | None, of_data("Which episodes; default all.", metavar="0:10 | 0,3,5 | TASK")
-    ] = None
-    units: Annotated[
-        list[str] | None,
-        of_data(
-            "Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them, "
-            "repeatable. FILE.json is LeRobot's calibration, with PREFIX= of one arm. Default: "
-            "as the set declares.",
-            metavar="[JOINT=]UNIT",
-        ),
-    ] = None
-    joints: Annotated[
-        str | None,
-        of_data(
-            "The feature that holds the joints, or 'measured' or 'commanded'; default "
-            "observation.state or the like.",
-            metavar="FEATURE",
-        ),
-    ] = None
-    joint_name: Annotated[
-        list[str] | None,
-        of_data(
-            "The robot's name of a stored joint, repeatable, where the names differ.",
-            metavar="STORED=JOINT",
-        ),
-    ] = None
-    rate: Annotated[
-        float | None, of_data("Resample to so many steps per second.", min=1e-3)
-    ] = None
+    Parameters
+    ----------
+    frame : ``NAME[=SOURCE]``
+        An object's pose, repeatable: NAME (found by the names in
+        observation.environment_state), NAME=FEATURE, NAME=FEATURE[7:14], or NAME=LINK@EVENT,
+        where a link of the robot is at an event: one of the set, of --event, 'close', 'open'
+        or 'stop' of that link, 'start' or 'end'. Default: all poses that the set names.
+    event : ``NAME=HOW``
+        How an event is found, repeatable: NAME=closing:SIGNALS or opening:SIGNALS (when a
+        gripper's are low), contact: or release:SIGNALS (high), moving:FRAME, stop:LINK;
+        SIGNALS are names or patterns of joints, joined by commas.
+    episodes : ``0:10 | 0,3,5 | TASK``
+        Which episodes; default all.
+    units : ``[JOINT=]UNIT``
+        Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them,
+        repeatable. FILE.json is LeRobot's calibration, with PREFIX= of one arm. Default: as
+        the set declares.
+    joints : ``FEATURE``
+        The feature that holds the joints, or 'measured' or 'commanded'; default
+        observation.state or the like.
+    joint_name : ``STORED=JOINT``
+        The robot's name of a stored joint, repeatable, where the names differ.
+    rate : float >= 0.001
+        Resample to so many steps per second.
+    """
+
+    frame: list[str] | None = None
+    event: list[str] | None = None
+    episodes: str | None = None
+    units: list[str] | None = None
+    joints: str | None = None
+    joint_name: list[str] | None = None
+    rate: float | None = None
 
     def arguments(self, robot: Kinematics | None = None) -> dict[str, Any]:
         """Keyword arguments of :func:`tpgmm_datasets.load_lerobot`, ``robot`` among them.
@@ -160,41 +99,28 @@ class DataOptions:
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """Options that describe a robot."""
+    """Robot.
 
-    robot: Annotated[
-        str | None,
-        of_robot(
-            "The robot's URDF or MJCF file; 'upper_body' and 'so101' come with the package. "
-            "Without a robot, joints alone.",
-            metavar="FILE",
-        ),
-    ] = None
-    link: Annotated[list[str] | None, of_robot("A link of interest (a hand), repeatable.")] = (
-        None
-    )
-    robot_joint: Annotated[
-        list[str] | None,
-        of_robot(
-            "Joints that move, repeatable, like 'left_*'; the others stand still. Default: "
-            "all.",
-            metavar="PATTERN",
-        ),
-    ] = None
-    coordinate: Annotated[
-        list[str] | None,
-        of_robot(
-            "A value that is learned like a joint but moves no link (a gripper), repeatable.",
-            metavar="NAME",
-        ),
-    ] = None
-    poses: Annotated[
-        list[str] | None,
-        of_robot(
-            "Instead of a robot: a tracked body whose pose the data set holds, repeatable.",
-            metavar="NAME",
-        ),
-    ] = None
+    Parameters
+    ----------
+    robot : ``FILE``
+        The robot's URDF or MJCF file; 'upper_body' and 'so101' come with the package. Without
+        a robot, joints alone.
+    link : str
+        A link of interest (a hand), repeatable.
+    robot_joint : ``PATTERN``
+        Joints that move, repeatable, like 'left_*'; the others stand still. Default: all.
+    coordinate : ``NAME``
+        A value that is learned like a joint but moves no link (a gripper), repeatable.
+    poses : ``NAME``
+        Instead of a robot: a tracked body whose pose the data set holds, repeatable.
+    """
+
+    robot: str | None = None
+    link: list[str] | None = None
+    robot_joint: list[str] | None = None
+    coordinate: list[str] | None = None
+    poses: list[str] | None = None
 
     def read(self) -> Kinematics | None:
         """The robot, or tracked poses; None for joints alone.
@@ -240,12 +166,13 @@ def filter_plausibility(action: str) -> None:
 
 
 def command(
-    app: typer.Typer, example: str, generated: Collection[Parameter] = ()
+    app: typer.Typer, example: str, generated: Iterable[Parameter] = ()
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that adds a function to an app as a command.
 
-    A parameter whose type is a group of options (:class:`DataOptions`, ...) stands for all
-    options of the group, and ``**settings`` for the ``generated`` ones.
+    Positional parameters are arguments, others options, explained by the function's docstring.
+    A parameter whose type is a group of options (:class:`DataOptions`, ...) stands for all of
+    them, and ``**settings`` for the ``generated`` ones.
 
     Parameters
     ----------
@@ -253,33 +180,31 @@ def command(
         Where it is added.
     example : str
         Shown below the help, after "Example: ".
-    generated : collection of inspect.Parameter
+    generated : iterable of inspect.Parameter
         As :func:`options_of` makes them.
     """
 
     def add(function: Callable[..., Any]) -> Callable[..., Any]:
-        parameters, groups = list[Parameter](), dict[str, Any]()
+        parameters, groups = list[Parameter](), dict[str, tuple[Any, list[Parameter]]]()
+        entries = _entries(function)
         for one in signature(function, eval_str=True).parameters.values():
             if one.kind is Parameter.VAR_KEYWORD:
                 parameters += generated
-            elif is_dataclass(one.annotation):
-                groups[one.name] = one.annotation
-                hints = get_type_hints(one.annotation, include_extras=True)
-                parameters += [
-                    Parameter(
-                        f.name, one.KEYWORD_ONLY, default=f.default, annotation=hints[f.name]
-                    )
-                    for f in fields(one.annotation)
-                ]
+            elif is_dataclass(group := one.annotation) and isinstance(group, type):
+                panel = (group.__doc__ or "").partition(".")[0]
+                groups[one.name] = group, options_of(group, panel)
+                parameters += groups[one.name][1]
             else:
-                parameters.append(one.replace(kind=one.KEYWORD_ONLY))
+                parameters.append(_option(one, *entries[one.name]))
 
         @wraps(function)
         def run(**given: Any) -> Any:
-            for name, group in groups.items():
-                given[name] = group(**{f.name: given.pop(f.name) for f in fields(group)})
+            for name, (group, members) in groups.items():
+                given[name] = group(**{each.name: given.pop(each.name) for each in members})
             return function(**given)
 
+        text = (getdoc(function) or "").partition("Parameters\n---")[0]
+        run.__doc__ = re.sub(r"(?<!\n)\n(?!\n)", " ", text)
         run.__signature__ = signature(function).replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
         app.command(epilog=f"Example: {example}")(run)
@@ -288,8 +213,11 @@ def command(
     return add
 
 
-def options_of(made: type, panel: str, without: Collection[str]) -> list[Parameter]:
-    """Options for the parameters of a class, explained as in its docstring.
+def options_of(made: type, panel: str, without: Collection[str] = ()) -> list[Parameter]:
+    """Options for the parameters of a class, explained by its docstring.
+
+    Of long explanations of a model's parameters the first sentence is shown, and their values
+    are read as :func:`value` does.
 
     Parameters
     ----------
@@ -300,20 +228,51 @@ def options_of(made: type, panel: str, without: Collection[str]) -> list[Paramet
     without : collection of str
         Parameters that get none.
     """
-    entries = re.findall(
-        r"^([\w, ]+) : .*\n((?: .+\n|\n(?= ))+)", getdoc(made) or "", re.MULTILINE
-    )
-    texts = {name: text for names, text in entries for name in names.split(", ")}
-    options, found = in_panel(panel), []
-    for one in signature(made).parameters.values():
-        if one.name not in without:
-            sentence = re.split(r"(?<=\.)\s", " ".join(texts.get(one.name, "").split()))[0]
-            text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", sentence).replace("[", "\\[")
+    entries, found = _entries(made), list[Parameter]()
+    for one in signature(made, eval_str=is_dataclass(made)).parameters.values():
+        if one.name in without:
+            continue
+        kind, text = entries.get(one.name, ("", ""))
+        one = one.replace(kind=Parameter.KEYWORD_ONLY)
+        if not is_dataclass(made):
             flag = isinstance(one.default, bool)
-            settings: dict[str, Any] = {} if flag else {"parser": value, "metavar": "VALUE"}
-            kind: Any = Annotated[bool if flag else Any, options(text, **settings)]
-            found.append(one.replace(kind=one.KEYWORD_ONLY, annotation=kind))
+            one = one.replace(annotation=bool if flag else Any)
+            kind, text = "" if flag else "``VALUE``", re.split(r"(?<=\.)\s", text)[0]
+        found.append(_option(one, kind, text, panel))
     return found
+
+
+def _entries(documented: Any) -> dict[str, tuple[str, str]]:
+    """Type and text of each parameter in a numpydoc docstring."""
+    pattern = r"^([\w, ]+) : (.*)\n((?: .+\n?|\n(?= ))*)"
+    found = re.findall(pattern, getdoc(documented) or "", re.MULTILINE)
+    return {
+        name: (kind, " ".join(text.split()))
+        for names, kind, text in found
+        for name in names.split(", ")
+    }
+
+
+def _option(one: Parameter, kind: str, text: str, panel: str | None = None) -> Parameter:
+    """A parameter with what typer must know: ``X`` in its type is shown as its value."""
+    text = re.sub(r"(?::\w+:)?`+~?([^`]+)`+", r"\1", text).replace("[", "\\[")
+    settings: dict[str, Any] = {"help": text, "rich_help_panel": panel}
+    if shown := re.search("``(.+)``", kind):
+        settings["metavar"] = shown[1]
+    if least := re.search(r">= (\S+)", kind):
+        settings["min"] = type(one.default or 0.5)(float(least[1]))
+    if one.annotation is Any:
+        settings["parser"] = value
+    name = one.name.rstrip("_").replace("_", "-")
+    negation = f"/--no-{name}" if one.default is True else ""
+    argument = one.kind is not Parameter.KEYWORD_ONLY
+    info = (
+        typer.Argument(**settings)
+        if argument
+        else typer.Option(f"--{name}{negation}", **settings)
+    )
+    annotation: Any = Annotated[one.annotation, info]
+    return one.replace(kind=Parameter.KEYWORD_ONLY, annotation=annotation)
 
 
 def value(text: Any) -> Any:

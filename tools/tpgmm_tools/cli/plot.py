@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
@@ -23,26 +23,34 @@ EXAMPLE = "tpgmm plot out/model --dataset out/demo/dataset --joint l_elbow --out
 
 @options.command(app, EXAMPLE)
 def plot(
-    model: options.Model,
-    dataset: Annotated[
-        str, typer.Option(help="A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the pictures go.")],
+    model: Path,
+    *,
+    dataset: str,
+    out: Path,
     data: options.DataOptions,
-    joint: Annotated[
-        list[str] | None,
-        typer.Option(help="Also draw each operator's estimate of this joint; repeatable."),
-    ] = None,
-    form: Annotated[
-        Literal["png", "pdf", "svg"],
-        typer.Option("--format", help="Pixels, or vectors for print."),
-    ] = "png",
-    alignment: options.AlignmentMethod = "dtw",
+    joint: list[str] | None = None,
+    format_: Literal["png", "pdf", "svg"] = "png",
+    alignment: options.Alignments = "dtw",
 ) -> None:
     """Draw a fitted model.
 
     For every operator a picture of its coordinates over time: the demonstrations (black), the
     components (green), and the reproduction in the situation of the first episode (orange).
+
+    Parameters
+    ----------
+    model : ``DIR``
+        A model that 'tpgmm fit' saved.
+    dataset : str
+        A LeRobot data set: its folder, or hf://datasets/OWNER/NAME.
+    out : ``FOLDER``
+        Where the pictures go.
+    joint : str
+        Also draw each operator's estimate of this joint; repeatable.
+    format_ : str
+        Pixels, or vectors for print.
+    alignment : str
+        How episodes are brought onto one clock, as for 'tpgmm fit'.
     """
     from tpgmm_tools.plotting import figure, legend, plot_candidates, plot_local, save
     from tpgmm_torch.data.demonstrations import Situation
@@ -78,7 +86,7 @@ def plot(
     out.mkdir(parents=True, exist_ok=True)
     for name, drawing in drawings.items():
         legend(drawing)
-        typer.echo(save(drawing, out / f"{name}.{form}"))
+        typer.echo(save(drawing, out / f"{name}.{format_}"))
 
 
 def coordinate_names(operator: Operator, kinematics: Kinematics) -> list[str]:

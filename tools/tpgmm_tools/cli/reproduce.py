@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -31,35 +31,37 @@ EXAMPLE = (
 
 @options.command(app, EXAMPLE)
 def reproduce(
-    model: options.Model,
-    out: Annotated[
-        Path, typer.Option(metavar="FILE", help="Where they go: .parquet, .csv or .npz.")
-    ],
+    model: Path,
+    *,
+    out: Path,
     data: options.DataOptions,
-    situations: options.Situations = None,
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="Or a LeRobot data set: the situations of its episodes."),
-    ] = None,
-    via: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="A via-point, repeatable: TIME:OPERATOR=NUMBERS~TOLERANCE, as in "
-            "3.2:position:l_hand@bottle=0,0,0.1 or 3.2:canonical=l_elbow:0.4; in place of "
-            "those that were saved with the model.",
-            metavar="VIA",
-        ),
-    ] = None,
-    fade: Annotated[
-        float,
-        typer.Option(help="Seconds before and after a via-point that it changes.", min=1e-3),
-    ] = 1.0,
+    situations: Path | None = None,
+    dataset: str | None = None,
+    via: list[str] | None = None,
+    fade: float = 1.0,
 ) -> None:
     """Reproduce a skill in new situations.
 
     Writes joint references over time and their covariance: a table with one row per time step
     (.parquet, .csv), as tpgmm_datasets.tables.trajectories_from_frame reads it back, or
     arrays (.npz). Prints a line per situation.
+
+    Parameters
+    ----------
+    model : ``DIR``
+        A model that 'tpgmm fit' saved.
+    out : ``FILE``
+        Where they go: .parquet, .csv or .npz.
+    situations : ``FILE.json``
+        Situations: start postures and frames.
+    dataset : str
+        Or a LeRobot data set: the situations of its episodes.
+    via : ``VIA``
+        A via-point, repeatable: TIME:OPERATOR=NUMBERS~TOLERANCE, as in
+        3.2:position:l_hand@bottle=0,0,0.1 or 3.2:canonical=l_elbow:0.4; in place of those that
+        were saved with the model.
+    fade : float >= 0.001
+        Seconds before and after a via-point that it changes.
     """
     from tpgmm_torch.exceptions import DataError, UnknownNameError
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import typer
 
@@ -15,7 +15,6 @@ __all__ = ["app"]
 app = typer.Typer()
 
 SUFFIXES = {"html": ".html", "rerun": ".rrd"}
-serving = options.in_panel("Live")
 EXAMPLE = (
     "tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
     "\n\n"
@@ -25,64 +24,20 @@ EXAMPLE = (
 
 @options.command(app, EXAMPLE)
 def view(
+    model: Path,
+    *,
     data: options.DataOptions,
-    model: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            help="A model that 'tpgmm fit' saved, or what 'tpgmm demo' wrote: a folder with "
-            "model/ and dataset/.",
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Where it goes; default DIR.html or DIR.rrd."),
-    ] = None,
-    form: Annotated[
-        Literal["html", "rerun"],
-        typer.Option("--format", help="A page, or a Rerun recording (.rrd) of the same."),
-    ] = "html",
-    dataset: Annotated[
-        str | None,
-        typer.Option(help="A LeRobot data set: demonstrated paths, and their situations."),
-    ] = None,
-    situations: options.Situations = None,
-    situation: Annotated[
-        list[int],
-        typer.Option(
-            min=0,
-            help="Which of the situations is shown, counted from 0; several side by side.",
-        ),
-    ] = [0],  # noqa: B006
-    shapes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--object",
-            metavar="FRAME=SHAPE",
-            help="What an object looks like: box:X,Y,Z, cylinder:RADIUS,LENGTH or "
-            "sphere:RADIUS in metres, at the origin of its frame; else a small box.",
-        ),
-    ] = None,
-    meshes: Annotated[
-        Path | None,
-        options.of_robot(
-            "The robot's mesh files; without them, sticks stand for meshes.",
-            metavar="FOLDER",
-            exists=True,
-            file_okay=False,
-        ),
-    ] = None,
-    fps: Annotated[float, typer.Option(min=1, max=200, help="Pictures per second.")] = 25.0,
-    live: Annotated[
-        bool,
-        serving(
-            "Serve the page instead: objects can be moved by hand, and the skill is "
-            "reproduced for where they are.",
-            "--live",
-        ),
-    ] = False,
-    host: Annotated[str, serving("Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, serving("First port to try.", min=0, max=65535)] = 8080,
+    out: Path | None = None,
+    format_: Literal["html", "rerun"] = "html",
+    dataset: str | None = None,
+    situations: Path | None = None,
+    situation: list[int] = [0],  # noqa: B006
+    object_: list[str] | None = None,
+    meshes: Path | None = None,
+    fps: float = 25.0,
+    live: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 8080,
 ) -> None:
     """Look at a motion in three dimensions.
 
@@ -90,6 +45,36 @@ def view(
     and reproduced paths, ellipsoids of two standard deviations along the path, a time line,
     curves of stiffness, of each operator's share and of what is held. With --format rerun,
     the same as a recording for Rerun's viewer.
+
+    Parameters
+    ----------
+    model : ``DIR``
+        A model that 'tpgmm fit' saved, or what 'tpgmm demo' wrote: a folder with model/ and
+        dataset/.
+    out : ``FILE``
+        Where it goes; default DIR.html or DIR.rrd.
+    format_ : str
+        A page, or a Rerun recording (.rrd) of the same.
+    dataset : str
+        A LeRobot data set: demonstrated paths, and their situations.
+    situations : ``FILE.json``
+        Situations, as 'tpgmm reproduce' takes them, instead of the data set's.
+    situation : int
+        Which of the situations is shown, counted from 0; several side by side.
+    object_ : ``FRAME=SHAPE``
+        What an object looks like, repeatable: box:X,Y,Z, cylinder:RADIUS,LENGTH or
+        sphere:RADIUS in metres, at the origin of its frame; else a small box.
+    meshes : ``FOLDER``
+        The robot's mesh files; without them, sticks stand for meshes.
+    fps : float >= 1
+        Pictures per second.
+    live : bool
+        Serve the page instead: objects can be moved by hand, and the skill is reproduced for
+        where they are.
+    host : str
+        Address to listen on, with --live.
+    port : int
+        First port to try, with --live.
     """
     import torch
 
@@ -99,11 +84,13 @@ def view(
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
-    suffix = SUFFIXES[form]
+    if meshes is not None and not meshes.is_dir():
+        raise DataError(f"--meshes needs a folder, got {str(meshes)!r}")
+    suffix = SUFFIXES[format_]
     where, place = model, out or Path(f"{model}{suffix}")
     if place.suffix != suffix:
         raise DataError(f"--out ends in {suffix}, got {str(place)!r}")
-    if form == "rerun" and (live or len(situation) > 1):
+    if format_ == "rerun" and (live or len(situation) > 1):
         raise DataError("--format rerun records one situation, and nothing is served")
     if (model / "model").is_dir() and (model / "dataset").is_dir():
         where, dataset = model / "model", dataset or str(model / "dataset")
@@ -111,11 +98,11 @@ def view(
         raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
     fitted = TaskParameterizedGMM.load(where, device="cpu")
     wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
-    if (last := max(situation)) >= len(wanted):
+    if (last := max(situation)) >= len(wanted) or min(situation) < 0:
         raise DataError(
             f"there are {len(wanted)} situations, counted from 0; got --situation {last}"
         )
-    pairs = [text.partition("=") for text in shapes or ()]
+    pairs = [text.partition("=") for text in object_ or ()]
     objects = {name: parse_shape(shape) for name, _, shape in pairs}
     how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
     if live:
@@ -129,7 +116,7 @@ def view(
         return
     chosen = [wanted[number] for number in situation]
     how["title"] = f"{model.resolve().name}, situation {', '.join(map(str, situation))}"
-    if form == "rerun":
+    if format_ == "rerun":
         trajectory = write_rerun(place, fitted, chosen[0], demonstrations, **how)
     else:
         trajectory = write_motion(place, fitted, chosen, demonstrations, **how)
