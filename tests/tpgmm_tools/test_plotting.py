@@ -1,6 +1,5 @@
 """Pictures: what their artists hold, not only that they are drawn."""
 
-import sys
 from itertools import combinations
 
 import numpy as np
@@ -26,28 +25,12 @@ from tpgmm_tools.plotting import (
     shade,
 )
 from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParameterizedGMM
-from tpgmm_torch.exceptions import DependencyError, UnknownNameError
+from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 
 
 def joints_model() -> TaskParameterizedGMM:
     return TaskParameterizedGMM(4, blend=0.0).fit(waves())
-
-
-def test_panels_share_the_time_axis():
-    drawing = figure(3, "a title")
-    axes = drawing.axes
-    assert len(axes) == 3
-    axes[0].set_xlim(1, 2)
-    assert axes[2].get_xlim() == (1, 2)
-    assert [a.get_xlabel() for a in axes] == ["", "", "time [s]"]
-    assert drawing.get_suptitle() == "a title"
-
-
-def test_without_matplotlib_the_extra_is_named(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(DependencyError, match=r"tpgmm-torch\[plot\]"):
-        figure(1, "")
 
 
 def test_phases_are_bands_with_names():

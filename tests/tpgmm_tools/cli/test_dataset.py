@@ -92,23 +92,6 @@ def test_a_set_that_exists_is_left_alone_without_append(command, generated, arm,
     assert_same(load_lerobot(root), written)
 
 
-def test_episodes_at_another_rate_are_not_appended(generated):
-    before = load_lerobot(generated)
-    other = ("dataset", "convert", generated, generated, "--append", "--rate", RATE / 2)
-    for words in (generate(generated, "--append", rate=RATE // 2), other):
-        assert f"the set has fps {RATE}, the demonstrations {RATE // 2}" in refusal(*words)
-    assert_same(load_lerobot(generated), before)
-
-
-def test_converting_a_set_of_layout_v30_changes_nothing(generated, tmp_path):
-    output("dataset", "convert", generated, tmp_path / "copy")
-    assert_same(load_lerobot(tmp_path / "copy"), load_lerobot(generated))
-    found, expected = describe_lerobot(tmp_path / "copy"), describe_lerobot(generated)
-    assert found.columns == expected.columns
-    for name in ("version", "robot_type", "fps", "tasks", "lengths", "problems"):
-        assert getattr(found, name) == getattr(expected, name)
-
-
 def test_layout_v21_becomes_v30_and_each_episode_keeps_its_task(arm, tmp_path):
     root, written = arm
     output("dataset", "convert", to_v21(root, tmp_path / "old"), tmp_path / "new")
@@ -154,29 +137,6 @@ def test_actions_of_other_joints_are_not_kept_and_it_is_said(tmp_path):
     assert "the recorded actions are not kept: " in result.stderr
     [first, *_] = load_lerobot(tmp_path / "new", joints="commanded")
     assert first.joints[:-1].numpy() == pytest.approx(written[0].joints[1:].numpy(), abs=1e-6)
-
-
-def test_degrees_become_radians_if_told_and_are_refused_if_not(tmp_path):
-    root, new = tmp_path / "set", tmp_path / "new"
-    written = write(root)
-    undeclared(root, 100)
-    words = ("dataset", "convert", root, new)
-    assert "not radians" in refusal(*words)
-    assert not new.exists()
-    output(*words, *("--units", "deg"), *("--episodes", "0,2"))
-    found = load_lerobot(new)
-    for a, b in zip(found, (written[0], written[2]), strict=True):
-        expected = np.radians(100 * b.joints.numpy())
-        assert a.joints.numpy() == pytest.approx(expected, abs=1e-5)
-
-
-def test_rate_resamples_and_task_names_all_episodes(arm, tmp_path):
-    root, written = arm
-    options = ("--rate", 25, "--task", "wave", "--episodes", "1:")
-    output("dataset", "convert", root, tmp_path / "new", *options)
-    found = load_lerobot(tmp_path / "new")
-    assert_same(found, [resample(item, 25) for item in written[1:]], 1e-6)
-    assert describe_lerobot(tmp_path / "new").tasks == ("wave",)
 
 
 @pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])
@@ -258,27 +218,6 @@ def test_one_bad_episode_of_several_is_told_and_may_be_left_out(tmp_path, genera
     with pytest.warns(DatasetWarning, match="norm of a quaternion"):
         [second] = load_lerobot(root, relax=["poses"])
     assert_same([second], load_lerobot(generated)[1:])
-
-
-def test_a_stored_joint_is_called_as_the_robot_does(tmp_path):
-    names = ["base", *(f"motor_{n}" for n in range(2, 7))]
-    time = np.arange(20) / 10
-    joints = 0.1 * np.sin(time[:, None] + np.arange(6)) + 0.3
-    root = save_lerobot(
-        [Demonstration(time, joints + 0.01 * n, joint_names=names) for n in range(2)],
-        tmp_path / "motors",
-        fps=10,
-        task="t",
-    )
-    robot = ("--robot", "so101", "--link", "gripper_frame_link")
-    told = run("dataset", "check", root, *robot)
-    assert told.exit_code == 2 and "--joint-name STORED=JOINT" in told.stderr
-    called = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
-    pairs = zip(names, [*called, "gripper"], strict=True)
-    given = [part for pair in pairs for part in ("--joint-name", "=".join(pair))]
-    assert "no problems in 2 episodes" in output("dataset", "check", root, *robot, *given)
-    output("dataset", "convert", root, tmp_path / "named", *robot, *given)
-    assert load_lerobot(tmp_path / "named")[0].joint_names == (*called, "gripper")
 
 
 def write_degrees(folder):

@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 
 from tests.support.skills import small_bottle, waves
 from tests.support.two_ways import Handles, fitted
@@ -69,13 +68,6 @@ def test_settings_other_than_the_defaults_are_told_and_no_others():
     learned = dict(row for row in rows(card, "How it was learned"))
     assert learned["`blend`"] == "0.25"
     assert not {"`tol`", "`n_components`", "`robot`"} & learned.keys()
-
-
-def test_demonstrations_that_were_left_out_are_named():
-    model = TaskParameterizedGMM(3).fit(waves())
-    model.demonstration_weights_ = torch.tensor([1.0, 0.0, 1.0, 0.0])
-    learned = dict(row for row in rows(describe(model), "How it was learned"))
-    assert learned["of these not learned from, unlike the others"] == "[1, 3]"
 
 
 def test_text_that_was_given_stays_in_its_cell():

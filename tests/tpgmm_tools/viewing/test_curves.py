@@ -6,28 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from tests.support import skills
 from tpgmm_tools.viewing.curves import Mark, as_html, motion_marks, motion_panels
-from tpgmm_torch import Hold, Robot, Situation, TaskParameterizedGMM
+from tpgmm_torch import Hold, Situation, TaskParameterizedGMM
 from tpgmm_torch.impedance.stiffness import Impedance
-
-#: The joints of :func:`skills.waves`, of which the first slides.
-SLIDING_ARM = (
-    "<robot name='r'><link name='base'/>"
-    + "".join(
-        f"<link name='{name}'/><joint name='{name}' type='{kind}'><parent link='{parent}'/>"
-        f"<child link='{name}'/><axis xyz='0 0 1'/>"
-        "<limit lower='-9' upper='9' velocity='9' effort='9'/></joint>"
-        for name, parent, kind in (
-            ("a", "base", "prismatic"),
-            ("b", "a", "revolute"),
-            ("c", "b", "revolute"),
-        )
-    )
-    + "</robot>"
-)
 
 
 @pytest.fixture(scope="module")
@@ -76,18 +59,6 @@ def test_tracked_poses_have_shares_but_no_stiffness():
     [trajectory] = model.predict([skills.new_handling()[0]])
     [panel] = motion_panels(model, trajectory)
     assert [curve.label.count("left") for curve in panel.curves] == [2, 2]
-
-
-def test_joints_that_slide_do_not_count_among_newton_metres_per_radian():
-    robot = Robot.from_urdf(SLIDING_ARM, links=["c"])
-    demonstrations = skills.waves()
-    model = skills.canonical(n_components=2, robot=robot).fit(demonstrations)
-    [trajectory] = model.predict([Situation.of(demonstrations[0])])
-    variances = torch.tensor([1e-8, 0.01, 0.01], dtype=torch.float64)
-    trajectory = replace(trajectory, covariance=variances.diag().expand(len(trajectory), 3, 3))
-    [stiffness, _] = motion_panels(model, trajectory)
-    [expected] = Impedance(robot).joints.matrix(variances[1:2].diag()).flatten()
-    np.testing.assert_allclose(stiffness.curves[0].values, expected)
 
 
 def test_events_of_the_demonstrations_and_parts_are_marked_where_they_are(tmp_path):
