@@ -71,7 +71,8 @@ def stopping_range(start: Array, acceleration: Array, jerk: Array) -> tuple[Arra
 
     Returns
     -------
-    low, high : ndarray of shape (N,)
+    low : ndarray of shape (N,)
+    high : ndarray of shape (N,)
         Infinite if no plan is found.
     """
     position = start[0]
