@@ -60,9 +60,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Kinematics,
-    Operator,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Robot,
@@ -77,6 +74,8 @@ from tpgmm_torch.alignment import (
     LinearTimeNormalization,
 )
 from tpgmm_torch.alignment.base import Alignment
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots import Kinematics, Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 G1_URDF = (

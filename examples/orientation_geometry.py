@@ -29,8 +29,6 @@ from torch import Tensor
 from tpgmm_torch import (
     AbsoluteOrientation,
     Demonstration,
-    Operator,
-    Poses,
     RelativeOrientation,
     Situation,
     Stack,
@@ -38,7 +36,9 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.rotation_density import rotation_log_density
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.training.mixture_settings import block_widths
 
 GEOMETRIES = ("quaternion", "tangent")

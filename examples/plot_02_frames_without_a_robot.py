@@ -15,18 +15,13 @@ import numpy as np
 import torch
 
 from tpgmm_tools.plotting import BLUE, SKY, STYLE, VERMILION
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Poses,
-    RelativePosition,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Demonstration, Frame, RelativePosition, TaskParameterizedGMM
+from tpgmm_torch.robots import Poses
 
 # %%
 # Demonstrations
 # --------------
-# :class:`~tpgmm_torch.Poses` stands where otherwise the robot does: the "joints" are the
+# :class:`~tpgmm_torch.robots.Poses` stands where otherwise the robot does: the "joints" are the
 # coordinates of tracked bodies, here the position of one hand. Each demonstration is a smooth
 # curve between two frames, with some noise.
 

@@ -20,11 +20,11 @@ from tpgmm_torch import (
     AbsolutePosition,
     Demonstration,
     Frame,
-    Poses,
     RelativePosition,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.metrics import PoseScorer, reproduction_scorer
+from tpgmm_torch.robots import Poses
 
 # %%
 # Demonstrations

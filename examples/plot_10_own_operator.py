@@ -16,16 +16,8 @@ import torch
 
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.plotting import STYLE, VERMILION
-from tpgmm_torch import (
-    Canonical,
-    Demonstration,
-    Frame,
-    Linearization,
-    Operator,
-    Robot,
-    Situation,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Canonical, Demonstration, Frame, Robot, Situation, TaskParameterizedGMM
+from tpgmm_torch.operators import Linearization, Operator
 
 # %%
 # The operator

@@ -13,7 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from tpgmm_tools.plotting import STYLE, plot_relevance
-from tpgmm_torch import Demonstration, Frame, OperatorSelection, Poses, TaskParameterizedGMM
+from tpgmm_torch import Demonstration, Frame, OperatorSelection, TaskParameterizedGMM
+from tpgmm_torch.robots import Poses
 
 # %%
 # Demonstrations

@@ -13,16 +13,10 @@ import numpy as np
 from sklearn.pipeline import make_pipeline
 
 from tpgmm_tools.plotting import STYLE, plot_parts
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Poses,
-    Segmentation,
-    Situation,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Demonstration, Frame, Segmentation, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots import Poses
 
 # %%
 # Demonstrations

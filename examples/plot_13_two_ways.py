@@ -18,11 +18,11 @@ from tpgmm_torch import (
     Demonstration,
     Frame,
     MultimodalTaskParameterizedGMM,
-    Poses,
     RelativePosition,
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.robots import Poses
 
 # %%
 # Demonstrations

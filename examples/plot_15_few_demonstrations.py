@@ -18,12 +18,12 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Poses,
     RelativePosition,
     Situation,
     Stack,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.robots import Poses
 
 torch.set_num_threads(1)  # the matrices are small
 

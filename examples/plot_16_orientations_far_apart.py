@@ -18,11 +18,11 @@ from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
 from tpgmm_torch import (
     AbsoluteOrientation,
     Demonstration,
-    Poses,
     Situation,
     TaskParameterizedGMM,
     quaternions,
 )
+from tpgmm_torch.robots import Poses
 
 # %%
 # A tool that turns

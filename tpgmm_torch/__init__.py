@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
-    from tpgmm_torch.data.trajectories import Candidate, Trajectory
+    from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     from tpgmm_torch.motion.motion_bounds import MotionBounds
@@ -28,17 +28,13 @@ if TYPE_CHECKING:
         AbsoluteOrientation,
         AbsolutePosition,
         Canonical,
-        Linearization,
-        Operator,
         RelativeOrientation,
         RelativePosition,
         Stack,
     )
     from tpgmm_torch.regression.estimate import Estimate
     from tpgmm_torch.regression.via_points import ViaPoint
-    from tpgmm_torch.robots.kinematics import Kinematics, RobotState
     from tpgmm_torch.robots.robot import Robot
-    from tpgmm_torch.robots.tracked_poses import Poses
     from tpgmm_torch.sensing.trust import Trust
     from tpgmm_torch.structure.mode_selection import ModeSelection
     from tpgmm_torch.structure.operator_selection import OperatorSelection
@@ -51,7 +47,6 @@ __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
     "BlockGaussianMixture",
-    "Candidate",
     "Canonical",
     "Clock",
     "Command",
@@ -61,20 +56,15 @@ __all__ = [
     "EvenClock",
     "Frame",
     "Hold",
-    "Kinematics",
-    "Linearization",
     "LocalizingClock",
     "ModeChoice",
     "ModeSelection",
     "MotionBounds",
     "MultimodalTaskParameterizedGMM",
-    "Operator",
     "OperatorSelection",
-    "Poses",
     "RelativeOrientation",
     "RelativePosition",
     "Robot",
-    "RobotState",
     "Segmentation",
     "Situation",
     "Stack",
@@ -98,7 +88,6 @@ _HOMES = {
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
     "data.holds": ("Hold",),
-    "robots.kinematics": ("Kinematics", "RobotState"),
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
     "motion.motion_bounds": ("MotionBounds",),
     "multimodal": ("ModeChoice", "MultimodalTaskParameterizedGMM"),
@@ -106,13 +95,10 @@ _HOMES = {
         "AbsoluteOrientation",
         "AbsolutePosition",
         "Canonical",
-        "Linearization",
-        "Operator",
         "RelativeOrientation",
         "RelativePosition",
         "Stack",
     ),
-    "robots.tracked_poses": ("Poses",),
     "regression.estimate": ("Estimate",),
     "regression.via_points": ("ViaPoint",),
     "robots.robot": ("Robot",),
@@ -120,7 +106,7 @@ _HOMES = {
     "structure.mode_selection": ("ModeSelection",),
     "structure.operator_selection": ("OperatorSelection",),
     "structure.segmentation": ("Segmentation",),
-    "data.trajectories": ("Candidate", "Trajectory"),
+    "data.trajectories": ("Trajectory",),
     "training.hold_detection": ("find_holds",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

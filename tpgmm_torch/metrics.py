@@ -126,7 +126,7 @@ def pose_errors(
 
     Examples
     --------
-    >>> from tpgmm_torch import Poses
+    >>> from tpgmm_torch.robots import Poses
     >>> hand, time = Poses(["hand"], orientation=False), torch.tensor([0.0, 1.0])
     >>> shown = Demonstration(time, [[0.0, 0, 0], [0.5, 0, 0]], events={"close": 1.0})
     >>> reached = torch.tensor([[0.0, 0, 0], [0.5, 0.002, 0]])

@@ -30,13 +30,13 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Kinematics,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots import Kinematics
 
 __all__ = ["BENCHMARKS", "OTHER_ROBOTS", "Benchmark", "benchmark"]
 

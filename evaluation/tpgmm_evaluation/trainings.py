@@ -26,8 +26,9 @@ from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
 from tpgmm_evaluation.policies.replay import NearestPolicy
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 from tpgmm_evaluation.settings import Settings
-from tpgmm_torch import Canonical, Demonstration, Operator, TaskParameterizedGMM
+from tpgmm_torch import Canonical, Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.operators import Operator
 
 __all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
 

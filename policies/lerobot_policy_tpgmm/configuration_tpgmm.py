@@ -18,9 +18,7 @@ from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import (
     Hold,
-    Kinematics,
     MultimodalTaskParameterizedGMM,
-    Operator,
     Robot,
     TaskParameterizedGMM,
     Trust,
@@ -31,8 +29,10 @@ from tpgmm_torch.alignment.text import METHODS
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.structure.parts import parse_parts
 

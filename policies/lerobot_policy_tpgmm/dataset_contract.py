@@ -11,9 +11,9 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
-from tpgmm_torch import Kinematics
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators
+from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
 
 __all__ = ["adopt", "check_dataset"]

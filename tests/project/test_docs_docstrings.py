@@ -31,9 +31,10 @@ ASKED_FOR = set(ERROR_MSGS) - set(LEFT_OUT)
 SHOWN = {
     "tpgmm_torch": (
         "AbsoluteOrientation AbsolutePosition BlockGaussianMixture Canonical Demonstration "
-        "Frame Kinematics Poses RelativeOrientation RelativePosition Robot.from_urdf "
+        "Frame RelativeOrientation RelativePosition Robot.from_urdf "
         "Situation Stack TaskParameterizedGMM TaskParameterizedGMM.step"
     ),
+    "tpgmm_torch.robots": "Kinematics Poses",
     "tpgmm_torch.alignment": "DynamicTimeWarping LinearTimeNormalization",
     "tpgmm_torch.gaussians": "condition information moment_match product",
     "tpgmm_torch.metrics": "largest_acceleration largest_velocity PoseScorer",

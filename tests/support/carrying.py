@@ -10,16 +10,9 @@ from torch import Tensor
 
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Hold,
-    Operator,
-    Situation,
-    TaskParameterizedGMM,
-    quaternions,
-)
+from tpgmm_torch import Demonstration, Frame, Hold, Situation, TaskParameterizedGMM, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator
 
 HAND = "l_hand"

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from tpgmm_torch import Demonstration, Frame, Poses
+from tpgmm_torch import Demonstration, Frame
+from tpgmm_torch.robots import Poses
 
 HAND = Poses(["hand"], orientation=False)
 

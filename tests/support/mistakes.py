@@ -28,7 +28,6 @@ from tpgmm_datasets.tables import (
 from tpgmm_torch import (
     Demonstration,
     Frame,
-    Poses,
     RelativePosition,
     Robot,
     Situation,
@@ -36,6 +35,7 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.data.pose_names import POSE_PARTS
+from tpgmm_torch.robots import Poses
 
 __all__ = ["MISTAKES", "Mistake"]
 

@@ -16,15 +16,15 @@ from tpgmm_torch import (
     AbsolutePosition,
     Canonical,
     Frame,
-    Operator,
     RelativeOrientation,
     RelativePosition,
-    RobotState,
     Stack,
 )
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots import RobotState
 
 Rows = Callable[[oracles.At], list[oracles.Row]]
 

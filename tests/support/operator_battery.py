@@ -20,7 +20,9 @@ from torch import Tensor
 import tpgmm_torch
 from tests.support import oracles
 from tests.support.worlds import OBJECT, World, moved
-from tpgmm_torch import Demonstration, Frame, Operator, RobotState, quaternions
+from tpgmm_torch import Demonstration, Frame, quaternions
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots import RobotState
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["f64", "f32"])
 BATCHES = pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=["one", "batch", "batches"])

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tpgmm_torch import Kinematics, Linearization, Operator, RobotState
+from tpgmm_torch.operators import Linearization, Operator
+from tpgmm_torch.robots import Kinematics, RobotState
 
 Q = torch.tensor([0.3, 0.8, -0.6], dtype=torch.float64)
 

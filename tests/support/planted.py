@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch import Demonstration, Frame, Poses, quaternions
+from tpgmm_torch import Demonstration, Frame, quaternions
+from tpgmm_torch.robots import Poses
 
 HAND = Poses(["hand"])
 NAMES = tuple("abcdefgh")

@@ -13,8 +13,6 @@ from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import (
     Demonstration,
     Frame,
-    Operator,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -23,6 +21,8 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots import Poses
 
 JOINT_NAMES = ("a", "b", "c")
 HANDS = Poses(("left", "right"))

@@ -20,7 +20,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Stack,
@@ -28,6 +27,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.large_data.checkpoints import Checkpoint
 from tpgmm_torch.large_data.processes import Processes, joined_processes
+from tpgmm_torch.robots import Poses
 
 BLOCKS = (2, 3)
 HAND = Poses(("hand",))

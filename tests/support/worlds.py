@@ -12,7 +12,8 @@ from torch import Tensor
 
 from tests.support import oracles
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import Frame, Poses, Robot, RobotState, quaternions
+from tpgmm_torch import Frame, Robot, quaternions
+from tpgmm_torch.robots import Poses, RobotState
 from tpgmm_torch.robots.robot import Kinematics
 
 LEFT, RIGHT, OBJECT, CARRIED = "l_hand", "r_hand", "object", "bottle"

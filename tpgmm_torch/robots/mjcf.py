@@ -8,7 +8,6 @@ several joints, links are put in between; reference angles go into the origins.
 
 from __future__ import annotations
 
-import io
 import math
 import os
 from collections.abc import Iterator
@@ -21,10 +20,10 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematic_tree import motion
-from tpgmm_torch.robots.urdf import Mimic, UrdfJoint, description_text, is_text
+from tpgmm_torch.robots.urdf import Mimic, UrdfJoint, description_text, is_text, parse_xml
 from tpgmm_torch.robots.urdf_writer import free_name, numbers, origin, write_urdf
 
-__all__ = ["mjcf_to_urdf", "root_element"]
+__all__ = ["mjcf_to_urdf"]
 
 HOW_TO_INSTALL = "pip install 'tpgmm-torch[simulation]'"
 #: Geoms of these groups are shown by MuJoCo unless asked; those of others collide.
@@ -60,7 +59,7 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
         import mujoco
     except ImportError as error:
         raise DependencyError(f"reading MJCF needs MuJoCo: {HOW_TO_INSTALL}") from error
-    if (tag := root_element(mjcf)) != "mujoco":
+    if (tag := parse_xml(description_text(mjcf)).tag) != "mujoco":
         raise DataError(f"an MJCF has the root element <mujoco>, got <{tag}>")
     try:
         if is_text(mjcf):
@@ -70,26 +69,6 @@ def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
     except (ValueError, mujoco.FatalError) as error:
         raise DataError(f"MuJoCo cannot compile the MJCF: {error}") from error
     return _Translation(model).text()
-
-
-def root_element(source: str | bytes | os.PathLike[str]) -> str:
-    """The name of the outermost element of a robot's description.
-
-    Parameters
-    ----------
-    source : str, bytes or path
-        A path, or the text itself (bytes, or a string that begins with ``<``).
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or is no XML.
-    """
-    stream = io.StringIO(description_text(source))
-    try:
-        return str(next(iter(ElementTree.iterparse(stream, ("start",))))[1].tag)
-    except ElementTree.ParseError as error:
-        raise DataError(f"the robot's description is not well-formed XML: {error}") from error
 
 
 class _Translation:

@@ -22,8 +22,8 @@ from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
-from tpgmm_torch.robots.mjcf import mjcf_to_urdf, root_element
-from tpgmm_torch.robots.urdf import UrdfModel, read_urdf
+from tpgmm_torch.robots.mjcf import mjcf_to_urdf
+from tpgmm_torch.robots.urdf import UrdfModel, description_text, parse_xml, read_urdf
 from tpgmm_torch.robots.urdf_writer import joined
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
@@ -200,7 +200,7 @@ class Robot(Kinematics):
         **settings
             As for :meth:`from_urdf`.
         """
-        is_mjcf = root_element(description) == "mujoco"
+        is_mjcf = parse_xml(description_text(description)).tag == "mujoco"
         return (cls.from_mjcf if is_mjcf else cls.from_urdf)(description, links, **settings)
 
     @classmethod

@@ -8,11 +8,13 @@ default there (axis ``1 0 0``, no offset). Numbers stay float64.
 import math
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
@@ -26,6 +28,7 @@ __all__ = [
     "UrdfModel",
     "description_text",
     "is_text",
+    "parse_xml",
     "placement",
     "read_urdf",
 ]
@@ -160,11 +163,34 @@ class UrdfModel:
         raise DataError(f"joint {name!r} follows joints that mimic one another in a circle")
 
 
-class _PlainTree(ElementTree.TreeBuilder):
-    """Refuse document types: with them entities could be declared that expand without bound."""
+def parse_xml(text: str) -> ElementTree.Element:
+    """The outermost element of a description; prefixes and namespaces mean nothing.
 
-    def doctype(self, name: str, *_: Any) -> None:
-        raise DataError(f"the URDF declares a document type ({name!r}): remove <!DOCTYPE ...>")
+    Parameters
+    ----------
+    text : str
+
+    Raises
+    ------
+    DataError
+        If it is not well-formed, or declares a document type: with one, entities could be
+        declared that expand without bound.
+    """
+
+    def refuse(name: str, *_: Any) -> None:
+        raise DataError(
+            f"the description declares a document type ({name!r}): remove <!DOCTYPE ...>"
+        )
+
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.StartDoctypeDeclHandler = refuse
+    try:
+        parser.Parse(text, True)
+        return builder.close()
+    except (expat.ExpatError, ValueError) as error:
+        reason = f"the description is not well-formed XML: {error}"
+        raise DataError(XACRO if "<xacro:" in text else reason) from error
 
 
 def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
@@ -181,16 +207,11 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
         If the file is missing, is not XML, or does not describe one tree of links.
     """
     text = description_text(source)
-    try:
-        parser = ElementTree.XMLParser(target=_PlainTree())
-        root = ElementTree.fromstring(text, parser)
-    except ElementTree.ParseError as error:
-        reason = XACRO if "<xacro:" in text else f"the URDF is not well-formed XML: {error}"
-        raise DataError(reason) from error
+    root = parse_xml(text)
     if root.tag != "robot":
         other = OTHER_FORMATS.get(root.tag, "")
         raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{other}")
-    if any("xacro" in tag for tag in {element.tag for element in root.iter()}):
+    if any(element.tag.startswith("xacro:") for element in root.iter()):
         raise DataError(XACRO)
     links = tuple(_names(root, "link"))
     if not links:
@@ -201,12 +222,7 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
 
 
 def is_text(source: str | bytes | os.PathLike[str]) -> bool:
-    """Whether a robot's description is given as text, and not as the path of a file.
-
-    Parameters
-    ----------
-    source : str, bytes or path
-    """
+    """Whether a description, ``source``, is given as text, and not as the path of a file."""
     return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
 
 
@@ -242,10 +258,10 @@ def description_text(source: str | bytes | os.PathLike[str]) -> str:
 
 def _names(root: ElementTree.Element, tag: str) -> list[str]:
     names: dict[str, None] = {}
-    for index, element in enumerate(root.findall(tag)):
+    for number, element in enumerate(root.findall(tag), 1):
         name = element.get("name")
         if not name:
-            raise DataError(f"<{tag}> number {index + 1} of the URDF has no name")
+            raise DataError(f"<{tag}> number {number} of the URDF has no name")
         if name in names:
             raise DataError(f"the URDF has two {tag}s named {name!r}")
         names[name] = None
@@ -253,152 +269,116 @@ def _names(root: ElementTree.Element, tag: str) -> list[str]:
 
 
 def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
-    kind = element.get("type")
+    kind = element.get("type", "")
     if kind not in (*MOVABLE_TYPES, *MULTIPLE_TYPES, "fixed"):
-        raise DataError(
-            f"joint {name!r} has type {kind!r}; URDF knows "
-            f"{sorted((*MOVABLE_TYPES, *MULTIPLE_TYPES, 'fixed'))}"
+        known = sorted((*MOVABLE_TYPES, *MULTIPLE_TYPES, "fixed"))
+        raise DataError(f"joint {name!r} has type {kind!r}; URDF knows {known}")
+    ends = []
+    for side in ("parent", "child"):
+        end = element.find(side)
+        if end is None or not end.get("link"):
+            raise DataError(f"joint {name!r} has no {side} link")
+        ends.append(end.get("link", ""))
+
+    def numbers(tag: str, attribute: str, *default: float) -> list[float]:
+        child = element.find(tag)
+        text = None if child is None else child.get(attribute)
+        return (
+            list(default)
+            if text is None
+            else _numbers(name, tag, attribute, text, len(default))
         )
-    parent, child = (_end(element, name, side) for side in ("parent", "child"))
-    origin = placement(
-        _numbers(element, name, "origin", "xyz", (0.0, 0.0, 0.0)),
-        _numbers(element, name, "origin", "rpy", (0.0, 0.0, 0.0)),
-    )
-    axis = _numbers(element, name, "axis", "xyz", (1.0, 0.0, 0.0))
-    if kind not in MOVABLE_TYPES:
-        return UrdfJoint(name, kind, parent, child, origin, axis)
-    largest = np.abs(axis).max()
-    if largest == 0:
+
+    origin = placement(numbers("origin", "xyz", 0, 0, 0), numbers("origin", "rpy", 0, 0, 0))
+    joint = UrdfJoint(name, kind, ends[0], ends[1], origin, np.array([1.0, 0.0, 0.0]))
+    if not joint.movable:
+        return joint
+    axis = np.array(numbers("axis", "xyz", 1.0, 0.0, 0.0))
+    if not axis.any():
         raise DataError(f"joint {name!r} has the axis 0 0 0: it needs a direction")
-    axis = axis / largest  # a direction alone: the square of a length may overflow
-    axis = axis / np.linalg.norm(axis)
-    limits, mimic = _limits(element, name, kind), _mimic(element, name)
-    return UrdfJoint(name, kind, parent, child, origin, axis, *limits, mimic)
+    axis /= np.abs(axis).max()  # a direction alone: the square of a length may overflow
+    axis /= np.linalg.norm(axis)
+    # without a range <limit> gives effort and velocity alone; values that cannot be, such as
+    # those of tools that write -1 or 0 where nothing is known, are no limits
+    limit = element.find("limit")
+    lower, upper = -math.inf, math.inf
+    if kind != "continuous" and limit is not None and {"lower", "upper"} & set(limit.keys()):
+        [low], [high] = numbers("limit", "lower", 0), numbers("limit", "upper", 0)
+        lower, upper = (low, high) if low <= high else (lower, upper)
+    velocity, acceleration, deceleration, jerk = (
+        rate if rate > 0 else math.inf
+        for key in ("velocity", "acceleration", "deceleration", "jerk")
+        for rate in numbers("limit", key, math.inf)
+    )
+    joint = replace(joint, axis=axis, lower=lower, upper=upper, velocity=velocity)
+    joint = replace(joint, acceleration=min(acceleration, deceleration), jerk=jerk)
+    follows = element.find("mimic")
+    if follows is None:
+        return joint
+    if not follows.get("joint"):
+        raise DataError(f"joint {name!r}: <mimic> does not name a joint")
+    line = numbers("mimic", "multiplier", 1.0) + numbers("mimic", "offset", 0.0)
+    return replace(joint, mimic=Mimic(follows.get("joint", ""), *line))
 
 
-def _end(element: ElementTree.Element, name: str, side: str) -> str:
-    end = element.find(side)
-    link = None if end is None else end.get("link")
-    if not link:
-        raise DataError(f"joint {name!r} has no {side} link")
-    return link
-
-
-def _numbers(
-    element: ElementTree.Element,
-    joint: str,
-    tag: str,
-    attribute: str,
-    default: tuple[float, ...],
-) -> Array:
-    child = element.find(tag)
-    text = None if child is None else child.get(attribute)
-    if text is None:
-        return np.array(default)
-    try:  # lists, not arrays: a description has thousands of these
+def _numbers(joint: str, tag: str, attribute: str, text: str, count: int) -> list[float]:
+    shown = repr(text if len(text) <= 100 else f"{text[:100]} ...")
+    try:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != len(default) or not all(map(math.isfinite, values)):
+    if len(values) != count or not all(map(math.isfinite, values)):
         hint = f". {XACRO}" if "${" in text or "$(" in text else ""
         raise DataError(
-            f"joint {joint!r}: <{tag} {attribute}> needs {len(default)} finite number(s), "
-            f"got {_short(text)}{hint}"
+            f"joint {joint!r}: <{tag} {attribute}> needs {count} finite number(s), "
+            f"got {shown}{hint}"
         )
     if tag in ("origin", "mimic") and max(map(abs, values)) > LARGEST:
         raise DataError(
-            f"joint {joint!r}: <{tag} {attribute}> is {_short(text)}, and no robot's is beyond "
+            f"joint {joint!r}: <{tag} {attribute}> is {shown}, and no robot's is beyond "
             f"{LARGEST:g}"
         )
-    return np.array(values)
+    return values
 
 
-def _short(text: str) -> str:
-    return repr(text if len(text) <= 100 else f"{text[:100]} ...")
-
-
-def placement(xyz: Array, rpy: Array) -> Array:
+def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
     """Homogeneous matrix of a URDF origin: rotations about the fixed x, then y, then z axis.
 
     Parameters
     ----------
-    xyz, rpy : ndarray of shape (3,)
+    xyz, rpy : sequence of three floats
         Metres, radians.
     """
-    (x, y, z), (roll, pitch, yaw) = xyz.tolist(), rpy.tolist()
-    cr, cp, cy = math.cos(roll), math.cos(pitch), math.cos(yaw)
-    sr, sp, sy = math.sin(roll), math.sin(pitch), math.sin(yaw)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
-            [-sp, cp * sr, cp * cr, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-
-
-def _limits(
-    element: ElementTree.Element, name: str, kind: str
-) -> tuple[float, float, float, float, float]:
-    """Lower, upper, velocity, acceleration, jerk."""
-    limit = element.find("limit")
-    lower, upper = -math.inf, math.inf
-    # a <limit> that gives only effort and velocity says nothing about the range
-    ranged = limit is not None and ("lower" in limit.attrib or "upper" in limit.attrib)
-    if ranged and kind != "continuous":
-        [lower] = _numbers(element, name, "limit", "lower", (0.0,)).tolist()
-        [upper] = _numbers(element, name, "limit", "upper", (0.0,)).tolist()
-    rates = dict.fromkeys(("velocity", "acceleration", "deceleration", "jerk"), math.inf)
-    for rate in rates:
-        if limit is not None and rate in limit.attrib:
-            [rates[rate]] = _numbers(element, name, "limit", rate, (0.0,)).tolist()
-    if lower > upper or min(rates.values()) < 0:
-        raise DataError(
-            f"joint {name!r} has the limits lower={lower:g}, upper={upper:g}, "
-            + ", ".join(
-                f"{rate}={value:g}" for rate, value in rates.items() if value < math.inf
-            )
-            + ": lower must not exceed upper, the others not be negative"
-        )
-    acceleration = min(rates["acceleration"], rates.pop("deceleration"))
-    return lower, upper, rates["velocity"], acceleration, rates["jerk"]
-
-
-def _mimic(element: ElementTree.Element, name: str) -> Mimic | None:
-    mimic = element.find("mimic")
-    if mimic is None:
-        return None
-    leader = mimic.get("joint")
-    if not leader:
-        raise DataError(f"joint {name!r}: <mimic> does not name a joint")
-    [multiplier] = _numbers(element, name, "mimic", "multiplier", (1.0,)).tolist()
-    [offset] = _numbers(element, name, "mimic", "offset", (0.0,)).tolist()
-    return Mimic(leader, multiplier, offset)
+    pose = np.eye(4)
+    pose[:3, 3] = xyz
+    for angle, (i, j) in zip(rpy, ((1, 2), (2, 0), (0, 1)), strict=True):
+        turn = np.eye(4)
+        turn[[i, j], [i, j]] = math.cos(angle)
+        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
+        pose[:3, :3] = turn[:3, :3] @ pose[:3, :3]
+    return pose
 
 
 def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:
     """The one link from which all others hang."""
-    children: dict[str, list[str]] = {}
-    held: set[str] = set()
-    known = set(links)
+    known, above = set(links), dict[str, str]()
     for joint in joints:
         for link in (joint.parent, joint.child):
             if link not in known:
                 raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
-        if joint.child in held:
+        if joint.child in above:
             raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")
-        held.add(joint.child)
-        children.setdefault(joint.parent, []).append(joint.child)
-    roots = [link for link in links if link not in held]
+        above[joint.child] = joint.parent
+    roots = [link for link in links if link not in above]
     if len(roots) > 1:
         raise DataError(f"the URDF has {len(roots)} links without a parent, not one: {roots}")
-    reached: set[str] = set()
-    front = list(roots)
-    while front:
-        reached.add(link := front.pop())
-        front += children.get(link, ())
-    if len(reached) < len(links):
-        loose = [link for link in links if link not in reached]
-        raise DataError(f"the joints of the URDF form a cycle, in or above the links {loose}")
+    reached = set(roots)
+    for link in links:
+        way = dict[str, None]()
+        while link not in reached and link not in way:
+            way[link] = None
+            link = above[link]
+        if link in way:
+            raise DataError(f"the joints of the URDF form a cycle: {' < '.join([*way, link])}")
+        reached.update(way)
     return roots[0]

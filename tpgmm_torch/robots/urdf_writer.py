@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.robots.urdf import UrdfJoint, UrdfModel
+from tpgmm_torch.robots.urdf import UrdfJoint, UrdfModel, parse_xml
 
 __all__ = ["Visuals", "free_name", "joined", "roll_pitch_yaw", "write_urdf"]
 
@@ -130,7 +130,7 @@ def joined(
             parent, child = f"{prefix}_{joint.parent}", f"{prefix}_{joint.child}"
             name = f"{prefix}_{joint.name}"
             joints.append(replace(joint, name=name, parent=parent, child=child, mimic=mimic))
-        drawn = _visuals(ElementTree.fromstring(model.text))
+        drawn = _visuals(parse_xml(model.text))
         visuals |= {f"{prefix}_{link}": elements for link, elements in drawn.items()}
     return write_urdf(" and ".join(parts), root, joints, visuals)
 

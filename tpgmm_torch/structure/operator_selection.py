@@ -139,7 +139,8 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
 
     Examples
     --------
-    >>> from tpgmm_torch import Demonstration, Frame, OperatorSelection, Poses
+    >>> from tpgmm_torch import Demonstration, Frame, OperatorSelection
+    >>> from tpgmm_torch.robots import Poses
     >>> time, rng = np.linspace(0, 1, 30), np.random.default_rng(0)
     >>> shown = []
     >>> for _ in range(5):
@@ -402,7 +403,8 @@ def candidate_operators(
 
     Examples
     --------
-    >>> from tpgmm_torch import Frame, Poses
+    >>> from tpgmm_torch import Frame
+    >>> from tpgmm_torch.robots import Poses
     >>> shown = Demonstration([0.0], [[0.0, 0, 0]], {"cup": Frame([0.4, 0, 0])})
     >>> for one in candidate_operators(Poses(["hand"], orientation=False), shown):
     ...     print(format_operator(one))

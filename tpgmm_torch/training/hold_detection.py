@@ -95,7 +95,8 @@ def find_holds(
     Examples
     --------
     >>> import torch
-    >>> from tpgmm_torch import Demonstration, Frame, Poses
+    >>> from tpgmm_torch import Demonstration, Frame
+    >>> from tpgmm_torch.robots import Poses
     >>> time = torch.linspace(0, 4, 81, dtype=torch.float64)
     >>> x = torch.stack((time - 2, 0 * time, 0 * time), dim=-1)  # of the hand
     >>> hand, cup = Frame(x), Frame(x.clamp(min=0))  # comes to the cup, and takes it along

@@ -32,7 +32,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -42,6 +41,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
+from tpgmm_torch.operators import Operator
 
 __all__ = ["BottleExperiment", "bottle_operators"]
 

@@ -21,16 +21,9 @@ from torch import Tensor
 
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Robot,
-    RobotState,
-    Situation,
-    Trajectory,
-    quaternions,
-)
+from tpgmm_torch import Demonstration, Frame, Robot, Situation, Trajectory, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.robots import RobotState
 
 __all__ = [
     "TASK",

@@ -10,16 +10,9 @@ from functools import cache
 from typing import Any
 from xml.etree import ElementTree
 
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    Operator,
-    RelativeOrientation,
-    RelativePosition,
-    Robot,
-    Stack,
-)
+from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Robot, Stack
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
 
 __all__ = [

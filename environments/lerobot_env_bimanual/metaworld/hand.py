@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpgmm_torch import Canonical, Operator, RelativePosition, Robot
+from tpgmm_torch import Canonical, RelativePosition, Robot
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.urdf import UrdfJoint
 from tpgmm_torch.robots.urdf_writer import write_urdf
 

@@ -29,14 +29,8 @@ from lerobot_env_bimanual.suite.task import (
     upright_pose,
 )
 from tpgmm_datasets.bottle.skill import attached
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    Operator,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-)
+from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
+from tpgmm_torch.operators import Operator
 
 __all__ = ["Handover"]
 

@@ -40,12 +40,12 @@ from tpgmm_datasets.bottle.skill import attached
 from tpgmm_torch import (
     Canonical,
     Frame,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
     quaternions,
 )
+from tpgmm_torch.operators import Operator
 
 __all__ = ["PegInHole"]
 

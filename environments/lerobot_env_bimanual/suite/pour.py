@@ -36,13 +36,13 @@ from tpgmm_datasets.bottle.skill import attached, between
 from tpgmm_torch import (
     Canonical,
     Frame,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
     quaternions,
 )
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.operators import Operator
 
 __all__ = ["Pour"]
 

@@ -24,8 +24,9 @@ from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
-from tpgmm_torch import Demonstration, Frame, Operator, Robot
+from tpgmm_torch import Demonstration, Frame, Robot
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.operators import Operator
 
 __all__ = [
     "Judge",

@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 
 from tpgmm_datasets import describe_lerobot, load_lerobot
-from tpgmm_torch import Demonstration, Kinematics
+from tpgmm_torch import Demonstration
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.alignment.base import retime
+from tpgmm_torch.robots import Kinematics
 
 __all__ = ["Aligned"]
 

@@ -15,7 +15,6 @@ from tpgmm_evaluation.regressions.plan import Measured, Plan
 from tpgmm_torch import (
     Demonstration,
     Frame,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -23,6 +22,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.robots import Poses
 
 __all__ = ["GOLDENS"]
 

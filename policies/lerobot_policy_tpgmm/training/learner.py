@@ -47,9 +47,7 @@ from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import (
     Demonstration,
     Hold,
-    Kinematics,
     MultimodalTaskParameterizedGMM,
-    Operator,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment.base import Alignment
@@ -57,6 +55,8 @@ from tpgmm_torch.alignment.piecewise_linear import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization

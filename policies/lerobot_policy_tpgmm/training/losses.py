@@ -11,10 +11,12 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
-from tpgmm_torch import Frame, Kinematics, Operator, RobotState, quaternions
+from tpgmm_torch import Frame, quaternions
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots import Kinematics, RobotState
 from tpgmm_torch.training.mixture_settings import fused_samples
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]

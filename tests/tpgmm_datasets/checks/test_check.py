@@ -14,9 +14,10 @@ from tests.support.mistakes import MISTAKES, Mistake
 from tests.support.skills import generator, handlings, waves
 from tests.support.worlds import upper_body
 from tpgmm_datasets import check, load_lerobot
-from tpgmm_torch import Demonstration, Poses, quaternions
+from tpgmm_torch import Demonstration, quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, TPGMMError
+from tpgmm_torch.robots import Poses
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 needs_recordings = pytest.mark.skipif(not DATA.is_dir(), reason="the recordings are not here")

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from tpgmm_datasets import check
-from tpgmm_torch import Demonstration, Poses
+from tpgmm_torch import Demonstration
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 TIME = np.arange(100) / 50

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tpgmm_datasets import check
-from tpgmm_torch import Demonstration, Frame, Poses
+from tpgmm_torch import Demonstration, Frame
+from tpgmm_torch.robots import Poses
 
 TIME = np.arange(40) / 20
 

@@ -20,8 +20,9 @@ from tpgmm_datasets.bottle.carrying import composed, slide
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_evaluation.policies.key_poses import find_moves
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
-from tpgmm_torch import Demonstration, Frame, Poses
+from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots import Poses
 
 
 @pytest.fixture(scope="module", params=[False, True])

@@ -16,10 +16,10 @@ from tpgmm_torch import (
     Demonstration,
     Hold,
     MultimodalTaskParameterizedGMM,
-    Poses,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.operators.text import default_operators, format_operator
+from tpgmm_torch.robots import Poses
 
 #: Quick, and silent about two episodes and about none that are aligned.
 QUICK = ("--n-components", 2, "--rate", 5, "--alignment", "none", "--plausibility", "ignore")

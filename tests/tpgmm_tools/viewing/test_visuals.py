@@ -8,8 +8,9 @@ from tests.support.worlds import upper_body
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.viewing import link_shapes, parse_shape
 from tpgmm_tools.viewing.visuals import mesh, whole_body
-from tpgmm_torch import Poses, Robot
+from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, DependencyError
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.urdf import read_urdf
 
 

@@ -9,10 +9,11 @@ import torch
 
 from tests.support.skills import generator
 from tests.support.worlds import upper_body
-from tpgmm_torch import Demonstration, Frame, Poses, quaternions
+from tpgmm_torch import Demonstration, Frame, quaternions
 from tpgmm_torch.checks import Region, TrainingSummary
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 SKILL = generator()

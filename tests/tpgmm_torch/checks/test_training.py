@@ -13,7 +13,6 @@ from tpgmm_torch import (
     Demonstration,
     Frame,
     Hold,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Stack,
@@ -22,6 +21,7 @@ from tpgmm_torch import (
 from tpgmm_torch.checks import check
 from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import PlausibilityWarning, ShapeError, UnknownNameError
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 HAND = Poses(["hand"], orientation=False)

@@ -41,13 +41,12 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Linearization,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
 )
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.operators import Linearization, Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.training.mixture_settings import check_operators

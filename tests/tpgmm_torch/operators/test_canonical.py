@@ -20,7 +20,6 @@ from tests.support.worlds import OnPoses, OnRobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_torch import (
     Canonical,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -28,6 +27,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 

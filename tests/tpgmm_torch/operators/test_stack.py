@@ -11,12 +11,12 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
     Canonical,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Stack,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.robots.joint_space import JointSpace
 
 

@@ -9,12 +9,12 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
     Canonical,
-    Operator,
     RelativeOrientation,
     RelativePosition,
     Stack,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
 
 OPERATORS = [

@@ -6,14 +6,7 @@ import torch
 
 from tests.support.skills import HANDS, handlings, hands, hands_model
 from tests.support.worlds import upper_body
-from tpgmm_torch import (
-    Demonstration,
-    Frame,
-    Poses,
-    RelativePosition,
-    Robot,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Demonstration, Frame, RelativePosition, Robot, TaskParameterizedGMM
 from tpgmm_torch.exceptions import (
     DataError,
     InvalidParameterError,
@@ -21,6 +14,7 @@ from tpgmm_torch.exceptions import (
     UnknownNameError,
 )
 from tpgmm_torch.regression.prior import prior_widths
+from tpgmm_torch.robots import Poses
 
 LIFT = """<robot name="lift"><link name="base"/><link name="arm"/><link name="hand"/>
 <joint name="lift" type="prismatic"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>

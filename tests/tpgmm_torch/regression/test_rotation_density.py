@@ -10,12 +10,12 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     Demonstration,
     Frame,
-    Poses,
     RelativePosition,
     TaskParameterizedGMM,
     quaternions,
 )
 from tpgmm_torch.regression.rotation_density import rotation_log_density
+from tpgmm_torch.robots import Poses
 
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 2, 40, dtype=torch.float64)

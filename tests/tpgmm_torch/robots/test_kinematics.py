@@ -12,8 +12,9 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from tests.support.own_operators import PlanarArm
 from tests.support.robot_zoo import assert_differences_agree, random_joints, upper_body, zoo
-from tpgmm_torch import Frame, RobotState, quaternions
+from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots import RobotState
 from tpgmm_torch.robots.kinematics import dtype_name, dtype_named
 
 #: A grasp.

@@ -56,6 +56,16 @@ class TestReading:
         (j,) = read_urdf(one('<limit lower="-1" upper="1" velocity="3"/>', "continuous")).joints
         assert (j.lower, j.upper, j.velocity) == (-math.inf, math.inf, 3)
 
+    @pytest.mark.parametrize("rate", ["0", "-1"])
+    def test_limits_that_cannot_be_are_none(self, rate: str) -> None:
+        limit = f'<limit lower="1" upper="0" velocity="{rate}" acceleration="{rate}"/>'
+        (j,) = read_urdf(one(limit)).joints
+        assert (j.lower, j.upper, j.velocity, j.acceleration) == (-math.inf, *[math.inf] * 3)
+
+    def test_namespaces_and_prefixes_mean_nothing(self) -> None:
+        text = one('<gazebo sim:kind="sonar"/>').replace("<robot", '<robot xmlns="http://a"')
+        assert read_urdf(text).actuated == ("j",)
+
     def test_origin_turns_about_fixed_axes_x_then_y_then_z(self) -> None:
         (j,) = read_urdf(one('<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>')).joints
 
@@ -121,7 +131,7 @@ class TestRefusing:
             (urdf(links=LINKS + '<link name="a"/>'), "two links named 'a'"),
             (urdf(joint("j", "a", "b"), joint("j", "b", "c")), "two joints named 'j'"),
             (one().replace('name="j"', ""), "<joint> number 1 of the URDF has no name"),
-            (one().replace('type="revolute"', ""), "joint 'j' has type None"),
+            (one().replace('type="revolute"', ""), "joint 'j' has type ''"),
             (one(kind="hinge"), "joint 'j' has type 'hinge'; URDF knows .*'revolute'"),
             (one().replace('<parent link="a"/>', ""), "joint 'j' has no parent link"),
             (one().replace('<child link="b"/>', "<child/>"), "joint 'j' has no child link"),
@@ -131,17 +141,14 @@ class TestRefusing:
             ),
             (urdf(joint("j", "a", "b")), r"2 links without a parent, not one: \['a', 'c'\]"),
             (urdf(joint("j", "a", "a")), r"2 links without a parent, not one: \['b', 'c'\]"),
-            (urdf(joint("j", "b", "c"), joint("k", "c", "b")), r"cycle.*\['b', 'c'\]"),
-            (urdf(joint("j", "a", "a"), links='<link name="a"/>'), r"cycle.*\['a'\]"),
+            (urdf(joint("j", "b", "c"), joint("k", "c", "b")), r"cycle: b < c < b"),
+            (urdf(joint("j", "a", "a"), links='<link name="a"/>'), r"cycle: a < a"),
             (one('<axis xyz="0 0 0"/>'), "joint 'j' has the axis 0 0 0"),
             (one('<axis xyz="0 1"/>'), "<axis xyz> needs 3 finite number.*got '0 1'"),
             (one('<origin xyz="0 nan 0"/>'), "<origin xyz> needs 3 finite"),
             (one('<origin rpy="0 ${pi} 0"/>'), "<origin rpy> needs 3 finite"),
             (one('<origin xyz="0 1e200 0"/>'), "'0 1e200 0', and no robot's is beyond 1e.09"),
             (one('<limit lower="low" upper="1"/>'), "<limit lower> needs 1 finite"),
-            (one('<limit lower="2" upper="1"/>'), "lower=2, upper=1"),
-            (one('<limit velocity="-1"/>'), "velocity=-1"),
-            (one('<limit acceleration="-2"/>'), "upper=inf, acceleration=-2: lower"),
             (one('<limit jerk="x"/>'), "<limit jerk> needs 1 finite"),
             (one("<mimic/>"), "<mimic> does not name a joint"),
             (one('<mimic joint="j" offset="x"/>'), "<mimic offset>"),

@@ -10,9 +10,10 @@ from tests.support.skills import few_bottles
 from tests.support.two_ways import ARM, TIME, Handles, Obstacle, shown
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import upper_body
-from tpgmm_torch import Canonical, Demonstration, Frame, ModeSelection, Poses, RelativePosition
+from tpgmm_torch import Canonical, Demonstration, Frame, ModeSelection, RelativePosition
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.robots import Poses
 
 POINT = Poses(["hand"], orientation=False)
 

@@ -18,7 +18,6 @@ from tpgmm_torch import (
     Demonstration,
     Frame,
     OperatorSelection,
-    Poses,
     RelativePosition,
     Stack,
     TaskParameterizedGMM,
@@ -27,6 +26,7 @@ from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError, UnknownNameError
 from tpgmm_torch.model_selection import fit_folds
 from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.structure.operator_selection import candidate_operators
 
 

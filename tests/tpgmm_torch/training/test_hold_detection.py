@@ -9,9 +9,10 @@ import torch
 from tests.support.carrying import ARRIVES, HAND, HELD, LEAVES, LIFTS, PUTS, at_first, carries
 from tests.support.skills import few_bottles
 from tests.support.worlds import upper_body
-from tpgmm_torch import Demonstration, Frame, Hold, Kinematics, Poses, quaternions
+from tpgmm_torch import Demonstration, Frame, Hold, quaternions
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import RelativePosition
+from tpgmm_torch.robots import Kinematics, Poses
 from tpgmm_torch.training.hold_detection import find_holds, holds_for
 
 TIME = torch.linspace(0, 6, 121, dtype=torch.float64)

@@ -14,7 +14,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    Poses,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -26,6 +25,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 
