@@ -35,6 +35,8 @@ RISE_TIME, RISE_TIME_ALONE = 0.25, 0.1
 #: name greater limits may mean motors without load, 37 rad/s, which is no reason to go there in
 #: a quarter of a second.
 BELIEVABLE_SPEED = 4.0
+#: A smaller acceleration is rounding, that of a joint at constant speed [rad/s^2 or m/s^2].
+NO_ACCELERATION = 1e-6
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
 #: Share of a bound that rounding may add to it.
@@ -171,7 +173,7 @@ class MotionBounds:
         most = max(BELIEVABLE_SPEED / seconds, MARGIN * float(peaks.max()))
         quick = (bound["velocity"] / seconds).clamp(max=most)
         # of a joint without limit of speed, what was demonstrated is all that is known
-        unknown = torch.where(peaks > 0, 0.0, torch.inf)
+        unknown = torch.where(peaks > NO_ACCELERATION, 0.0, torch.inf)
         quick = torch.where(bound["velocity"].isinf(), unknown, quick)
         acceleration, jerk = bound["acceleration"], bound["jerk"]
         usual = torch.maximum(quick, MARGIN * peaks)

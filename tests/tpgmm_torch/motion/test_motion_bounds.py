@@ -43,7 +43,8 @@ def test_what_was_demonstrated_counts_with_a_margin():
 
 
 def test_without_limits_of_speed_demonstrations_alone_tell():
-    bounds = MotionBounds.of(ROBOT, peaks([2.0, 0.0], [10.0, 0.0]))
+    # the second joint was shown at constant speed
+    bounds = MotionBounds.of(ROBOT, peaks([2.0, 1e-12], [10.0, 1e-10]))
     assert bounds.acceleration.tolist() == [6.0, torch.inf]
     assert bounds.jerk.tolist() == [240.0, torch.inf]
     assert bounds.velocity.tolist() == [torch.inf] * 2
