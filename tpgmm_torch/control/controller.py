@@ -693,11 +693,11 @@ def _motion_bounds(
     skill: Skill, bounds: MotionBounds | Mapping[str, Any] | str | None
 ) -> MotionBounds | None:
     """Bounds as a controller takes them."""
-    if isinstance(bounds, Mapping):
+    if isinstance(bounds, Mapping) and bounds:
         return MotionBounds.of(skill.kinematics, skill.peaks, **bounds)
-    if not isinstance(bounds, str):
+    if isinstance(bounds, MotionBounds) or bounds is None:
         return bounds
-    if bounds != "robot":
+    if isinstance(bounds, str) and bounds != "robot":
         raise DataError(f"bounds are MotionBounds, a mapping, 'robot' or None, got {bounds!r}")
     return skill.motion_bounds
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.support.servos import Run, between, held
+from tests.support.servos import Run, held
 from tests.support.skills import LAST, canonical, hands, new_handling, wave, waves
 from tpgmm_torch.control.clock_text import format_clock
 from tpgmm_torch.control.clocks import (
@@ -97,16 +97,6 @@ def test_a_skill_without_a_span_is_refused(regression, clock, begin, end):
         clock.start(regression, START, {}, begin, end)
 
 
-@pytest.mark.parametrize("clock", [EvenClock(), WAITING, LOCALIZING], ids=format_clock)
-def test_looking_ahead_changes_nothing(regression, clock):
-    run = begun(regression, clock)
-    run.run(0.4)
-    before, ahead = run.progress.time.clone(), run.progress
-    for _ in range(5):
-        ahead = ahead.advance(0.04, seen(START + 9.0))
-    assert torch.equal(run.progress.time, before)
-
-
 # Waiting
 
 
@@ -146,21 +136,6 @@ def test_it_restarts_smoothly(regression):
     assert rates.max() <= 1 + 1e-9
     assert rates.diff().max() < 0.001 / 0.2 + 1e-9
     assert rates[-1] == pytest.approx(1.0)
-
-
-def test_every_robot_has_its_own_time_whatever_its_batch(regression):
-    """Robot b of 64 is held from 0.02 b s on for a second; each alone does the same."""
-    since = 0.02 * torch.arange(64, dtype=torch.float64)
-
-    together = begun(regression, WAITING, 64)
-    together.run(1.9, between(since, since + 1))
-    assert together.progress.time.std() > 0.1
-    for robot in (0, 17, 63):
-        alone = begun(regression, WAITING)
-        alone.run(1.9, between(since[robot], since[robot] + 1))
-        assert alone.progress.time.shape == ()
-        times = torch.stack(together.times)[:, robot]
-        torch.testing.assert_close(torch.stack(alone.times), times, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("joints", [None, torch.full((3,), torch.nan, dtype=torch.float64)])

@@ -86,14 +86,6 @@ def test_after_the_end_the_last_reference_is_held():
     assert not command.velocity.any()
 
 
-def test_rounding_does_not_cost_the_last_step():
-    problem = Problem.of(CASES["canonical"], 3)
-    controller = begun(problem, begin=0.0, end=0.3)  # 0.1 + 0.1 + 0.1 is more than 0.3
-    estimates = [controller.step(0.1).estimate for _ in range(5)]
-    assert len({id(estimate) for estimate in estimates}) == 4
-    assert float(controller.time) == 0.3
-
-
 def test_objects_are_where_they_were_last_seen():
     problem = Problem.of(CASES["the paper's"], 3, 2)
     elsewhere = {
@@ -130,17 +122,6 @@ def test_other_robots_are_refused():
     controller = begun(problem)
     with pytest.raises(ShapeError, match=r"began with joints of shape \(2, 17\).*\(1, 17\)"):
         controller.step(DT, problem.state.joints[:1])
-
-
-def test_numbers_given_in_another_type_are_converted():
-    problem = Problem.of(CASES["the paper's"], 3)
-    pose = problem.frames[OBJECT]
-    single = {OBJECT: Frame(pose.position.float(), pose.orientation.float())}
-    options = {"begin": 0.0, "end": 1.0, **PLAIN}
-    regression = problem.regression()
-    plain = Controller(regression, problem.state.joints, problem.frames, **options)
-    other = Controller(regression, problem.state.joints.tolist(), single, **options)
-    assert_close(other.step(DT).reference, plain.step(DT).reference, 1e-5)
 
 
 # Trust

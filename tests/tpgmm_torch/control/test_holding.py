@@ -22,7 +22,6 @@ from tpgmm_torch import (
     Hold,
     RelativeOrientation,
     RelativePosition,
-    Situation,
     quaternions,
 )
 from tpgmm_torch.control.holding import Holding
@@ -224,36 +223,6 @@ def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
     assert held.held["bottle"].moves_along.all()
     there = hand(elsewhere).compose(seen.seen_from(hand(joints + left)))
     assert_at(held.state(upper_body().state(elsewhere)).pose("bottle"), there)
-
-
-def test_each_robot_of_a_batch_sees_how_it_holds():
-    holding, joints = begun(3)
-    rates = torch.tensor([[0.0], [1.0], [1.0]])
-    together, _ = closing(holding, joints, shifts=True, carries=rates)
-    seen = {"bottle": LATER.expand((3,))}
-    later = together.advance(HELD.begin, joints + 0.2 * rates, seen)
-    for row in range(3):
-        alone = Holding.start(upper_body(), CARRIED, [HELD], scenes(3, 3)[row].frames)
-        alone, _ = closing(alone, joints[row], shifts=True, carries=rates[row])
-        assert_at(together.held["bottle"].grasp[row], alone.held["bottle"].grasp)
-        alone = alone.advance(HELD.begin, joints[row] + 0.2 * rates[row], {"bottle": LATER})
-        assert_at(later.held["bottle"].grasp[row], alone.held["bottle"].grasp)
-
-
-def test_what_was_shifted_moves_with_the_joints_by_its_jacobian():
-    held, joints = closing(*begun(), shifts=True, carries=1.0)[0], begun()[1]
-
-    def position(q):
-        return held.state(upper_body().state(q)).position("bottle")
-
-    numeric = torch.autograd.functional.jacobian(position, joints)
-    steps = 1e-6 * torch.eye(len(joints), dtype=joints.dtype)
-    differences = torch.stack(
-        [(position(joints + step) - position(joints - step)) / 2e-6 for step in steps], -1
-    )
-    state = held.state(upper_body().state(joints))
-    torch.testing.assert_close(state.linear_jacobian("bottle"), differences, rtol=0, atol=1e-8)
-    torch.testing.assert_close(numeric, differences, rtol=0, atol=1e-8)
 
 
 def test_after_the_release_it_stays_where_it_was_let_go():
@@ -489,47 +458,6 @@ def test_a_prediction_carries_what_it_holds():
         assert (share[:taken] == 0).all()
         assert (share[taken:put] > 0).any()
         assert (share[put:] == 0).all()
-
-
-def test_one_robot_of_many_is_as_if_alone():
-    model, scene, rows = carrying_model(), scenes(300, seed=5), (0, 7, 255, 256, 299)
-    together = model.controller(scene.start, scene.frames)
-    alone = [model.controller(scene.start[i], scene[i].frames) for i in rows]
-    for now in (0.0, 1.0, 2.3, 2.4, 3.0, 3.5, 4.0, 4.5, 4.9, 5.0):
-        for controller in (together, *alone):
-            controller.step(now - controller.time)
-        for i, one in zip(rows, alone, strict=True):
-            torch.testing.assert_close(together.reference[i], one.reference, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("texts", [PLACES, None], ids=["places", "things"])
-def test_frames_that_live_to_the_end_change_nothing(texts):
-    model = carrying_model() if texts is None else carrying_model(texts)
-    scene = scenes(1, seed=9)[0]
-    [nominal] = model.predict([scene.situation])
-    taken, put = ticks_of(model)
-    held = hand(nominal.joints)
-    grasp = scene.bottle.seen_from(held[taken - 1])
-    index = torch.arange(len(model.time_)).sub(1).clamp(max=put - 1)  # seen a tick later
-    live = held[index.clamp(min=0)].compose(grasp)
-    before = (index < taken)[:, None]
-    moving = Frame(
-        torch.where(before, scene.bottle.position, live.position),
-        torch.where(before, scene.bottle.orientation, live.orientation),
-    )
-    situation = Situation(scene.start, {**scene.frames, "bottle": moving}, model.time_)
-    [followed] = model.predict([situation])
-    # as a thing it is held as it is seen, to rounding
-    torch.testing.assert_close(followed.joints[:put], nominal.joints[:put], rtol=0, atol=1e-6)
-    # where it was let go, it is seen to rounding, which precise operators enlarge, and which
-    # decides whether a reference is just within bounds
-    torch.testing.assert_close(followed.joints, nominal.joints, rtol=0, atol=1e-2)
-
-
-def test_recorded_objects_are_followed_as_they_were_held():
-    [predicted] = carrying_model().predict([carries()[0]])
-    error = predicted.joints - carries()[0].joints
-    assert float(error.square().mean().sqrt()) < 0.05
 
 
 def test_objects_that_are_first_seen_on_the_way_are_held_from_then_on():

@@ -156,14 +156,6 @@ def test_robots_are_carried_to_any_other_place(shaking):
     assert again.sum() <= 8 and gone[again & (gone.abs() <= 1)].max() < 0
 
 
-def test_to_a_pause_they_may_come_anywhere_in_it(shaking):
-    run = localizing(shaking)
-    run.run(8.0)
-    run.run(0.5, held(posture(shaking, 5.5)))
-    assert 4.3 < float(run.progress.time) < 7.0
-    assert sum(map(int, run.relocalized)) == 1
-
-
 def test_shaking_does_not_jump_a_period(shaking):
     """Neither robots that are noisy nor such as are held, late, or stopped again and again."""
     since = torch.linspace(10.6, 13.4, 12, dtype=torch.float64)

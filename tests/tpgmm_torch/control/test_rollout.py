@@ -134,27 +134,6 @@ def test_before_the_beginning_and_after_the_end_references_are_held(keep_limits)
             assert_close(found.covariance[15:], one.covariance[-1:].expand(8, -1, -1), 1e-10)
 
 
-def test_situations_without_objects_need_none():
-    problem = Problem.of(CASES["canonical"], 3, 1)
-    [trajectory] = run(problem.regression(), [Situation(problem.state.joints[0], time=grid())])
-    assert trajectory.joints.shape == (12, 17)
-
-
-@pytest.mark.parametrize("wanted", [True, False])
-def test_candidates_are_kept_if_wanted(wanted):
-    problem = Problem.of(CASES["three"], 2, 2)
-    names = problem.case.world.kinematics.joint_names
-    for trajectory in run(
-        problem.regression(), situations(problem, grid(), grid()), candidates=wanted
-    ):
-        assert len(trajectory.candidates) == (3 if wanted else 0)
-        assert trajectory.joint_names == names
-        assert trajectory.covariance.shape == (12, 17, 17)
-        for candidate in trajectory.candidates:
-            assert candidate.mean.shape == candidate.share.shape == (12, 17)
-            assert candidate.covariance.shape == (12, 17, 17)
-
-
 @EVERY_WORLD
 @pytest.mark.parametrize("moves", [False, True], ids=["still", "moving"])
 @pytest.mark.parametrize("activation", ["time", "product"])
@@ -180,26 +159,6 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
 
 
 # The start
-
-
-@EVERY_WORLD
-def test_with_a_blend_the_first_reference_is_the_start(case: Case):
-    problem = Problem.of(case, 3, 2)
-    given = situations(problem, grid(), grid())
-    for trajectory, situation in zip(
-        run(problem.regression(), given, blend=1.0), given, strict=True
-    ):
-        assert_close(trajectory.joints[0], situation.joints)
-
-
-def test_without_a_blend_the_first_reference_is_the_models():
-    problem = Problem.of(CASES["canonical"], 3, 1)
-    given = situations(problem, grid())
-    [trajectory] = run(problem.regression(), given, blend=0)
-    frames = {OBJECT: problem.frames[OBJECT][0]}
-    first = problem.regression().step(grid()[0], problem.state[0], frames)
-    assert_close(trajectory.joints[0], first.joints)
-    assert (trajectory.joints[0] - given[0].joints).abs().max() > 1e-2
 
 
 def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
