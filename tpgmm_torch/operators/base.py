@@ -51,6 +51,15 @@ class Linearization:
     present: Tensor | None = None
     noise: Tensor | None = None
 
+    def dense(self) -> tuple[Tensor, Tensor]:
+        """``J`` and ``M``, identities written out."""
+        like = self.displacement
+        eye = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
+        return (
+            eye if self.jacobian is None else self.jacobian,
+            eye if self.matrix is None else self.matrix,
+        )
+
     def without(self, rigid: Tensor) -> Linearization:
         """The rows as ``0 = 0``, where the joints cannot change what the operator measures.
 
@@ -139,14 +148,11 @@ class Operator(ABC):
 
     def linear(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """``A_t = J^+ M`` of Table I, shape (..., n_joints, D)."""
-        at, like = self.linearize(state, frames), state.joints
-        linear = at.matrix
-        if linear is None:
-            size = at.displacement.shape[-1]
-            linear = torch.eye(size, dtype=like.dtype, device=like.device)
+        at = self.linearize(state, frames)
+        _, linear = at.dense()
         if at.jacobian is not None:
             linear = gaussians.pseudo_inverse(at.jacobian) @ linear
-        batch = gaussians.common_shape(like.shape[:-1], linear.shape[:-2])
+        batch = gaussians.common_shape(state.joints.shape[:-1], linear.shape[:-2])
         return linear.expand(*batch, *linear.shape[-2:])
 
     def offset(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:

@@ -80,42 +80,31 @@ class Stack(Operator):
                 parts += [operator.linearize(state, frames) for operator in group]
         if len(parts) == 1:
             return parts[0]
-        like = state.joints
-        sizes = [part.displacement.shape[-1] for part in parts]
-        identity = torch.eye(max(*sizes, like.shape[-1]), dtype=like.dtype, device=like.device)
-        n = like.shape[-1]
-        jacobians = [identity[:n, :n] if p.jacobian is None else p.jacobian for p in parts]
-        matrices = [
-            identity[:m, :m] if part.matrix is None else part.matrix
-            for m, part in zip(sizes, parts, strict=True)
-        ]
-        shapes = [matrix.shape[:-2] for matrix in (*jacobians, *matrices)]
-        shapes += [part.displacement.shape[:-1] for part in parts]
-        batch = gaussians.common_shape(like.shape[:-1], *shapes)
-        widths = [matrix.shape[-1] for matrix in matrices]
+        like, dense = state.joints, [part.dense() for part in parts]
+        batch = gaussians.common_shape(
+            like.shape[:-1],
+            *(matrix.shape[:-2] for pair in dense for matrix in pair),
+            *(part.displacement.shape[:-1] for part in parts),
+        )
+        shapes = [matrix.shape[-2:] for _, matrix in dense]
+        rows, columns = (sum(sizes) for sizes in zip(*shapes, strict=True))
         # the last row has the present quaternions
-        whole = like.new_zeros(*batch, sum(sizes) + 1, sum(widths))
-        row, column, known = 0, 0, True
-        for part, matrix, m, width in zip(parts, matrices, sizes, widths, strict=True):
+        whole, row, column = like.new_zeros(*batch, rows + 1, columns), 0, 0
+        for part, (_, matrix), (m, width) in zip(parts, dense, shapes, strict=True):
             whole[..., row : row + m, column : column + width] = matrix
-            if part.present is None:
-                known = False
-            else:
+            if part.present is not None:
                 whole[..., -1, column : column + width] = part.present
             row, column = row + m, column + width
-        noises = [part.noise for part in parts]
-        noise = None
-        if any(one is not None for one in noises):
-            noise = [
-                torch.zeros_like(part.displacement) if part.noise is None else part.noise
-                for part in parts
-            ]
+        is_known = all(part.present is not None for part in parts)
+        noises = [
+            torch.zeros_like(p.displacement) if p.noise is None else p.noise for p in parts
+        ]
         return Linearization(
-            _joined(jacobians, batch, 2),
+            _joined([jacobian for jacobian, _ in dense], batch, 2),
             whole[..., :-1, :],
             _joined([part.displacement for part in parts], batch, 1),
-            whole[..., -1, :] if known else None,
-            None if noise is None else _joined(noise, batch, 1),
+            whole[..., -1, :] if is_known else None,
+            _joined(noises, batch, 1) if any(p.noise is not None for p in parts) else None,
         )
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
