@@ -8,7 +8,7 @@ and, of trajectories, the upper triangle of the joints' covariance (``covariance
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,6 @@ __all__ = [
     "demonstrations_from_frame",
     "demonstrations_to_frame",
     "read_table",
-    "trajectories_from_frame",
     "trajectories_to_frame",
     "write_table",
 ]
@@ -166,66 +165,30 @@ def demonstrations_from_frame(
     >>> demonstrations_from_frame(table, time="t")
     [Demonstration(2 steps, 0.10 s, 2 joints, frames=[], events={})]
     """
-
-    def make(part: pd.DataFrame, names: list[str]) -> Demonstration:
-        events = {
-            name.removeprefix(EVENT): _only(part, name)
-            for name in part.columns
-            if name.startswith(EVENT)
-        }
-        numbered = names == [str(i) for i in range(len(names))]
-        return Demonstration(
-            torch.from_numpy(_numbers(part, [time])[:, 0]),
-            torch.from_numpy(_numbers(part, names)),
-            _poses(part, {time, episode, *names}),
-            None if numbered else tuple(names),
-            events,
-        )
-
-    return _each(table, make, joints, time, episode)
-
-
-def trajectories_from_frame(
-    table: pd.DataFrame,
-    *,
-    joints: Sequence[str] | None = None,
-    time: str = "time",
-    episode: str = EPISODE,
-) -> list[Trajectory]:
-    """The trajectories in a table as :func:`trajectories_to_frame` makes it.
-
-    Parameters
-    ----------
-    table, joints, time, episode
-        As of :func:`demonstrations_from_frame`. The joints are those that have a covariance.
-
-    Returns
-    -------
-    list of Trajectory
-        In order of appearance, without candidates.
-
-    Raises
-    ------
-    DataError, UnknownNameError
-        As :func:`demonstrations_from_frame`, and if a covariance is missing.
-    """
-
-    def make(part: pd.DataFrame, names: list[str]) -> Trajectory:
-        n = len(names)
-        rows, columns = np.triu_indices(n)
-        covariance = np.empty((len(part), n, n))
-        covariance[:, rows, columns] = _numbers(part, covariance_names(names))
-        covariance[:, columns, rows] = covariance[:, rows, columns]
-        # checked as that of a demonstration is
-        motion = Demonstration(
-            torch.from_numpy(_numbers(part, [time])[:, 0]),
-            torch.from_numpy(_numbers(part, names)),
-        )
-        return Trajectory(
-            motion.time, motion.joints, torch.from_numpy(covariance), (), tuple(names)
-        )
-
-    return _each(table, make, joints, time, episode)
+    table = _checked(table, joints, time, episode)
+    names = list(joints) if joints is not None else _joints(table, time, episode)
+    whole = episode not in table.columns
+    parts = [(0, table)] if whole else table.groupby(episode, sort=False)
+    made = []
+    for label, part in parts:
+        kept = part.dropna(axis="columns", how="all")
+        try:
+            made.append(
+                Demonstration(
+                    torch.from_numpy(_numbers(kept, [time])[:, 0]),
+                    torch.from_numpy(_numbers(kept, names)),
+                    _poses(kept, {time, episode, *names}),
+                    None if names == [str(i) for i in range(len(names))] else tuple(names),
+                    {
+                        name.removeprefix(EVENT): _only(kept, name)
+                        for name in kept.columns
+                        if name.startswith(EVENT)
+                    },
+                )
+            )
+        except (DataError, UnknownNameError) as error:
+            raise DataError(f"episode {label} of the table: {error}") from error
+    return made
 
 
 def write_table(table: pd.DataFrame, path: str | Path) -> None:
@@ -283,7 +246,7 @@ def read_table(path: str | Path) -> pd.DataFrame:
 
 
 def covariance_names(joint_names: Sequence[str]) -> list[str]:
-    """Columns of the covariance's upper triangle, row by row."""
+    """Columns of the upper triangle of the covariance of joints, row by row."""
     pairs = zip(*np.triu_indices(len(joint_names)), strict=True)
     return [f"{COVARIANCE}{joint_names[i]}.{joint_names[j]}" for i, j in pairs]
 
@@ -336,40 +299,25 @@ def _joint_names(motion: Demonstration | Trajectory) -> list[str]:
     return list(motion.joint_names or map(str, range(motion.joints.shape[-1])))
 
 
-def _each[Motion](
-    table: pd.DataFrame,
-    make: Callable[[pd.DataFrame, list[str]], Motion],
-    joints: Sequence[str] | None,
-    time: str,
-    episode: str,
-) -> list[Motion]:
-    """What is made of each episode; errors say which."""
+def _checked(
+    table: pd.DataFrame, joints: Sequence[str] | None, time: str, episode: str
+) -> pd.DataFrame:
+    """The table with texts for names, each there once, and all that are asked for."""
     if not hasattr(table, "columns"):
         raise DataError(f"a table is a pandas DataFrame, got {type(table).__name__}")
     table = table.rename(columns=str)
     twice = table.columns[table.columns.duplicated()]
     if len(twice):
         raise DataError(f"the table has columns of one name: {sorted(set(twice))}")
-    told = () if episode == EPISODE else (episode,)
-    for name in (time, *told, *(joints or ())):
+    asked = () if episode == EPISODE else (episode,)
+    for name in (time, *asked, *(joints or ())):
         if name not in table.columns:
             raise UnknownNameError("column", name, "the table", table.columns)
     if not len(table):
         raise DataError("the table has no rows")
-    names = list(joints) if joints is not None else _joints(table, time, episode)
-    if episode in table.columns:
-        if table[episode].isna().any():
-            raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
-        parts = list(table.groupby(episode, sort=False))
-    else:
-        parts = [(0, table)]
-    made = []
-    for label, part in parts:
-        try:
-            made.append(make(part.dropna(axis="columns", how="all"), names))
-        except (DataError, UnknownNameError) as error:
-            raise DataError(f"episode {label} of the table: {error}") from error
-    return made
+    if episode in table.columns and table[episode].isna().any():
+        raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
+    return table
 
 
 def _joints(table: pd.DataFrame, time: str, episode: str) -> list[str]:

@@ -25,11 +25,14 @@ from tpgmm_datasets.bottle.skill import (
     BottleSkill,
     attached,
     between,
+    either,
+    pose_error,
+    reached,
     upright,
 )
 from tpgmm_torch import Demonstration, Frame, Situation, quaternions
 
-__all__ = ["TASK", "CarryAndPut", "before_sliding", "composed", "slid", "slide"]
+__all__ = ["TASK", "CarryAndPut", "before_sliding", "slid", "slide"]
 
 #: What LeRobot data sets of the skill call it.
 TASK = "put the bottle on the tray"
@@ -166,10 +169,7 @@ class CarryAndPut(BottleSkill):
         orientation : Tensor of shape (...)
             In radians.
         """
-        place = composed(tray, Frame((0.0, 0.0, FOOT)))
-        turn = quaternions.product(bottle.orientation, quaternions.conjugate(place.orientation))
-        distance = torch.linalg.vector_norm(bottle.position - place.position, dim=-1)
-        return distance, torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
+        return pose_error(bottle, tray.compose(Frame((0.0, 0.0, FOOT))))
 
     def _demonstrations(
         self, situations: Sequence[Situation], slides: NDArray[np.float64], ends: Tensor
@@ -179,54 +179,31 @@ class CarryAndPut(BottleSkill):
             Frame.stack([situation.frames[name] for situation in situations])
             for name in ("bottle", "tray")
         )
-        first = self.robot.state(starts)
-        hands = [Frame(first.position(hand), first.orientation(hand)) for hand in HANDS]
-        lengths = self._timing.steps(ends)
-
-        def bottle_at(time: Tensor) -> Frame:
-            return self._bottle(
-                self._timing.progress(time, ends), time, ends, bottles, trays, slides
-            )
+        state = self.robot.state(starts)
+        first = {hand: state.pose(hand) for hand in HANDS}
 
         def wanted(time: Tensor) -> list[Frame]:
             progress = self._timing.progress(time, ends)
-            held = before_sliding(bottle_at(time), slides)
+            bottle = self._bottle(progress, time, ends, bottles, trays, slides)
+            held = before_sliding(bottle, slides)
             poses = []
-            for start, hand in zip(hands, HANDS, strict=True):
-                away = attached(bottles, APPROACH_POINT[hand])
-                pose = between(start, away, progress["reach"])
-                pose = between(pose, attached(bottles, GRASP_POINT[hand]), progress["close"])
-                grasp = attached(held, GRASP_POINT[hand])
-                leave = between(grasp, attached(held, APPROACH_POINT[hand]), progress["leave"])
-                carrying = (progress["lift"] > 0)[:, None]
-                poses.append(
-                    Frame(
-                        torch.where(carrying, leave.position, pose.position),
-                        torch.where(carrying, leave.orientation, pose.orientation),
-                    )
-                )
+            for hand in HANDS:
+                away = attached(held, APPROACH_POINT[hand])
+                leaving = between(attached(held, GRASP_POINT[hand]), away, progress["leave"])
+                pose = reached(first[hand], hand, bottles, progress)
+                poses.append(either(progress["lift"] > 0, leaving, pose))
             return poses
 
-        joints = self._follow(starts, wanted, max(lengths))
-        times = self._timing.times(max(lengths))
-        poses = [bottle_at(time.expand(len(starts))) for time in times]
-        demonstrations = []
-        for i, steps in enumerate(lengths):
-            end = dict(zip(self.phases, ends[i].tolist(), strict=True))
-            bottle = Frame(
-                torch.stack([pose.position[i] for pose in poses[:steps]]),
-                torch.stack([pose.orientation[i] for pose in poses[:steps]]),
-            )
-            demonstrations.append(
-                Demonstration(
-                    times[:steps],
-                    joints[:steps, i],
-                    {"bottle": bottle, "tray": trays[i]},
-                    self.robot.joint_names,
-                    {"grasp": end["hold"], "put": end["lower"], "rest": end["leave"]},
-                )
-            )
-        return demonstrations
+        times, joints = self._follow(starts, wanted, ends)
+        poses = []
+        for time in times[:, None].expand(-1, len(starts)):
+            progress = self._timing.progress(time, ends)
+            poses.append(self._bottle(progress, time, ends, bottles, trays, slides))
+        frames = {"bottle": Frame.stack(poses), "tray": trays}
+        return self._recorded(times, joints, ends, frames)
+
+    def _events(self, end: Mapping[str, float]) -> dict[str, float]:
+        return {"grasp": end["hold"], "put": end["lower"], "rest": end["leave"]}
 
     def _bottle(
         self,
@@ -241,9 +218,9 @@ class CarryAndPut(BottleSkill):
         begin, length = SLIDE
         arrived = ends[:, list(self.phases).index("close")]
         slid = ((time - arrived - begin) / length).clamp(0, 1)
-        grasped = composed(bottles, slide(slides))
+        grasped = bottles.compose(slide(slides))
         pose = between(bottles, grasped, slid)
-        place = composed(trays, Frame((0.0, 0.0, FOOT)))
+        place = trays.compose(Frame((0.0, 0.0, FOOT)))
         for end, phase in (
             (_above(grasped), "lift"),
             (_above(place), "carry"),
@@ -280,13 +257,6 @@ def before_sliding(bottle: Frame, slides: NDArray[np.float64]) -> Frame:
     slid = slide(slides)
     turn = quaternions.product(bottle.orientation, quaternions.conjugate(slid.orientation))
     return Frame(bottle.position - quaternions.rotate(turn, slid.position), turn)
-
-
-def composed(frame: Frame, pose: Frame) -> Frame:
-    """A pose that is given as seen from a frame."""
-    return Frame(
-        frame.transform(pose.position), quaternions.product(frame.orientation, pose.orientation)
-    )
 
 
 def _above(pose: Frame) -> Frame:

@@ -23,7 +23,6 @@ from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Demonstration, Frame, Robot, Situation, Trajectory, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
-from tpgmm_torch.robots import RobotState
 
 __all__ = [
     "TASK",
@@ -31,7 +30,10 @@ __all__ = [
     "BottleSkill",
     "attached",
     "between",
+    "either",
     "follow_hands",
+    "pose_error",
+    "reached",
     "upper_body",
     "upright",
 ]
@@ -145,29 +147,20 @@ class BottleSkill:
             In radians.
         """
         state = self.robot.state(joints)
-        distance, angle = [], []
-        for hand in HANDS:
-            target = attached(bottle, GRASP_POINT[hand])
-            distance.append(
-                torch.linalg.vector_norm(state.position(hand) - target.position, dim=-1)
-            )
-            between = quaternions.product(
-                target.orientation, quaternions.conjugate(state.orientation(hand))
-            )
-            angle.append(torch.linalg.vector_norm(quaternions.log(between), dim=-1))
-        return torch.maximum(*distance), torch.maximum(*angle)
+        errors = [
+            pose_error(state.pose(hand), attached(bottle, GRASP_POINT[hand])) for hand in HANDS
+        ]
+        return torch.maximum(*(one for one, _ in errors)), torch.maximum(
+            *(one for _, one in errors)
+        )
 
     def neutral_posture(self) -> Tensor:
         """The humanoid's published home posture, elbows out and bent, shape (17,) [rad]."""
         joints = torch.zeros(self.robot.n_joints, dtype=torch.float64)
-        for side, sign in (("l", 1.0), ("r", -1.0)):
-            home = {
-                "shoulder_pitch": 0.5,
-                "shoulder_roll": 0.5 * sign,
-                "shoulder_yaw": -0.3 * sign,
-                "elbow": -1.57,
-            }
-            for name, value in home.items():
+        home = {"shoulder_pitch": (0.5, 0.5), "shoulder_roll": (0.5, -0.5)}
+        home |= {"shoulder_yaw": (-0.3, 0.3), "elbow": (-1.57, -1.57)}
+        for name, sides in home.items():
+            for side, value in zip("lr", sides, strict=True):
                 joints[self.robot.joint_names.index(f"{side}_{name}")] = value
         return joints
 
@@ -183,12 +176,30 @@ class BottleSkill:
         return Phases(self.phases, self.rate, self.stretch)
 
     def _follow(
-        self, starts: Tensor, wanted: Callable[[Tensor], list[Frame]], steps: int
-    ) -> Tensor:
-        """Inverse kinematics of all demonstrations at once, shape (steps, n, 17)."""
-        return follow_hands(
-            self.robot, starts, wanted, self._timing.times(steps), self.neutral_posture()
-        )
+        self, starts: Tensor, wanted: Callable[[Tensor], list[Frame]], ends: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Times (T,), and joints (T, n, 17) of all demonstrations, by inverse kinematics."""
+        times = self._timing.times(max(self._timing.steps(ends)))
+        posture = self.neutral_posture()
+        return times, follow_hands(self.robot, starts, wanted, times, posture)
+
+    def _recorded(
+        self, times: Tensor, joints: Tensor, ends: Tensor, frames: Mapping[str, Frame]
+    ) -> list[Demonstration]:
+        """Demonstrations, each until its last phase ends, of frames (n,) or (n, T)."""
+        found = []
+        for i, steps in enumerate(self._timing.steps(ends)):
+            end = dict(zip(self.phases, ends[i].tolist(), strict=True))
+            poses = {
+                name: pose[i, :steps] if len(pose.batch_shape) > 1 else pose[i]
+                for name, pose in frames.items()
+            }
+            names, events = self.robot.joint_names, self._events(end)
+            found.append(Demonstration(times[:steps], joints[:steps, i], poses, names, events))
+        return found
+
+    def _events(self, end: Mapping[str, float]) -> dict[str, float]:
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -300,37 +311,33 @@ class BottleShaking(BottleSkill):
         ends: Tensor,
         amplitudes: Tensor,
     ) -> list[Demonstration]:
-        paths = [_Path(self.robot.state(starts), hand, bottles, chests) for hand in HANDS]
-        lengths = self._timing.steps(ends)
-        joints = self._follow(
-            starts,
-            lambda time: [path.at(self._timing.progress(time, ends)) for path in paths],
-            max(lengths),
-        )
-        u = self._timing.progress(self._timing.times(max(lengths))[:, None], ends)["shake"]
+        state = self.robot.state(starts)
+        first = {hand: state.pose(hand) for hand in HANDS}
+
+        def wanted(time: Tensor) -> list[Frame]:
+            progress = self._timing.progress(time, ends)
+            carried = between(bottles, chests, progress["bring"])
+            # from the grasp on the bottle moves, and the hand with it
+            return [
+                either(
+                    progress["bring"] > 0,
+                    attached(carried, GRASP_POINT[hand]),
+                    reached(first[hand], hand, bottles, progress),
+                )
+                for hand in HANDS
+            ]
+
+        times, joints = self._follow(starts, wanted, ends)
+        u = self._timing.progress(times[:, None], ends)["shake"]
         ramp = minimum_jerk(8 * u) * minimum_jerk(8 * (1 - u))
         swing = amplitudes * ramp * torch.sin(2 * math.pi * self.cycles * u)
-        joints[..., [self.robot.joint_names.index(name) for name in SHOULDERS]] += swing[
-            ..., None
-        ]
-        demonstrations = []
-        for i, steps in enumerate(lengths):
-            end = dict(zip(self.phases, ends[i].tolist(), strict=True))
-            events = {
-                "grasp": (end["close"] + end["hold"]) / 2,
-                "shake": end["pause"],
-                "rest": end["shake"],
-            }
-            demonstrations.append(
-                Demonstration(
-                    self._timing.times(steps),
-                    joints[:steps, i],
-                    {"bottle": bottles[i]},
-                    self.robot.joint_names,
-                    events,
-                )
-            )
-        return demonstrations
+        columns = [self.robot.joint_names.index(name) for name in SHOULDERS]
+        joints[..., columns] += swing[..., None]
+        return self._recorded(times, joints, ends, {"bottle": bottles})
+
+    def _events(self, end: Mapping[str, float]) -> dict[str, float]:
+        grasp = (end["close"] + end["hold"]) / 2
+        return {"grasp": grasp, "shake": end["pause"], "rest": end["shake"]}
 
     def shoulders(self, trajectory: Trajectory | Demonstration) -> Tensor:
         """Both shoulder pitches of a motion, shape (T, 2) [rad]."""
@@ -344,26 +351,26 @@ class BottleShaking(BottleSkill):
         return lengths
 
 
-class _Path:
-    """Where one hand should be: minimum-jerk segments on the bottle's frame."""
+def reached(start: Frame, hand: str, bottle: Frame, progress: Mapping[str, Tensor]) -> Frame:
+    """Where a hand is from its start to the grasp: beside the bottle, then at it."""
+    pose = between(start, attached(bottle, APPROACH_POINT[hand]), progress["reach"])
+    return between(pose, attached(bottle, GRASP_POINT[hand]), progress["close"])
 
-    def __init__(self, start: RobotState, hand: str, bottle: Frame, chest: Frame) -> None:
-        self.hand, self.bottle, self.chest = hand, bottle, chest
-        self.start = Frame(start.position(hand), start.orientation(hand))
-        self.approach = attached(bottle, APPROACH_POINT[hand])
-        self.grasp = attached(bottle, GRASP_POINT[hand])
 
-    def at(self, progress: Mapping[str, Tensor]) -> Frame:
-        pose = between(self.start, self.approach, progress["reach"])
-        pose = between(pose, self.grasp, progress["close"])
-        # from the grasp on the bottle moves, and the hand with it
-        carried = between(self.bottle, self.chest, progress["bring"])
-        held = attached(carried, GRASP_POINT[self.hand])
-        bringing = (progress["bring"] > 0)[:, None]
-        return Frame(
-            torch.where(bringing, held.position, pose.position),
-            torch.where(bringing, held.orientation, pose.orientation),
-        )
+def either(where: Tensor, one: Frame, other: Frame) -> Frame:
+    """One pose where a condition (n,) holds, the other elsewhere."""
+    mask = where[:, None]
+    return Frame(
+        torch.where(mask, one.position, other.position),
+        torch.where(mask, one.orientation, other.orientation),
+    )
+
+
+def pose_error(pose: Frame, target: Frame) -> tuple[Tensor, Tensor]:
+    """Distance [m] and angle [rad] of poses (...) from their targets."""
+    turn = quaternions.product(pose.orientation, quaternions.conjugate(target.orientation))
+    distance = torch.linalg.vector_norm(pose.position - target.position, dim=-1)
+    return distance, torch.linalg.vector_norm(quaternions.log(turn), dim=-1)
 
 
 def upright(

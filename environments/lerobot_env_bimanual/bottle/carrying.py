@@ -21,7 +21,7 @@ from lerobot_env_bimanual.disturbances import (
     Course,
     Disturbance,
 )
-from tpgmm_datasets.bottle.carrying import SLIDE, TASK, CarryAndPut, composed, slide
+from tpgmm_datasets.bottle.carrying import SLIDE, TASK, CarryAndPut, slide
 from tpgmm_datasets.bottle.skill import FOOT
 from tpgmm_torch import Demonstration, Frame, Situation
 
@@ -190,7 +190,7 @@ class CarryAndPutEnv(BottleEnv):
         assert self._closed is not None
         done = min((self._free - self._closed) / SLIDE[1] + 1e-9, 1.0)
         stood = Frame(*np.split(self._contact[1], [3]))
-        pose = composed(stood, slide(done * self._start.slide))
+        pose = stood.compose(slide(done * self._start.slide))
         self._scene.put_bottle(torch.cat((pose.position, pose.orientation)).numpy())
         if done == 1.0:
             self._closed = None

@@ -9,7 +9,6 @@ from tpgmm_datasets.bottle.carrying import (
     PHASES,
     CarryAndPut,
     before_sliding,
-    composed,
     slid,
     slide,
 )
@@ -101,6 +100,6 @@ def test_sliding_is_undone():
     slides = rng.uniform(-1, 1, (4, 2)) * (0.03, 0.2)
     turns = quaternions.normalize(torch.from_numpy(rng.standard_normal((4, 4))))
     stood = Frame(rng.standard_normal((4, 3)), turns)
-    again = before_sliding(composed(stood, slide(slides)), slides)
+    again = before_sliding(stood.compose(slide(slides)), slides)
     torch.testing.assert_close(again.position, stood.position)
     torch.testing.assert_close(again.orientation, stood.orientation)

@@ -16,7 +16,7 @@ from tests.support.learned_sets import (
     references,
     shaking,
 )
-from tpgmm_datasets.bottle.carrying import composed, slide
+from tpgmm_datasets.bottle.carrying import slide
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_evaluation.policies.key_poses import find_moves
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
@@ -136,7 +136,7 @@ def test_a_bottle_that_slid_in_the_hands_is_put_on_the_tray(carrier):
     inner = None
     for step in range(puts[-1].end):
         if step == takes:
-            slid = composed(bottle, slide(torch.tensor([0.02, 0.1]).numpy()))
+            slid = bottle.compose(slide(torch.tensor([0.02, 0.1]).numpy()))
             inner = slid.seen_from(robot.state(joints).pose("l_hand"))
         if inner is not None:
             bottle = robot.state(joints).pose("l_hand").compose(inner)

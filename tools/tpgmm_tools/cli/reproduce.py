@@ -43,7 +43,7 @@ def reproduce(
     """Reproduce a skill in new situations.
 
     Writes joint references over time and their covariance: a table with one row per time step
-    (.parquet, .csv), as tpgmm_datasets.tables.trajectories_from_frame reads it back, or
+    (.parquet, .csv), as tpgmm_datasets.tables.demonstrations_from_frame reads it back, or
     arrays (.npz). Prints a line per situation.
 
     Parameters
