@@ -138,9 +138,9 @@ def estimate_motor_map(
     (-1, 20.0)
     """
     names = tuple(robot.joint_names if names is None else names)
-    motor_of = {
-        joint: motor for motor, joint in match_names(robot.joint_names, names, "").items()
-    }
+    stored = match_names(robot.joint_names, names, "")
+    motor_of = {joint: motor for motor, joint in stored.items()}
+    motors = [motor_of[joint] for joint in robot.joint_names]
     table = as_tensor(values, "values").to(robot.lower)
     n = len(poses.position) if poses.batch_shape else 0
     if table.shape != (n, len(names)) or not n:
@@ -149,15 +149,13 @@ def estimate_motor_map(
             f"and there are n poses; got values {tuple(table.shape)}, poses "
             f"{tuple(poses.batch_shape)}"
         )
+    if wrong := [motor for motor in known if motor not in motors]:
+        raise DatasetError(f"known motors {wrong} are not among {motors}")
     given = units if isinstance(units, Mapping) else dict.fromkeys(names, units)
-    motors = [motor_of[joint] for joint in robot.joint_names]
     scales = {motor: as_scale(given.get(motor, "rad"), motor) for motor in motors}
-    factors = table.new_tensor([scales[motor].factor for motor in motors])
-    zeros = table.new_tensor([scales[motor].offset for motor in motors])
-    angles = table[:, [names.index(motor) for motor in motors]] * factors + zeros
-    for motor in known:
-        if motor not in motors:
-            raise DatasetError(f"known motor {motor!r} is none of the motors {motors}")
+    angles = torch.stack(
+        [table[:, names.index(m)] * scales[m].factor + scales[m].offset for m in motors], 1
+    )
     moves = robot.state(angles).jacobians[:, robot.links.index(link)].abs().amax((0, 1)) > 1e-9
     chosen = [i for i, motor in enumerate(motors) if moves[i] and motor not in known]
     if not 0 < len(chosen) <= MOST_MOTORS:
@@ -165,31 +163,24 @@ def estimate_motor_map(
             f"{len(chosen)} motors move the link {link!r}; the map of 1 to {MOST_MOTORS} can "
             "be estimated at once: take one arm, or say which are known, known=[...]"
         )
-    problem = _Problem(
-        robot, link, angles, chosen, poses.to(table), position_std,
-        orientation_std if orientations else math.inf,
-    )  # fmt: skip
+    std = position_std, orientation_std if orientations else math.inf
+    problem = _Problem(robot, link, angles, chosen, poses.to(table), *std)
     signs, offsets, cost = problem.solve()
     best = int(cost.argmin())
-    covariance = problem.covariance(signs[best : best + 1], offsets[best : best + 1])[0]
-    errors = covariance.diagonal().clamp_min(0).sqrt()
-    position, orientation = problem.misfit(signs[best : best + 1], offsets[best : best + 1])
+    errors = problem.errors(signs[best], offsets[best])
     labels = [motors[i] for i in chosen]
     _check(labels, signs, cost, best, errors, problem.rows)
-    turn = dict(zip(labels, signs[best].int().tolist(), strict=True))
+    turns = dict(zip(labels, signs[best].int().tolist(), strict=True))
     # a half turn to either side is the same angle
     wrapped = math.pi - torch.remainder(math.pi - offsets[best], math.tau)
-    shift = dict(zip(labels, wrapped.tolist(), strict=True))
-    for name in labels:
-        scale = scales[name]
-        scales[name] = Scale(turn[name] * scale.factor, turn[name] * scale.offset + shift[name])
+    shifts = dict(zip(labels, wrapped.tolist(), strict=True))
+    scales |= {
+        m: Scale(turns[m] * scales[m].factor, turns[m] * scales[m].offset + shifts[m])
+        for m in labels
+    }
+    uncertainty = dict(zip(labels, errors.tolist(), strict=True))
     return MotorMap(
-        units=scales,
-        signs=turn,
-        offsets=shift,
-        uncertainty=dict(zip(labels, errors.tolist(), strict=True)),
-        position_error=position,
-        orientation_error=orientation,
+        scales, turns, shifts, uncertainty, *problem.misfit(signs[best], offsets[best])
     )
 
 
@@ -204,15 +195,15 @@ def _check(
             "position_std and orientation_std say they are: is it this link, the robot's base "
             "frame, and do units make angles of the values?"
         )
-    advice = "take more postures, in which it moves further and the others differ"
     for i, name in enumerate(labels):
         wrong = cost[signs[:, i] != signs[best, i]].min() - cost[best]
         if not wrong > LEAST_EVIDENCE or not errors[i] < LEAST_CERTAINTY:
             raise DatasetError(
                 f"the poses do not tell the sign and the offset of motor {name!r} (a wrong "
                 f"sign fits {float(wrong):.1f} worse in log-likelihood, the offset is known to "
-                f"{math.degrees(errors[i]):.1f} deg): {advice}, give orientations, or say that "
-                f"it is known, known=[{name!r}]"
+                f"{math.degrees(errors[i]):.1f} deg): take more postures, in which it moves "
+                "further and the others differ, give orientations, or say that it is known, "
+                f"known=[{name!r}]"
             )
 
 
@@ -246,17 +237,17 @@ class _Problem:
         offsets = offsets.reshape(-1, GUESSES, m).take_along_dim(first[..., None], 1)[:, 0]
         return choices, *self._descend(choices, offsets, FINE)
 
-    def covariance(self, signs: Tensor, offsets: Tensor) -> Tensor:
-        """Of the offsets, with the accuracy that was given or what is left, if that is more."""
-        residual, jacobian = self._residual(signs, offsets)
-        freedom = max(self.rows - len(self.chosen), 1)
-        excess = (residual.square().sum(-1) / freedom).clamp_min(1)
-        return torch.linalg.pinv(jacobian.mT @ jacobian, hermitian=True) * excess[:, None, None]
+    def errors(self, signs: Tensor, offsets: Tensor) -> Tensor:
+        """Standard errors (m,): of the accuracy that was given, or of what is left if more."""
+        [residual], [jacobian] = self._residual(signs[None], offsets[None])
+        excess = residual.square().sum() / max(self.rows - len(self.chosen), 1)
+        covariance = torch.linalg.pinv(jacobian.mT @ jacobian, hermitian=True)
+        return (covariance.diagonal() * excess.clamp_min(1)).clamp_min(0).sqrt()
 
     def misfit(self, signs: Tensor, offsets: Tensor) -> tuple[float, float]:
         """Root mean square distances and angles that are left [m, rad]."""
-        parts = self._residual(signs, offsets)[0].reshape(len(self.angles), 6)
-        position, turn = parts.square().reshape(-1, 2, 3).sum(-1).mean(0).sqrt().tolist()
+        parts = self._residual(signs[None], offsets[None])[0].reshape(len(self.angles), 2, 3)
+        position, turn = parts.square().sum(-1).mean(0).sqrt().tolist()
         known = not math.isinf(self.orientation_std)
         return position * self.position_std, turn * self.orientation_std if known else math.nan
 
@@ -270,12 +261,12 @@ class _Problem:
             ridge = damping[:, None] * diagonal + 1e-9 * diagonal.amax(-1, keepdim=True)
             gradient = jacobian.mT @ residual[..., None]
             step = torch.linalg.solve(normal + torch.diag_embed(ridge), gradient)[..., 0]
-            new_residual, new_jacobian = self._residual(signs, offsets + step)
-            new_cost = new_residual.square().sum(-1) / 2
+            found = self._residual(signs, offsets + step)
+            new_cost = found[0].square().sum(-1) / 2
             better = new_cost < cost
             offsets = torch.where(better[:, None], offsets + step, offsets)
-            residual = torch.where(better[:, None], new_residual, residual)
-            jacobian = torch.where(better[:, None, None], new_jacobian, jacobian)
+            residual = torch.where(better[:, None], found[0], residual)
+            jacobian = torch.where(better[:, None, None], found[1], jacobian)
             cost = torch.where(better, new_cost, cost)
             damping = torch.where(better, damping / 5, damping * 5).clamp(1e-9, 1e9)
         return offsets, cost
@@ -283,18 +274,15 @@ class _Problem:
     def _residual(self, signs: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """What is left (S, 6 n) in units of its accuracy, and how offsets lessen it."""
         joints = self.angles.expand(len(signs), *self.angles.shape).clone()
-        turned = signs[:, None] * self.angles[:, self.chosen] + offsets[:, None]
-        joints[..., self.chosen] = turned
+        joints[..., self.chosen] *= signs[:, None]
+        joints[..., self.chosen] += offsets[:, None]
         state = self.robot.state(joints)
+        back = quaternions.conjugate(state.orientation(self.link))
+        turn = quaternions.log(quaternions.product(self.poses.orientation, back))
         away = self.poses.position - state.position(self.link)
-        turn = quaternions.product(
-            self.poses.orientation, quaternions.conjugate(state.orientation(self.link))
-        )
-        turn = quaternions.log(turn)
-        weights = [1 / self.position_std] * 3 + [1 / self.orientation_std] * 3
-        weight = away.new_tensor(weights)
-        residual = (torch.cat((away, turn), -1) * weight).flatten(1)
-        columns = state.jacobians[..., self.robot.links.index(self.link), :, :][
-            ..., self.chosen
-        ]
-        return residual, (columns * weight[:, None]).flatten(1, 2)
+        weight = away.new_tensor([1 / self.position_std, 1 / self.orientation_std])
+        weight = weight.repeat_interleave(3)
+        jacobian = state.jacobians[..., self.robot.links.index(self.link), :, :]
+        residual = torch.cat((away, turn), -1) * weight
+        weighted = jacobian[..., self.chosen] * weight[:, None]
+        return residual.flatten(1), weighted.flatten(1, 2)
