@@ -78,9 +78,7 @@ def match_names(
         fits = [fit for fit in fits if fit not in matched]
         if len(fits) != 1:
             what = f"fits several values, {fits}" if fits else "is none of the values"
-            raise DatasetError(
-                f"{kind} {name!r} {what}; they are called {list(present)}. {remedy}",
-                column=column,
-            )
+            message = f"{kind} {name!r} {what}; they are called {list(present)}. {remedy}"
+            raise DatasetError(message, column=column)
         matched[fits[0]] = name
     return matched

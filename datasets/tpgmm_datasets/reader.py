@@ -202,10 +202,8 @@ def _calibrated(
     listed = joint_names if isinstance(joint_names, Sequence) else None
     names = feature.names or (None if listed is None else tuple(listed))
     if names is None:
-        raise DatasetError(
-            "the metadata do not name the values: a calibration needs joint_names=[...]",
-            column=feature.key,
-        )
+        message = "the metadata do not name the values: a calibration needs joint_names=[...]"
+        raise DatasetError(message, column=feature.key)
     by_name: dict[str, Unit] = {**calibrated_units(calibration, names)}
     return by_name | dict(units) if isinstance(units, Mapping) else by_name
 

@@ -172,13 +172,12 @@ def convert(
     for i, (name, scale) in enumerate(zip(names, scales, strict=True)):
         low, high = scale.stored or (-math.inf, math.inf)
         if values[:, i].min() < low - ROUNDING or values[:, i].max() > high + ROUNDING:
-            raise DatasetError(
+            message = (
                 f"{name!r} goes from {values[:, i].min():.4g} to {values[:, i].max():.4g}, but "
                 f"is to be normalised to {low:g} ... {high:g}: was it recorded in degrees "
-                "(use_degrees)? Then units='deg' (--units deg), without a calibration",
-                column=column,
-                **where,
+                "(use_degrees)? Then units='deg' (--units deg), without a calibration"
             )
+            raise DatasetError(message, column=column, **where)
     converted: Array = values.astype(np.float64)
     if any(scale != NAMED["raw"] for scale in scales):
         converted = converted * [s.factor for s in scales] + [s.offset for s in scales]
@@ -237,8 +236,6 @@ def as_scale(unit: Unit, column: str) -> Scale:
     if unit == "auto":
         return NAMED["raw"]
     if unit not in NAMED:
-        raise DatasetError(
-            f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'auto', and Scale(...)",
-            column=column,
-        )
+        message = f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'auto', and Scale(...)"
+        raise DatasetError(message, column=column)
     return NAMED[unit]

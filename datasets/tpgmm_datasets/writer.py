@@ -318,7 +318,5 @@ def _old_statistics(old: Layout) -> Statistics:
         }
         if all(needed <= set(column) for column in statistics.values()):
             return statistics
-    raise DatasetError(
-        "statistics of some columns are missing or not readable; the set cannot grow",
-        file="meta/stats.json",
-    )
+    message = "statistics of some columns are missing or not readable; the set cannot grow"
+    raise DatasetError(message, file="meta/stats.json")

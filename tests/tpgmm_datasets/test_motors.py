@@ -137,7 +137,7 @@ def test_what_does_not_fit_together_is_refused() -> None:
         estimate_motor_map(ARM, LINK, degrees[:, :5], poses)
     with pytest.raises(DatasetError, match=r"poses \(9,\)"):
         estimate_motor_map(ARM, LINK, degrees, poses[:9])
-    with pytest.raises(DatasetError, match="known motors \['thumb'\] are not among"):
+    with pytest.raises(DatasetError, match=r"known motors \['thumb'\] are not among"):
         estimate_motor_map(ARM, LINK, degrees, poses, units="deg", known=["thumb"])
     with pytest.raises(DatasetError, match="0 motors move the link"):
         estimate_motor_map(ARM, LINK, degrees, poses, units="deg", known=ARM.joint_names)

@@ -76,6 +76,15 @@ def joint_findings(
     yield from _stuck(episodes, names)
 
 
+def _ranges(
+    names: Sequence[str], columns: Sequence[int], low: Array, high: Array, limits: Array
+) -> str:
+    places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
+    bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]
+    known = bool(np.isfinite(limits).any())
+    return listed([a + b * known for a, b in zip(places, bounds, strict=True)])
+
+
 def _limits(
     names: Sequence[str], low: Array, high: Array, limits: Array, unnamed: bool
 ) -> Iterator[Finding]:
@@ -85,14 +94,7 @@ def _limits(
     beyond = [int(j) for j in np.argsort(-excess) if excess[j] > allowed[j]]
     if not beyond or excess[beyond[0]] > IMPOSSIBLE:  # which is of units
         return
-    places = listed(
-        [
-            f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}, limits {limits[0, j]:.4g} to "
-            f"{limits[1, j]:.4g}"
-            for j in beyond
-        ]
-    )
-    about, worst = tuple(names[j] for j in beyond), float(excess[beyond[0]])
+    places, about = _ranges(names, beyond, low, high, limits), tuple(names[j] for j in beyond)
     # columns for the joints of the robot, in its order, such that all are within their limits
     cost = np.maximum(limits[0][:, None] - low, high - limits[1][:, None]) - allowed[:, None]
     rows, columns = linear_sum_assignment(cost.clip(min=0))
@@ -102,17 +104,11 @@ def _limits(
             f"columns {columns.tolist()} would fit the joints of the robot"
         )
         remedy = "Name the columns: Demonstration(..., joint_names=[...])"
-        yield Finding("order", message, remedy, about, value=worst)
+        yield Finding("order", message, remedy, about)
         return
-    yield Finding(
-        "limits",
-        f"joints are beyond the robot's limits: {places}",
-        "Check their zeros, units and order"
-        + (", and name them (joint_names=[...])" if unnamed else "")
-        + ", or that it is this robot; references will stay within the limits",
-        about,
-        value=worst,
-    )
+    remedy = "Check their zeros, units and order, that it is this robot"
+    remedy += ", and name them (joint_names=[...])" if unnamed else ""
+    yield Finding("limits", f"joints are beyond the robot's limits: {places}", remedy, about)
 
 
 def _units(
@@ -122,15 +118,16 @@ def _units(
     largest = np.maximum(-low, high)
     odd = sorted((i for i in angles if largest[i] > limit), key=lambda i: -largest[i])
     if odd:
-        places = listed([f"{names[i]!r} from {low[i]:.4g} to {high[i]:.4g}" for i in odd])
-        yield Finding(
-            "units",
-            f"joints are in radians (metres, where they slide), these hardly are: {places}",
-            "Are they in degrees, ticks or millimetres? If one joint is, all are: convert the "
-            "whole joint vector, and positions of frames",
-            tuple(names[i] for i in odd),
-            value=float(largest[odd[0]]),
+        unlimited = np.full((2, len(low)), np.inf)
+        places = _ranges(names, odd, low, high, unlimited * [[-1], [1]])
+        message = (
+            f"joints are in radians (metres, where they slide), these hardly are: {places}"
         )
+        remedy = (
+            "Are they in degrees, ticks or millimetres? If one joint is, all are: convert the "
+            "whole joint vector, and positions of frames"
+        )
+        yield Finding("units", message, remedy, tuple(names[i] for i in odd))
 
 
 def _speeds(
@@ -139,52 +136,39 @@ def _speeds(
     fastest = np.stack([one.fastest for one in episodes])
     over = np.stack([one.speed for one in episodes]) > FAST * velocity
     over |= fastest > FASTEST * velocity
-    odd, about = np.flatnonzero(over.any(axis=0)), np.flatnonzero(over.any(axis=1))
+    odd, about = np.flatnonzero(over.any(axis=0)), np.flatnonzero(over.any(axis=1)).tolist()
     if len(odd):
         most = fastest.max(axis=0)
         places = listed([f"{names[j]!r} {most[j]:.3g}, limit {velocity[j]:.3g}" for j in odd])
-        yield Finding(
-            "speed",
+        message = (
             f"joints move faster than the robot can, up to [rad/s or m/s]: {places} "
-            f"(demonstrations {listed([str(i) for i in about])})",
-            "Is time in seconds, are values lost, or did warping squeeze a motion?",
-            tuple(names[j] for j in odd),
-            tuple(about.tolist()),
-            float((most[odd] / velocity[odd]).max()),
+            f"(demonstrations {listed([str(i) for i in about])})"
         )
+        remedy = "Is time in seconds, are values lost, or did warping squeeze a motion?"
+        yield Finding("speed", message, remedy, tuple(names[j] for j in odd), tuple(about))
 
 
 def _steps(
     episodes: Sequence[RecordingSummary], names: Sequence[str], angles: Sequence[int]
 ) -> Iterator[Finding]:
     """Wraps and jumps."""
+    lost = "Were values lost, or the recording stopped? Repair or leave out the episode"
     kinds = {
         "wraps": ("by a whole turn", "Unwrap the joints (np.unwrap(joints, axis=0))"),
-        "jumps": (
-            "like no other of that joint",
-            "Were values lost, or the recording stopped? Repair or leave out the episode",
-        ),
+        "jumps": ("like no other of that joint", lost),
     }
     for check, (what, remedy) in kinds.items():
-        found = [
-            (i, names[j], at, size)
-            for i, episode in enumerate(episodes)
-            for j, at, size in getattr(episode, check)
-            if j in angles
-        ]
-        if found:
-            places = [
-                f"{name!r} by {size:.3g} at {at:.4g} s of demonstration {i}"
-                for i, name, at, size in found
-            ]
-            yield Finding(
-                check,
-                f"there are steps {what}: {listed(places)}",
-                remedy,
-                tuple(dict.fromkeys(name for _, name, _, _ in found)),
-                tuple(dict.fromkeys(i for i, *_ in found)),
-                max(size for *_, size in found),
-            )
+        places, joints, about = [], dict[str, None](), dict[int, None]()
+        for i, episode in enumerate(episodes):
+            for j, at, size in getattr(episode, check):
+                if j in angles:
+                    places.append(
+                        f"{names[j]!r} by {size:.3g} at {at:.4g} s of demonstration {i}"
+                    )
+                    joints[names[j]] = about[i] = None
+        if places:
+            message = f"there are steps {what}: {listed(places)}"
+            yield Finding(check, message, remedy, tuple(joints), tuple(about))
 
 
 def _clipped(
@@ -199,13 +183,11 @@ def _clipped(
     odd = {end: indices for end, indices in ends.items() if len(indices) > 1}
     if odd:
         places = [f"{name!r} at {v:.4g}, {len(i)} times" for (name, v), i in odd.items()]
-        yield Finding(
-            "clipped",
-            f"motions stop dead at one value and go on from it: {listed(places)}",
-            "Was the recording cut off at a limit, or a sensor saturated?",
-            tuple(dict.fromkeys(name for name, _ in odd)),
-            tuple(sorted({index for indices in odd.values() for index in indices})),
-        )
+        message = f"motions stop dead at one value and go on from it: {listed(places)}"
+        remedy = "Was the recording cut off at a limit, or a sensor saturated?"
+        about = sorted({index for indices in odd.values() for index in indices})
+        joints = dict.fromkeys(name for name, _ in odd)
+        yield Finding("clipped", message, remedy, tuple(joints), tuple(about))
 
 
 def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterator[Finding]:
@@ -216,18 +198,13 @@ def _stuck(episodes: Sequence[RecordingSummary], names: Sequence[str]) -> Iterat
     still = np.where(ranges <= 1e-9, 1.0, np.stack([one.still for one in episodes]))
     usual = np.median(ranges, axis=0)
     stuck = (still > STUCK) & (np.median(still, axis=0) < USUALLY_STILL) & (usual > MOVING)
-    odd = [(int(e), int(j)) for e, j in np.argwhere(stuck)]
+    odd = {(int(e), names[j]): (still[e, j], usual[j]) for e, j in np.argwhere(stuck)}
     if odd:
         places = [
-            f"{names[j]!r} of demonstration {e} for {still[e, j]:.0%} of it, usually it moves "
-            f"by {usual[j]:.2g}"
-            for e, j in odd
+            f"{name!r} of demonstration {e} for {share:.0%} of it, usually moves by {most:.2g}"
+            for (e, name), (share, most) in odd.items()
         ]
-        yield Finding(
-            "stuck",
-            f"joints keep one value while the others move: {listed(places)}",
-            "Was a sensor or a motor off? Leave the episode out",
-            tuple(dict.fromkeys(names[j] for _, j in odd)),
-            tuple(dict.fromkeys(e for e, _ in odd)),
-            float(max(still[e, j] for e, j in odd)),
-        )
+        message = f"joints keep one value while the others move: {listed(places)}"
+        remedy = "Was a sensor or a motor off? Leave the episode out"
+        joints, about = (dict.fromkeys(column) for column in zip(*odd, strict=True))
+        yield Finding("stuck", message, remedy, tuple(about), tuple(joints))

@@ -56,15 +56,11 @@ def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
             f"({', '.join(f'{x:.3g}' for x in first[i])})"
             for i in sorted(odd)
         ]
-        yield Finding(
-            "frames",
-            f"frame {name!r} is usually within {within:.2g} m of "
-            f"({', '.join(f'{x:.3g}' for x in usual)}), but {listed(places)}",
-            "Was the object tracked, and in the same base frame? Leave the episode out",
-            (name,),
-            tuple(sorted(odd)),
-            float(distances[[*odd]].max()),
-        )
+        centre = ", ".join(f"{x:.3g}" for x in usual)
+        message = f"frame {name!r} is usually within {within:.2g} m of ({centre}), but "
+        remedy = "Was the object tracked, and in the same base frame? Leave the episode out"
+        about = tuple(sorted(odd))
+        yield Finding("frames", message + listed(places), remedy, (name,), about)
 
 
 def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
@@ -75,15 +71,12 @@ def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
     angles = angles[:, np.median(angles[: len(some)], axis=0).argmin()]
     if odd := set_apart(angles, ALIKE):
         places = [f"by {np.rad2deg(angles[i]):.0f} deg in demonstration {i}" for i in odd]
-        yield Finding(
-            "frames",
+        message = (
             f"frame {name!r} is turned unlike in the others, {listed(places)}, usually within "
-            f"{np.rad2deg(np.delete(angles, odd).max()):.0f} deg",
-            "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out",
-            (name,),
-            tuple(odd),
-            float(angles[odd].max()),
+            f"{np.rad2deg(np.delete(angles, odd).max()):.0f} deg"
         )
+        remedy = "Was the object tracked, and are all quaternions (w, x, y, z)? Leave it out"
+        yield Finding("frames", message, remedy, (name,), tuple(odd))
 
 
 def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
@@ -97,14 +90,11 @@ def _jumps(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]
         places = [
             f"by {s:.3g} m at {at:.4g} s of demonstration {i}" for i, (s, at) in odd.items()
         ]
-        yield Finding(
-            "frames",
-            f"frame {name!r} jumps {listed(places)}",
-            "Did the tracker lose it? Leave the episode out, or give one pose for all of it",
-            (name,),
-            tuple(odd),
-            max(size for size, _ in odd.values()),
+        message = f"frame {name!r} jumps {listed(places)}"
+        remedy = (
+            "Did the tracker lose it? Leave the episode out, or give one pose for all of it"
         )
+        yield Finding("frames", message, remedy, (name,), tuple(odd))
 
 
 def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
@@ -114,15 +104,15 @@ def _quaternion_order(name: str, episodes: Sequence[RecordingSummary]) -> Iterat
     meant, _ = _upright(np.roll(given, 1, axis=-1))
     half_turns = np.median(np.abs(given[:, 0])) < 0.2
     if spread > np.deg2rad(2) and meant > 0.97 and upright < 0.5 and half_turns:
-        yield Finding(
-            "quaternions",
+        message = (
             f"frame {name!r} is turned by half turns about ever other axes; read as "
-            "(x, y, z, w), its quaternions are turns about the vertical",
-            "Quaternions are (w, x, y, z): give q[..., [3, 0, 1, 2]] "
-            "(load_lerobot: FramePose(..., rotation='xyzw'))",
-            (name,),
-            value=float(np.rad2deg(spread)),
+            "(x, y, z, w), its quaternions are turns about the vertical"
         )
+        remedy = (
+            "Quaternions are (w, x, y, z): give q[..., [3, 0, 1, 2]] "
+            "(load_lerobot: FramePose(..., rotation='xyzw'))"
+        )
+        yield Finding("quaternions", message, remedy, (name,))
 
 
 def _upright(orientations: Array) -> tuple[float, float]:

@@ -98,18 +98,14 @@ def _names(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ...]
     if isinstance(given, Mapping):
         for name in given:
             if name not in (names or ()):
-                raise DatasetError(
-                    f"joint_names has {name!r}; the values are called {names}",
-                    column=feature.key,
-                )
+                message = f"joint_names has {name!r}; the values are called {names}"
+                raise DatasetError(message, column=feature.key)
         names = tuple(given.get(name, name) for name in names or ())
     elif given is not None:
         names = (given,) if isinstance(given, str) else tuple(given)
     if names is not None and (len(names) != feature.width or len(set(names)) < len(names)):
-        raise DatasetError(
-            f"joint_names must give {feature.width} different names, got {names}",
-            column=feature.key,
-        )
+        message = f"joint_names must give {feature.width} different names, got {names}"
+        raise DatasetError(message, column=feature.key)
     if robot is None:
         return names
     if names is None:

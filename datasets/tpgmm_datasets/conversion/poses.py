@@ -122,13 +122,11 @@ class FramePose:
         if self.rotation in ("wxyz", "xyzw"):
             off = (torch.linalg.vector_norm(rotation, dim=-1) - 1).abs().max()
             if off > UNIT_NORM_TOLERANCE:
-                raise DatasetError(
+                message = (
                     f"the norm of a quaternion is off by {float(off):.3g}; are the columns "
-                    f"and their order right? The rotation is read as {self.rotation!r}",
-                    check="poses",
-                    column=self.feature,
-                    **where,
+                    f"and their order right? The rotation is read as {self.rotation!r}"
                 )
+                raise DatasetError(message, check="poses", column=self.feature, **where)
         return Frame(position, self._orientation(rotation))
 
     def _orientation(self, rotation: torch.Tensor) -> torch.Tensor | None:
@@ -201,14 +199,13 @@ class LinkPose:
         try:
             return demonstration.event(self.event)
         except UnknownNameError as error:
-            raise DatasetError(
+            message = (
                 f"frame of link {self.link!r}: {error}. Say how to find it, as in "
                 f"events={{{self.event!r}: 'closing:*gripper*'}} or --event "
                 f"{self.event}='closing:*gripper*'; leave episodes without it "
-                "out by relax=['events'] or --episodes",
-                check="events",
-                **where,
-            ) from error
+                "out by relax=['events'] or --episodes"
+            )
+            raise DatasetError(message, check="events", **where) from error
 
     def frame(self, demonstration: Demonstration, robot: Any, time: float) -> Frame:
         """The pose of the link at the step nearest to ``time``."""

@@ -156,12 +156,8 @@ def _declaration_problems(
         ) from error
     for name, there, here in pairs:
         if there != here:
-            yield DatasetError(
-                f"the file was written with {there!r}, but info.json says {here!r}",
-                check="metadata",
-                file=file,
-                column=name,
-            )
+            message = f"the file was written with {there!r}, but info.json says {here!r}"
+            yield DatasetError(message, check="metadata", file=file, column=name)
 
 
 def _rows(
@@ -191,25 +187,17 @@ def _row_problems(layout: Layout, episode: Episode, table: pa.Table) -> Iterator
     """All contradictions between the rows of an episode and the metadata, and in time."""
     where, rows = episode.where, len(table)
     if rows != episode.length:
-        yield DatasetError(
-            f"the metadata give {episode.length} rows, the file has {rows}",
-            check="metadata",
-            **where,
-        )
-    starts = {"frame_index": 0, "index": episode.start}
-    for name, start in starts.items():
-        if name not in table.column_names or (name == "index" and start is None):
+        message = f"the metadata give {episode.length} rows, the file has {rows}"
+        yield DatasetError(message, check="metadata", **where)
+    for name, start in {"frame_index": 0, "index": episode.start}.items():
+        if name not in table.column_names or start is None:
             continue
         column = table[name]
         if not pa.types.is_integer(column.type) or column.null_count:
             yield DatasetError("not all are whole numbers", column=name, **where)
-        elif (column.to_numpy() != np.arange(start, start + rows)).any():  # type: ignore[operator]
-            yield DatasetError(
-                f"it does not count from {start} in steps of one",
-                check="metadata",
-                column=name,
-                **where,
-            )
+        elif (column.to_numpy() != np.arange(start, start + rows)).any():
+            message = f"it does not count from {start} in steps of one"
+            yield DatasetError(message, check="metadata", column=name, **where)
     if "timestamp" in table.column_names:
         column = table["timestamp"]
         if not pa.types.is_floating(column.type) or column.null_count:
@@ -224,27 +212,19 @@ def _column_values(table: pa.Table, feature: Feature, episode: Episode) -> Array
     flat = _flat(table[feature.key].combine_chunks(), where)
     declared, stored = feature.dtype, str(flat.type)
     if stored != ARROW_NAMES.get(declared, declared) and (declared, stored) not in WIDER:
-        raise DatasetError(
-            f"it holds {stored}, info.json declares {declared}",
-            check="metadata",
-            **where,
-        )
+        message = f"it holds {stored}, info.json declares {declared}"
+        raise DatasetError(message, check="metadata", **where)
     if len(flat) != rows * feature.width:
-        raise DatasetError(
-            f"it has {len(flat) / rows:g} values per row, info.json declares "
-            f"{list(feature.shape)}",
-            check="metadata",
-            **where,
-        )
+        count = len(flat) / rows
+        message = f"it has {count:g} values per row, info.json declares {list(feature.shape)}"
+        raise DatasetError(message, check="metadata", **where)
     values: Array = flat.to_numpy(zero_copy_only=False).reshape(rows, feature.width)
     if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
         row, place = np.argwhere(~finite)[0].tolist()
         name = feature.names[place] if feature.names else f"value {place}"
-        raise DatasetError(
-            f"{int((~finite).sum())} values are NaN or infinite, the first: row {row}, {name}",
-            check="nan",
-            **where,
-        )
+        count = int((~finite).sum())
+        message = f"{count} values are NaN or infinite, the first: row {row}, {name}"
+        raise DatasetError(message, check="nan", **where)
     return values
 
 

@@ -24,6 +24,7 @@ __all__ = ["Episode", "Feature", "Layout", "open_layout"]
 #: Columns that LeRobot keeps for itself.
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 CAMERAS = ("video", "image")
+INFO = "meta/info.json"
 #: Of a row: what is longer is a mistake, and would fill the memory.
 MOST_VALUES = 100_000
 #: Indices beyond this are mistakes: floats could not count them.
@@ -151,11 +152,8 @@ class Layout:
         """
         readable = sorted(k for k, f in self.features.items() if not f.is_camera)
         if key not in readable:
-            raise DatasetError(
-                f"there is no numeric column of that name; the set has {readable}",
-                file="meta/info.json",
-                column=key,
-            )
+            message = f"there is no numeric column of that name; the set has {readable}"
+            raise DatasetError(message, file=INFO, column=key)
         return self.features[key]
 
 
@@ -168,32 +166,29 @@ def open_layout(root: Path) -> Layout:
         If there is no data set, its version is unknown, or its metadata cannot be read.
     """
     info = _read_info(root)
-    version = info.get("codebase_version")
-    if not isinstance(version, str) or version not in ("v2.0", "v2.1", "v3.0"):
+    version, robot_type = info.get("codebase_version"), info.get("robot_type")
+    fps: Any = info.get("fps")
+    if version not in ("v2.0", "v2.1", "v3.0"):
         raise DatasetError(
             f"codebase_version is {version!r}; v2.0, v2.1 and v3.0 are read. "
             "LeRobot's own converters bring older sets to v3.0",
-            file="meta/info.json",
+            file=INFO,
         )
-    fps = info.get("fps")
-    if not isinstance(fps, (int, float)) or isinstance(fps, bool) or not 0 < fps < HIGHEST_FPS:
-        raise DatasetError(
-            f"fps is {str(fps)[:20]}, not a number above 0 and below {HIGHEST_FPS:g}",
-            file="meta/info.json",
-        )
+    if type(fps) not in (int, float) or not 0 < fps < HIGHEST_FPS:
+        message = f"fps is {str(fps)[:20]}, not a number above 0 and below {HIGHEST_FPS:g}"
+        raise DatasetError(message, file=INFO)
     features = _features(info)
     modern = version == "v3.0"
-    rows = list(_episodes_v3(root) if modern else _episodes_v2(root))
-    episodes = [_episode(info, row, modern) for row in rows]
+    rows = _episodes_v3(root) if modern else _episodes_v2(root)
+    episodes = sorted((_episode(info, *row, modern) for row in rows), key=lambda e: e.index)
     tasks = _tasks(root, modern)
-    robot_type = info.get("robot_type")
     return Layout(
         root,
-        version,
+        str(version),
         float(fps),
         None if robot_type is None else str(robot_type),
         features,
-        tuple(sorted(episodes, key=lambda episode: episode.index)),
+        tuple(episodes),
         tasks,
         info,
         tuple(_contradictions(root, info, episodes, tasks)),
@@ -201,14 +196,12 @@ def open_layout(root: Path) -> Layout:
 
 
 def _read_info(root: Path) -> dict[str, Any]:
-    path = root / "meta" / "info.json"
-    if not path.is_file():
-        raise DatasetError(
-            f"{root} is not a LeRobot data set: it has no meta/info.json", check="missing"
-        )
-    info = _json(_bytes(root, "meta/info.json"), "meta/info.json")
+    if not (root / INFO).is_file():
+        message = f"{root} is not a LeRobot data set: it has no {INFO}"
+        raise DatasetError(message, check="missing")
+    info = _json(_bytes(root, INFO), INFO)
     if not isinstance(info, dict):
-        raise DatasetError("the file does not hold a JSON object", file="meta/info.json")
+        raise DatasetError("the file does not hold a JSON object", file=INFO)
     return info
 
 
@@ -230,7 +223,7 @@ def _json(text: bytes, file: str, line: int | None = None) -> Any:
 def _features(info: Mapping[str, Any]) -> dict[str, Feature]:
     declared = info.get("features")
     if not isinstance(declared, dict) or not declared:
-        raise DatasetError("'features' declares no columns", file="meta/info.json")
+        raise DatasetError("'features' declares no columns", file=INFO)
     return {key: _feature(key, entry) for key, entry in declared.items()}
 
 
@@ -239,19 +232,14 @@ def _feature(key: str, entry: Any) -> Feature:
     dtype, shape = entry.get("dtype"), entry.get("shape")
     sizes: list[Any] = shape if isinstance(shape, list) else [None]
     if not isinstance(dtype, str) or not all(type(n) is int and n > 0 for n in sizes):
-        raise DatasetError(
-            f"a feature needs a dtype and a shape, got {dtype!r} and {shape!r}",
-            file="meta/info.json",
-            column=key,
-        )
+        message = f"a feature needs a dtype and a shape, got {dtype!r} and {shape!r}"
+        raise DatasetError(message, file=INFO, column=key)
     width = math.prod(sizes)
     if width > MOST_VALUES and dtype not in CAMERAS:
-        raise DatasetError(
-            f"a row has {width} values, by its shape {shape!r}; no more than {MOST_VALUES} are "
-            "read",
-            file="meta/info.json",
-            column=key,
+        message = (
+            f"a row has {width} values, by its shape {shape!r}; at most {MOST_VALUES} are read"
         )
+        raise DatasetError(message, file=INFO, column=key)
     extra = entry.get("info")
     units = extra.get("units") if isinstance(extra, dict) else None
     return Feature(
@@ -266,12 +254,11 @@ def _feature(key: str, entry: Any) -> Feature:
 def _episodes_v3(root: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     files = sorted((root / "meta" / "episodes").glob("*/*.parquet"))
     if not files:
-        raise DatasetError(
+        message = (
             "there is no list of episodes: the set was never finalised "
-            "(LeRobotDataset.finalize) or was copied in part",
-            check="missing",
-            file="meta/episodes",
+            "(LeRobotDataset.finalize) or was copied in part"
         )
+        raise DatasetError(message, check="missing", file="meta/episodes")
     for path in files:
         table = read_columns(path, root, EPISODE_COLUMNS)
         file = str(path.relative_to(root))
@@ -297,19 +284,13 @@ def _json_lines(root: Path, file: str) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _episode(
-    info: Mapping[str, Any], place_row: tuple[str, dict[str, Any]], modern: bool
+    info: Mapping[str, Any], place: str, row: Mapping[str, Any], modern: bool
 ) -> Episode:
-    place, row = place_row
-    whole = ["episode_index", "length"]
-    if modern:
-        whole += [name for name in EPISODE_COLUMNS if name not in ("tasks", *whole)]
-    for name in whole:
+    whole = [name for name in EPISODE_COLUMNS if name != "tasks"]
+    for name in whole if modern else ("episode_index", "length"):
         if type(row.get(name)) is not int or not 0 <= row[name] <= LARGEST_INDEX:
-            raise DatasetError(
-                f"{row.get(name)!r} is not a whole number from 0 to 2^53",
-                file=place,
-                column=name,
-            )
+            message = f"{row.get(name)!r} is not a whole number from 0 to 2^53"
+            raise DatasetError(message, file=place, column=name)
     index, length = row["episode_index"], row["length"]
     tasks = row.get("tasks") or ()
     if not all(isinstance(task, str) for task in tasks):
@@ -319,11 +300,8 @@ def _episode(
         return Episode(index, length, tuple(tasks), file)
     start, stop = row["dataset_from_index"], row["dataset_to_index"]
     if stop - start != length:
-        raise DatasetError(
-            f"the length is {length} but the rows go from {start} to {stop}",
-            file=place,
-            episode=index,
-        )
+        message = f"the length is {length} but the rows go from {start} to {stop}"
+        raise DatasetError(message, file=place, episode=index)
     return Episode(index, length, tuple(tasks), file, start)
 
 
@@ -331,7 +309,7 @@ def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) ->
     template = info.get("data_path")
     size = info.get("chunks_size", 1000)
     if type(size) is not int or size < 1:
-        raise DatasetError(f"chunks_size is {size!r}", file="meta/info.json")
+        raise DatasetError(f"chunks_size is {size!r}", file=INFO)
     index = row["episode_index"]
     chunk = row["data/chunk_index"] if modern else index // size
     numbers = {
@@ -346,11 +324,11 @@ def _data_file(info: Mapping[str, Any], row: Mapping[str, Any], modern: bool) ->
         raise DatasetError(
             f"data_path {template!r} cannot be filled in: it has fields like "
             f"{{chunk_index:03d}}, of {sorted(numbers)}",
-            file="meta/info.json",
+            file=INFO,
         )
     file = Path(template.format(**numbers))
     if file.is_absolute() or ".." in file.parts or "\0" in str(file):
-        raise DatasetError(f"data_path {template!r} leaves the set", file="meta/info.json")
+        raise DatasetError(f"data_path {template!r} leaves the set", file=INFO)
     return file
 
 
@@ -377,32 +355,23 @@ def _contradictions(
         "total_tasks": len(tasks),
     }
     for name, count in counts.items():
-        if name in info and info[name] != count:
-            yield DatasetError(
-                f"{name} is {info[name]!r}, but the set lists {count}",
-                check="metadata",
-                file="meta/info.json",
-            )
+        if info.get(name, count) != count:
+            message = f"{name} is {info[name]!r}, but the set lists {count}"
+            yield DatasetError(message, check="metadata", file=INFO)
     seen: set[int] = set()
-    for episode in episodes:
-        if episode.index in seen:
-            yield DatasetError(
-                "the metadata list it twice", check="duplicates", episode=episode.index
-            )
-        seen.add(episode.index)
-        for task in episode.tasks:
-            if task not in tasks:
-                yield DatasetError(
-                    f"its task {task!r} is not among the tasks of the set, {list(tasks)}",
-                    check="metadata",
-                    episode=episode.index,
-                )
+    for one in episodes:
+        if one.index in seen:
+            message = "the metadata list it twice"
+            yield DatasetError(message, check="duplicates", episode=one.index)
+        seen.add(one.index)
+        for task in set(one.tasks) - set(tasks):
+            message = f"its task {task!r} is not among the tasks of the set, {list(tasks)}"
+            yield DatasetError(message, check="metadata", episode=one.index)
     listed = {episode.file for episode in episodes}
     for path in sorted((root / "data").glob("*/*.parquet")):
         if path.relative_to(root) not in listed:
-            yield DatasetError(
+            message = (
                 "no episode of the metadata lies in this file: it is a left-over of another "
-                "set or of an interrupted recording",
-                check="metadata",
-                file=path.relative_to(root),
+                "set or of an interrupted recording"
             )
+            yield DatasetError(message, check="metadata", file=path.relative_to(root))

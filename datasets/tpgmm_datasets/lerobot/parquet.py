@@ -38,12 +38,11 @@ def _named(file: Path) -> Iterator[None]:
         if isinstance(error, DatasetError):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise DatasetError(
+        message = (
             "this is not a complete parquet file: it is corrupted, truncated, or the set "
-            f"was never finalised ({reason})",
-            check="missing",
-            file=file,
-        ) from error
+            f"was never finalised ({reason})"
+        )
+        raise DatasetError(message, check="missing", file=file) from error
 
 
 def open_parquet(
@@ -70,12 +69,11 @@ def open_parquet(
         present = parquet.schema_arrow.names
     for column in (*columns, *(name for name in optional if name in present)):
         if present.count(column) != 1:
-            raise DatasetError(
+            message = (
                 f"the file has {present.count(column)} columns of that name; it has "
-                f"{[name for name in present if not name.startswith('stats/')]}",
-                file=file,
-                column=column,
+                f"{[name for name in present if not name.startswith('stats/')]}"
             )
+            raise DatasetError(message, file=file, column=column)
     return parquet
 
 

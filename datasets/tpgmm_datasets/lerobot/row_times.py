@@ -28,32 +28,22 @@ def time_problems(timestamps: Array, fps: float, **where: Any) -> Iterator[Datas
     steps = np.diff(timestamps.astype(np.float64))
     if (np.abs(steps * fps - 1) < 0.1).all():
         return
+    usual, longest = float(np.median(steps)), int(steps.argmax())
+    check = message = ""
     if (steps <= 0).any():
-        at = int(np.flatnonzero(steps <= 0)[0])
-        yield DatasetError(
-            f"time does not increase from {timestamps[at]:.6g} to {timestamps[at + 1]:.6g} s "
-            f"at row {at + 1}",
-            check="time",
-            **where,
-        )
+        check, at = "time", int(np.flatnonzero(steps <= 0)[0])
+        message = "time does not increase from {:.6g} to {:.6g} s at row {}"
+    elif abs(usual * fps - 1) > 0.1:
+        problem = f"rows are {usual:.6g} s apart, but info.json says fps = {fps:g}"
+        yield DatasetError(problem, check="metadata", **where)
         return
-    usual = float(np.median(steps))
-    if abs(usual * fps - 1) > 0.1:
-        yield DatasetError(
-            f"rows are {usual:.6g} s apart, but info.json says fps = {fps:g}",
-            check="metadata",
-            **where,
-        )
-        return
-    if steps.max() * fps > LONGEST_STEP:
-        at = int(steps.argmax())
+    elif steps[longest] * fps > LONGEST_STEP:
+        check, at = "gaps", longest
         missing = round(float(steps[at]) * fps) - 1
-        yield DatasetError(
-            f"about {missing} rows are missing between {timestamps[at]:.6g} and "
-            f"{timestamps[at + 1]:.6g} s (row {at + 1})",
-            check="gaps",
-            **where,
-        )
+        message = f"about {missing} rows are missing between {{:.6g}} and {{:.6g}} s (row {{}})"
+    if check:
+        text = message.format(timestamps[at], timestamps[at + 1], at + 1)
+        yield DatasetError(text, check=check, **where)
 
 
 def row_times(timestamps: Array | None, rows: int, fps: float) -> Array:

@@ -58,7 +58,6 @@ def test_an_order_that_fits_is_named_only_for_joints_without_names():
 def test_speeds_beyond_the_robot_are_named_with_the_limit():
     [finding] = found(bounded((-2, 2), velocity=0.5), 1.5)
     assert finding.check == "speed" and finding.episodes == (0, 1, 2, 3)
-    assert finding.value == pytest.approx(1.5 * np.pi / 2 / 0.5, rel=1e-2)
 
 
 def test_grippers_may_be_in_any_unit():
