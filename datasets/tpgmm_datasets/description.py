@@ -174,11 +174,13 @@ def _column(
         if units is None and feature.key == joints:
             names = feature.names or ("",) * len(low)
             # the joints of a feature have one unit, grippers may have their own
-            joint = [n for n, name in enumerate(names) if not is_gripper(name)]
-            common = guess_unit(
-                min((low[n] for n in joint), default=0.0),
-                max((high[n] for n in joint), default=0.0),
-            )
+            joint = [
+                (a, b)
+                for name, a, b in zip(names, low, high, strict=True)
+                if not is_gripper(name)
+            ]
+            lows, highs = zip(*joint, strict=True) if joint else ((0.0,), (0.0,))
+            common = guess_unit(min(lows), max(highs))
             guesses = [
                 f"{guess_unit(a, b) if is_gripper(name) else common}?"
                 for name, a, b in zip(names, low, high, strict=True)

@@ -158,9 +158,8 @@ def open_recording(
     if calibration is not None:
         units = _calibrated(feature, calibration, joint_names, units)
     columns = JointColumns.choose(feature, joint_names, units, robot)
-    unknown = [
-        n for n, u in zip(feature.names or (), columns.units, strict=False) if u == "auto"
-    ]
+    pairs = zip(feature.names or (), columns.units, strict=False)
+    unknown = [name for name, unit in pairs if unit == "auto"]
     if calibration is not None and unknown:
         raise DatasetError(
             f"the calibration has no motor for {unknown}: give their units, "
@@ -170,15 +169,8 @@ def open_recording(
         )
     sources = frame_sources(layout, frames)
     stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
-    assembly = Assembly(
-        layout,
-        columns,
-        sources,
-        event_sources(events, sources, stored, columns.names),
-        robot,
-        rate,
-        trim,
-    )
+    detectors = event_sources(events, sources, stored, columns.names)
+    assembly = Assembly(layout, columns, sources, detectors, robot, rate, trim)
     # one unit for all episodes: a quiet one does not decide
     stated = stated_range(layout.root, feature.key, feature.width)
     if stated is not None:
@@ -225,20 +217,22 @@ def select_episodes(
     if episodes is None:
         return available
     if isinstance(episodes, slice):
-        if not available[episodes]:
-            raise DatasetError(f"{episodes} chooses none of the {len(available)} episodes")
-        return available[episodes]
-    if isinstance(episodes, str):
+        chosen = available[episodes]
+        problem = f"{episodes} chooses none of the {len(available)} episodes"
+    elif isinstance(episodes, str):
         chosen = [episode for episode in available if episodes in episode.tasks]
-        if not chosen:
-            raise DatasetError(
-                f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
-            )
-        return chosen
-    missing = [index for index in episodes if index not in by_index]
-    if missing:
-        raise DatasetError(f"there are no episodes {missing}; the set has {sorted(by_index)}")
-    return [by_index[index] for index in sorted({int(index) for index in episodes})]
+        problem = f"no episode has the task {episodes!r}; the tasks are {list(layout.tasks)}"
+    else:
+        wanted = sorted({int(index) for index in episodes})
+        chosen = [by_index[index] for index in wanted if index in by_index]
+        missing = [index for index in wanted if index not in by_index]
+        problem = f"there are no episodes {missing}; the set has {sorted(by_index)}"
+        chosen = [] if missing else chosen
+        if not wanted:
+            return []
+    if not chosen:
+        raise DatasetError(problem)
+    return chosen
 
 
 def opened_by[**P, T](

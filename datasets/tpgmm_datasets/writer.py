@@ -181,22 +181,21 @@ def _extended(old: Layout, new: dict[str, Any]) -> dict[str, Any]:
     features = {**new["features"]}
     # an event that none of the new demonstrations has stays a column
     features |= {k: v for k, v in info["features"].items() if k.startswith("event.")}
-    for name, given, present in (
-        ("codebase_version", new["codebase_version"], old.version),
-        ("fps", new["fps"], info["fps"]),
-        ("robot_type", new["robot_type"] or info.get("robot_type"), info.get("robot_type")),
-        ("features", sorted(features), sorted(info["features"])),
-    ):
+    pairs = [(name, new[name], info[name]) for name in ("codebase_version", "fps")]
+    pairs.append(
+        ("robot_type", new["robot_type"] or info.get("robot_type"), info.get("robot_type"))
+    )
+    pairs.append(("features", sorted(features), sorted(info["features"])))
+    for name, given, present in pairs:
         if given != present:
             raise DatasetError(f"the set has {name} {present!r}, the demonstrations {given!r}")
     for key, feature in features.items():
         for name in ("dtype", "shape", "names"):
-            present = info["features"][key].get(name)
-            if feature[name] != present:
-                raise DatasetError(
-                    f"the set has {name} {present!r}, the demonstrations {feature[name]!r}",
-                    column=key,
+            if feature[name] != (present := info["features"][key].get(name)):
+                message = (
+                    f"the set has {name} {present!r}, the demonstrations {feature[name]!r}"
                 )
+                raise DatasetError(message, column=key)
     return info
 
 
@@ -223,41 +222,35 @@ class _Writer:
         commanded: Sequence[Demonstration | None],
     ) -> None:
         with self.data, self.meta:
-            for number, episode in enumerate(
-                zip(demonstrations, tasks, commanded, strict=True)
-            ):
-                self._episode(number, *episode)
+            for number, one in enumerate(zip(demonstrations, tasks, commanded, strict=True)):
+                self._episode(number, *one)
                 if len(self.pending) == FLUSH_EPISODES:
                     self._flush()
             self._flush()
         self._tables()
 
     def _episode(
-        self,
-        number: int,
-        demonstration: Demonstration,
-        task: str,
-        commanded: Demonstration | None,
+        self, number: int, shown: Demonstration, task: str, commanded: Demonstration | None
     ) -> None:
         features = self.info["features"]
         if task not in self.tasks:
             self.tasks.append(task)
         first = features["observation.state"]["names"]
-        if (demonstration.joint_names is None) != (first is None):
+        if (shown.joint_names is None) != (first is None):
             raise DatasetError(f"demonstration {number} has joint_names unlike the others")
         if first is not None:
-            demonstration = demonstration.reordered(first)
+            shown = shown.reordered(first)
             commanded = commanded and commanded.reordered(first)
-        columns = demonstration_columns(demonstration, number, features, self.info["fps"])
+        columns = demonstration_columns(shown, number, features, self.info["fps"])
         if commanded is not None:
             columns |= action_column(commanded, number, features)
-        rows = len(demonstration)
+        rows = len(shown)
         columns["episode_index"] = np.full((rows, 1), self.episodes)
         columns["index"] = np.arange(self.rows, self.rows + rows)[:, None]
         columns["task_index"] = np.full((rows, 1), self.tasks.index(task))
         columns = {key: columns[key] for key in features}
         chunk, file = self.data.write(feature_table(columns, features))
-        statistics = episode_statistics(columns)
+        new, before = episode_statistics(columns), self.statistics
         row: dict[str, Any] = {
             "episode_index": self.episodes,
             "tasks": [task],
@@ -267,11 +260,10 @@ class _Writer:
             "dataset_from_index": self.rows,
             "dataset_to_index": self.rows + rows,
         }
-        for key, column in statistics.items():
+        for key, column in new.items():
             row |= {f"stats/{key}/{name}": column[name].tolist() for name in column}
         self.pending.append(row)
-        before = self.statistics
-        self.statistics = statistics if before is None else merge_statistics(before, statistics)
+        self.statistics = new if before is None else merge_statistics(before, new)
         self.episodes, self.rows = self.episodes + 1, self.rows + rows
 
     def _flush(self) -> None:

@@ -201,12 +201,9 @@ class BottleExperiment:
         return TaskParameterizedGMM(n_components, operators, self.skill.robot)
 
     def _settings(self) -> dict[str, Any]:
+        own = ("n_components", "n_demonstrations", "n_situations", "seed")
         packages = ("tpgmm-torch", "torch", "numpy", "scikit-learn")
-        return {
-            "n_components": self.n_components,
-            "n_demonstrations": self.n_demonstrations,
-            "n_situations": self.n_situations,
-            "seed": self.seed,
+        return {name: getattr(self, name) for name in own} | {
             "threads": torch.get_num_threads(),
             "machine": platform.machine(),
             "python": platform.python_version(),
@@ -218,23 +215,22 @@ class _Measure:
     """The figures of merit, against aligned demonstrations."""
 
     def __init__(self, skill: BottleShaking, aligned: Sequence[Demonstration]) -> None:
-        self.skill, self.aligned = skill, aligned
-        self.time = aligned[0].time
-        events = {
-            name: float(np.mean([d.events[name] for d in aligned]))
+        self.skill, self.aligned, self.time = skill, aligned, aligned[0].time
+        grasp, shake, rest = (
+            float(np.mean([d.events[name] for d in aligned]))
             for name in ("grasp", "shake", "rest")
-        }
-        self.contact = int(torch.searchsorted(self.time, events["grasp"]))
-        self.spans = {
-            "reach": (0.0, events["grasp"]),
-            "shake": (events["shake"], events["rest"]),
-        }
-        length = events["rest"] - events["shake"]
-        self.shaking = self._window(events["shake"], events["rest"])
+        )
+        self.contact = int(torch.searchsorted(self.time, grasp))
+        self.spans = {"reach": (0.0, grasp), "shake": (shake, rest)}
+        self.shaking = self._window(shake, rest)
         # the first and the last eighth of the shaking grow and fade
-        self.steady = self._window(events["shake"] + length / 8, events["rest"] - length / 8)
-        self.grasping = self._window(events["grasp"] - 2.0, events["grasp"])
-        self.shoulders = torch.stack([skill.shoulders(d) for d in aligned]).mean(0)
+        fade = (rest - shake) / 8
+        self.steady = self._window(shake + fade, rest - fade)
+        self.grasping = self._window(grasp - 2.0, grasp)
+        self.shoulders = self._shoulders(aligned).mean(0)
+
+    def _shoulders(self, motions: Sequence[Trajectory | Demonstration]) -> Tensor:
+        return torch.stack([self.skill.shoulders(motion) for motion in motions])
 
     def _window(self, start: float, end: float) -> Tensor:
         return (self.time >= start) & (self.time <= end)
@@ -249,9 +245,7 @@ class _Measure:
             joints[:, self.contact],
             Frame.stack([situation.frames["bottle"] for situation in situations]),
         )
-        shoulders = torch.stack(
-            [self.skill.shoulders(trajectory) for trajectory in trajectories]
-        )
+        shoulders = self._shoulders(trajectories)
         residual = (shoulders - self.shoulders)[:, self.shaking]
         wanted = self._rhythm(self.shoulders)
         rhythms = np.array([self._rhythm(motion) for motion in shoulders]) / wanted - 1
@@ -265,11 +259,7 @@ class _Measure:
             "amplitude error [%]": _spread(100 * np.abs(rhythms[:, 1])),
             "first step [rad]": float((joints[:, 0] - starts).abs().max()),
             "beyond joint limits [rad]": float(beyond.max()),
-            "joint speed [rad/s]": _spread([largest_velocity(t) for t in trajectories]),
-            "joint acceleration [rad/s^2]": _spread(
-                [largest_acceleration(t) for t in trajectories]
-            ),
-        }
+        } | _pace(trajectories)
 
     def _rhythm(self, shoulders: Tensor) -> NDArray[np.float64]:
         """Frequency and amplitude, the mean of both shoulders."""
@@ -279,12 +269,8 @@ class _Measure:
     def shares(self, trajectories: Sequence[Trajectory]) -> dict[str, float]:
         """Figure 6 in two numbers: who determines the shoulders, and when."""
         columns = [self.skill.robot.joint_names.index(name) for name in SHOULDERS]
-        task, canonical = (
-            torch.stack(
-                [t.candidates[j].share[:, columns].mean(-1) for t in trajectories]
-            ).mean(0)
-            for j in (0, 1)
-        )
+        shares = [torch.stack([t.candidates[j].share for t in trajectories]) for j in (0, 1)]
+        task, canonical = (share[..., columns].mean((0, -1)) for share in shares)
         return {
             "task operator, two seconds before the grasp": float(task[self.grasping].mean()),
             "canonical operator, while shaking": float(canonical[self.steady].mean()),
@@ -307,39 +293,33 @@ class _Measure:
             done = ((torch.from_numpy(path) - shake) / (rest - shake)).clamp(0, 1)
             phases.append(2 * math.pi * self.skill.cycles * done)
         spread = torch.stack(phases)[:, self.steady].std(0)
-        shoulders = torch.stack([self.skill.shoulders(t) for t in trajectories])
-        residuals = [
-            (shoulders - self.skill.shoulders(d))[:, self.shaking] for d in self.aligned
-        ]
+        apart = self._shoulders(trajectories)[None] - self._shoulders(self.aligned)[:, None]
+        rmse = apart[:, :, self.shaking].square().mean().sqrt()
         return {
             "spread of the shaking's phase [rad]": float(spread.square().mean().sqrt()),
-            "shoulder RMSE against each demonstration [rad]": float(
-                torch.stack(residuals).square().mean().sqrt()
-            ),
+            "shoulder RMSE against each demonstration [rad]": float(rmse),
         }
 
     def demonstrations(self, demonstrations: Sequence[Demonstration]) -> dict[str, Any]:
         """What the demonstrations themselves reach, before alignment."""
-        errors = [
-            self.skill.grasp_error(
-                d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))], d.frames["bottle"]
-            )
-            for d in demonstrations
+        contacts = [
+            d.joints[int(torch.searchsorted(d.time, d.events["grasp"]))] for d in demonstrations
         ]
+        bottles = Frame.stack([d.frames["bottle"] for d in demonstrations])
+        position, orientation = self.skill.grasp_error(torch.stack(contacts), bottles)
+        durations = [d.duration for d in demonstrations]
         return {
-            "duration [s]": [
-                min(d.duration for d in demonstrations),
-                max(d.duration for d in demonstrations),
-            ],
-            "grasp position error [mm]": _spread([1e3 * float(p) for p, _ in errors]),
-            "grasp orientation error [deg]": _spread(
-                [float(torch.rad2deg(o)) for _, o in errors]
-            ),
-            "joint speed [rad/s]": _spread([largest_velocity(d) for d in demonstrations]),
-            "joint acceleration [rad/s^2]": _spread(
-                [largest_acceleration(d) for d in demonstrations]
-            ),
-        }
+            "duration [s]": [min(durations), max(durations)],
+            "grasp position error [mm]": _spread(1e3 * position),
+            "grasp orientation error [deg]": _spread(torch.rad2deg(orientation)),
+        } | _pace(demonstrations)
+
+
+def _pace(motions: Sequence[Trajectory | Demonstration]) -> dict[str, Any]:
+    return {
+        "joint speed [rad/s]": _spread([largest_velocity(one) for one in motions]),
+        "joint acceleration [rad/s^2]": _spread([largest_acceleration(one) for one in motions]),
+    }
 
 
 def _spread(values: Any) -> dict[str, float]:

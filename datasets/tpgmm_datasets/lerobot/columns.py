@@ -117,10 +117,7 @@ def demonstration_columns(
             "tpgmm_datasets.resample(demonstration, fps)"
         )
     joints = as_array(demonstration.joints)
-    columns: dict[str, Array] = {
-        STATE: joints,
-        ACTION: np.concatenate((joints[1:], joints[-1:])),
-    }
+    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
     if demonstration.frames:
         columns[ENVIRONMENT] = np.concatenate(
             [pose_values(demonstration.frame(n), steps) for n in _frame_order(features)], axis=1
@@ -130,11 +127,8 @@ def demonstration_columns(
             columns[key] = _flag(demonstration, key.removeprefix(EVENT), fps)
     columns["timestamp"] = grid[:, None]
     columns["frame_index"] = np.arange(steps)[:, None]
-    return {
-        key: _cast(columns[key], features[key]["dtype"], key, number)
-        for key in features
-        if key in columns
-    }
+    kinds = {key: features[key]["dtype"] for key in features if key in columns}
+    return {key: _cast(columns[key], kind, key, number) for key, kind in kinds.items()}
 
 
 def action_column(
@@ -191,9 +185,4 @@ def feature_table(columns: Mapping[str, Array], features: Mapping[str, Any]) -> 
 
 
 def _arrow_type(dtype: str) -> pa.DataType:
-    return {
-        "float32": pa.float32(),
-        "float64": pa.float64(),
-        "int64": pa.int64(),
-        "bool": pa.bool_(),
-    }[dtype]
+    return pa.bool_() if dtype == "bool" else getattr(pa, dtype)()
