@@ -56,12 +56,7 @@ class EpisodeBatches:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        size: int = 16,
-        *,
-        processes: Processes = ALONE,
-        **options: Any,
+        self, path: str | Path, size: int = 16, *, processes: Processes = ALONE, **options: Any
     ) -> None:
         if size < 1:
             raise DatasetError(f"a batch holds at least one episode, got size={size}")

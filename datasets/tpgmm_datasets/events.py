@@ -276,9 +276,7 @@ class Stop(Detector):
 
 
 def find_events(
-    demonstrations: Iterable[Demonstration],
-    events: Mapping[str, Detector],
-    robot: Any = None,
+    demonstrations: Iterable[Demonstration], events: Mapping[str, Detector], robot: Any = None
 ) -> list[Demonstration]:
     """Demonstrations with the events that are found in them.
 

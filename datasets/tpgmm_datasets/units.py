@@ -95,14 +95,8 @@ class Scale:
 
 
 #: Units that can be named; "raw" says that the values are to be taken as they are.
-NAMED = {
-    "rad": Scale(1.0),
-    "deg": Scale(math.pi / 180),
-    "m": Scale(1.0),
-    "mm": Scale(1e-3),
-    "1": Scale(1.0),
-    "raw": Scale(1.0),
-}
+NAMED = {name: Scale(1.0) for name in ("rad", "m", "1", "raw")}
+NAMED |= {"deg": Scale(math.pi / 180), "mm": Scale(1e-3)}
 
 #: Units of a pose: position, then quaternion.
 POSE_UNITS = ("m", "m", "m", "1", "1", "1", "1")
@@ -136,11 +130,7 @@ def with_pose_units(names: Sequence[str] | None, units: Sequence[str]) -> tuple[
 
 
 def convert(
-    values: Array,
-    names: Sequence[str],
-    units: Sequence[Unit],
-    column: str,
-    **where: Any,
+    values: Array, names: Sequence[str], units: Sequence[Unit], column: str, **where: Any
 ) -> Array:
     """Bring values to radians and metres.
 

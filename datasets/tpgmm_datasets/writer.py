@@ -20,7 +20,7 @@ from tpgmm_datasets.lerobot.columns import (
     feature_table,
     features_of,
 )
-from tpgmm_datasets.lerobot.files import FileSeries
+from tpgmm_datasets.lerobot.files import METADATA_KEY, file_path, free_place, write_tables
 from tpgmm_datasets.lerobot.layout import Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import (
     QUANTILES,
@@ -35,8 +35,8 @@ __all__ = ["save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-#: Episodes whose metadata are written at a time.
-FLUSH_EPISODES = 100
+#: LeRobot's numbers: of files in a folder, and of the size of a file, which it does not need.
+CHUNK_FILES, FILE_MEGABYTES = 1000, 100
 
 
 def save_lerobot(
@@ -50,8 +50,6 @@ def save_lerobot(
     units: Mapping[str, str] | None = None,
     dtype: str = "float32",
     append: bool = False,
-    file_megabytes: float = 100,
-    chunk_files: int = 1000,
 ) -> Path:
     """Write demonstrations as a LeRobot data set (v3.0), one episode each.
 
@@ -83,10 +81,6 @@ def save_lerobot(
         How joints and frames are stored. LeRobot's policies read float32 in either case.
     append : bool, default=False
         Add the episodes to the set at ``path``, if there is one.
-    file_megabytes : float, default=100
-        A parquet file is closed before it grows beyond this.
-    chunk_files : int, default=1000
-        Number of files in a folder.
 
     Returns
     -------
@@ -121,18 +115,13 @@ def save_lerobot(
         raise DatasetError(f"dtype is 'float32' or 'float64', got {dtype!r}")
     if int(fps) != fps or fps <= 0:
         raise DatasetError(f"LeRobot stores fps as a whole number > 0, got {fps!r}")
-    if file_megabytes <= 0 or chunk_files < 1:
-        raise DatasetError(
-            "file_megabytes must be > 0 and chunk_files >= 1, "
-            f"got {file_megabytes!r} and {chunk_files!r}"
-        )
     declared = {
         "codebase_version": "v3.0",
         "robot_type": robot_type,
         "fps": int(fps),
         "features": features_of(demonstrations, dtype, units),
-        "chunks_size": int(chunk_files),
-        "data_files_size_in_mb": file_megabytes,
+        "chunks_size": CHUNK_FILES,
+        "data_files_size_in_mb": FILE_MEGABYTES,
         "video_files_size_in_mb": 200,
         "data_path": DATA_PATH,
         "video_path": None,
@@ -208,12 +197,10 @@ class _Writer:
         self.episodes = 0 if old is None else len(old.episodes)
         self.rows = 0 if old is None else sum(episode.length for episode in old.episodes)
         self.statistics = None if old is None else _old_statistics(old)
-        self.pending: list[dict[str, Any]] = []
-        limits = int(info["data_files_size_in_mb"] * 1e6), info["chunks_size"]
-        declared = json.dumps({"fps": info["fps"], "features": info["features"]})
-        before = root if old is None else old.root
-        self.data = FileSeries(root, info["data_path"], *limits, before, declared)
-        self.meta = FileSeries(root, EPISODES_PATH, *limits, before)
+        # files of old episodes stay where they are
+        self.before = root if old is None else old.root
+        self.place = free_place(self.before, info["data_path"], info["chunks_size"])
+        self.listed: list[dict[str, Any]] = []
 
     def write(
         self,
@@ -221,17 +208,22 @@ class _Writer:
         tasks: Sequence[str],
         commanded: Sequence[Demonstration | None],
     ) -> None:
-        with self.data, self.meta:
-            for number, one in enumerate(zip(demonstrations, tasks, commanded, strict=True)):
-                self._episode(number, *one)
-                if len(self.pending) == FLUSH_EPISODES:
-                    self._flush()
-            self._flush()
+        path = self.root / file_path(self.info["data_path"], *self.place)
+        pairs = zip(demonstrations, tasks, commanded, strict=True)
+        tables = (self._episode(number, *one) for number, one in enumerate(pairs))
+        declared = {"fps": self.info["fps"], "features": self.info["features"]}
+        write_tables(path, tables, {METADATA_KEY: json.dumps(declared).encode()})
+        chunk, file = free_place(self.before, EPISODES_PATH, self.info["chunks_size"])
+        for row in self.listed:
+            row |= {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+        schema = pa.schema([(key, _episode_type(key)) for key in self.listed[0]])
+        table = pa.Table.from_pylist(self.listed, schema)
+        write_tables(self.root / file_path(EPISODES_PATH, chunk, file), [table])
         self._tables()
 
     def _episode(
         self, number: int, shown: Demonstration, task: str, commanded: Demonstration | None
-    ) -> None:
+    ) -> pa.Table:
         features = self.info["features"]
         if task not in self.tasks:
             self.tasks.append(task)
@@ -249,29 +241,22 @@ class _Writer:
         columns["index"] = np.arange(self.rows, self.rows + rows)[:, None]
         columns["task_index"] = np.full((rows, 1), self.tasks.index(task))
         columns = {key: columns[key] for key in features}
-        chunk, file = self.data.write(feature_table(columns, features))
         new, before = episode_statistics(columns), self.statistics
         row: dict[str, Any] = {
             "episode_index": self.episodes,
             "tasks": [task],
             "length": rows,
-            "data/chunk_index": chunk,
-            "data/file_index": file,
+            "data/chunk_index": self.place[0],
+            "data/file_index": self.place[1],
             "dataset_from_index": self.rows,
             "dataset_to_index": self.rows + rows,
         }
         for key, column in new.items():
             row |= {f"stats/{key}/{name}": column[name].tolist() for name in column}
-        self.pending.append(row)
+        self.listed.append(row)
         self.statistics = new if before is None else merge_statistics(before, new)
         self.episodes, self.rows = self.episodes + 1, self.rows + rows
-
-    def _flush(self) -> None:
-        if self.pending:
-            schema = pa.schema([(key, _episode_type(key)) for key in self.pending[0]])
-            table = pa.Table.from_pylist(self.pending, schema)
-            self.meta.write(table, place="meta/episodes/")
-            self.pending = []
+        return feature_table(columns, features)
 
     def _tables(self) -> None:
         meta = self.root / "meta"

@@ -60,7 +60,7 @@ def test_identity_over_lengths_names_and_rates(
         for length in lengths
     ]
     root = tmp_path_factory.mktemp("sets") / "set"
-    save_lerobot(written, root, fps=fps, task="x", dtype="float64", file_megabytes=0.002)
+    save_lerobot(written, root, fps=fps, task="x", dtype="float64")
     for found, expected in zip(load_lerobot(root), written, strict=True):
         assert_same(found, expected, 1e-12)
 
@@ -130,7 +130,6 @@ def test_append_adds_episodes_tasks_and_statistics(tmp_path):
         ({"task": ["a", "b"]}, "one per demonstration"),
         ({"task": ""}, "not empty"),
         ({"dtype": "float16"}, "dtype"),
-        ({"file_megabytes": 0}, "file_megabytes"),
     ],
 )
 def test_wrong_arguments_are_refused_and_leave_nothing(tmp_path, change, message):

@@ -38,17 +38,17 @@ __all__ = ["TASK", "CarryAndPut", "before_sliding", "slid", "slide"]
 TASK = "put the bottle on the tray"
 #: Nominal seconds of each phase; 12.3 in all.
 PHASES = MappingProxyType(
-    {
-        "reach": 2.5,
-        "close": 1.5,
-        "hold": 0.8,
-        "lift": 1.0,
-        "carry": 2.5,
-        "lower": 1.5,
-        "open": 0.8,
-        "leave": 1.2,
-        "rest": 0.5,
-    }
+    dict(
+        reach=2.5,
+        close=1.5,
+        hold=0.8,
+        lift=1.0,
+        carry=2.5,
+        lower=1.5,
+        open=0.8,
+        leave=1.2,
+        rest=0.5,
+    )
 )
 #: When the bottle slides, after the hands have arrived, and how long [s].
 SLIDE = (0.2, 0.2)

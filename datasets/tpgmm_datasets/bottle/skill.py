@@ -53,15 +53,7 @@ FOOT = 0.11
 CHEST = np.array((0.24, 0.0, 0.18))
 #: Nominal seconds of each phase; 13 in all, as in the paper.
 PHASES = MappingProxyType(
-    {
-        "reach": 2.5,
-        "close": 1.5,
-        "hold": 0.5,
-        "bring": 3.0,
-        "pause": 0.5,
-        "shake": 4.5,
-        "rest": 0.5,
-    }
+    dict(reach=2.5, close=1.5, hold=0.5, bring=3.0, pause=0.5, shake=4.5, rest=0.5)
 )
 
 
@@ -304,12 +296,7 @@ class BottleShaking(BottleSkill):
         )
 
     def _demonstrations(
-        self,
-        bottles: Frame,
-        chests: Frame,
-        starts: Tensor,
-        ends: Tensor,
-        amplitudes: Tensor,
+        self, bottles: Frame, chests: Frame, starts: Tensor, ends: Tensor, amplitudes: Tensor
     ) -> list[Demonstration]:
         state = self.robot.state(starts)
         first = {hand: state.pose(hand) for hand in HANDS}

@@ -1,101 +1,65 @@
-"""A series of parquet files that grow to a size and are kept in chunks of folders."""
+"""Numbered parquet files in chunks of folders."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-__all__ = ["METADATA_KEY", "FileSeries"]
+__all__ = ["METADATA_KEY", "file_path", "free_place", "write_tables"]
 
 #: Under this key the data files repeat what ``info.json`` declares, so that an edit of the
 #: one is noticed by the other.
 METADATA_KEY = b"tpgmm_datasets"
 
 
-class FileSeries:
-    """Append tables to ``template`` with increasing numbers, after those of a set that grows.
+def file_path(template: str, chunk: int, file: int) -> str:
+    """The path of a file, of a ``template`` with ``chunk_index`` and ``file_index``."""
+    return template.format(chunk_index=chunk, file_index=file)
+
+
+def free_place(root: Path, template: str, chunk_files: int) -> tuple[int, int]:
+    """Numbers of chunk and file of the first that is not in the folder.
 
     Parameters
     ----------
     root : Path
         Folder of the set.
     template : str
-        Path of a file, with ``chunk_index`` and ``file_index``.
-    file_bytes : int
-        A file is closed before it grows beyond this, if it holds anything.
+        As of :func:`file_path`.
     chunk_files : int
         Number of files in a folder.
-    before : Path
-        Folder of the set as it was; ``root`` for a new one.
-    metadata : str, optional
-        Kept in each file under :data:`METADATA_KEY`.
     """
+    number = 0
+    while (root / file_path(template, *divmod(number, chunk_files))).exists():
+        number += 1
+    return divmod(number, chunk_files)
 
-    def __init__(
-        self,
-        root: Path,
-        template: str,
-        file_bytes: int,
-        chunk_files: int,
-        before: Path,
-        metadata: str | None = None,
-    ) -> None:
-        self.root, self.template = root, template
-        self.file_bytes, self.chunk_files = file_bytes, chunk_files
-        self.metadata = None if metadata is None else {METADATA_KEY: metadata.encode()}
-        self.place = (0, 0)
-        while (before / self._path().relative_to(root)).exists():
-            self._advance()
-        self.writer: pq.ParquetWriter | None = None
 
-    def write(self, table: pa.Table, place: str | None = None) -> tuple[int, int]:
-        """Write a table as row group; returns the numbers of chunk and file it went to.
+def write_tables(
+    path: Path, tables: Iterable[pa.Table], metadata: dict[bytes, bytes] | None = None
+) -> None:
+    """Write one or more tables into a parquet file, each a row group.
 
-        With ``place``, two columns of that prefix tell the table itself where it is.
-        """
-        path = self._path()
-        if self.writer is not None and path.stat().st_size + table.nbytes > self.file_bytes:
-            self.close()
-            self._advance()
-        if place is not None:
-            for name, number in zip(("chunk_index", "file_index"), self.place, strict=True):
-                numbers = pa.array([number] * len(table), pa.int64())
-                table = table.append_column(place + name, numbers)
-        table = table.replace_schema_metadata(self.metadata)
-        if self.writer is None:
-            path = self._path()
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = pq.ParquetWriter(
-                path, table.schema, compression="snappy", write_page_checksum=True
-            )
-        self.writer.write_table(table)
-        return self.place
-
-    def close(self) -> None:
-        """Finish the file that is open, if one is."""
-        if self.writer is not None:
-            self.writer.close()
-            self.writer = None
-
-    def __enter__(self) -> FileSeries:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-    def _path(self) -> Path:
-        chunk, file = self.place
-        return self.root / self.template.format(chunk_index=chunk, file_index=file)
-
-    def _advance(self) -> None:
-        chunk, file = self.place
-        last = file + 1 >= self.chunk_files
-        self.place = (chunk + 1, 0) if last else (chunk, file + 1)
+    Parameters
+    ----------
+    path : Path
+    tables : iterable of pyarrow.Table
+        Of one schema.
+    metadata : dict of bytes to bytes, optional
+        Kept in the file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer: pq.ParquetWriter | None = None
+    try:
+        for table in tables:
+            marked = table.replace_schema_metadata(metadata)
+            if writer is None:
+                options = {"compression": "snappy", "write_page_checksum": True}
+                writer = pq.ParquetWriter(path, marked.schema, **options)
+            writer.write_table(marked)
+    finally:
+        if writer is not None:
+            writer.close()
