@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 # here are quick to look up
 if TYPE_CHECKING:
     from tpgmm_datasets.checks.check import check
+    from tpgmm_datasets.checks.drop_outliers import drop_outliers
     from tpgmm_datasets.conversion.poses import FramePose, LinkPose
     from tpgmm_datasets.conversion.timing import resample, trim
     from tpgmm_datasets.description import DatasetInfo, describe_lerobot
@@ -32,6 +33,7 @@ __all__ = [
     "Scale",
     "check",
     "describe_lerobot",
+    "drop_outliers",
     "estimate_motor_map",
     "iter_lerobot",
     "load_lerobot",
@@ -42,6 +44,7 @@ __all__ = [
 
 _HOMES = {
     "checks.check": ("check",),
+    "checks.drop_outliers": ("drop_outliers",),
     "conversion.poses": ("FramePose", "LinkPose"),
     "conversion.timing": ("resample", "trim"),
     "description": ("DatasetInfo", "describe_lerobot"),

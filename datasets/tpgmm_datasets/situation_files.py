@@ -80,25 +80,18 @@ def _situation(item: Any, joint_names: Sequence[str]) -> Situation:
     for name, pose in frames.items():
         _check_keys(pose, f"frame {name!r}", required={"position"}, optional={"orientation"})
         poses[name] = Frame(pose["position"], pose.get("orientation"))
-    times = {name: item.get(name) for name in TIMES}
-    return Situation(_joints(item["joints"], joint_names), poses, **times)
-
-
-def _joints(joints: Any, names: Sequence[str]) -> Any:
-    if not isinstance(joints, Mapping):
-        if isinstance(joints, list) and len(joints) != len(names):
-            raise ShapeError(
-                f"'joints' has {len(joints)} values, the model has {len(names)} joints: "
-                f"{list(names)}"
-            )
-        return joints
-    for name in joints:
-        if name not in names:
-            raise UnknownNameError("joint", name, "the model", names)
-    missing = [name for name in names if name not in joints]
-    if missing:
-        raise DataError(f"'joints' lacks {missing}")
-    return [joints[name] for name in names]
+    joints, times = item["joints"], {name: item.get(name) for name in TIMES}
+    if isinstance(joints, Mapping):
+        for name in joints:
+            if name not in joint_names:
+                raise UnknownNameError("joint", name, "the model", joint_names)
+    situation = Situation(joints, poses, **times).reordered(joint_names)
+    if len(situation.joints) != len(joint_names):
+        raise ShapeError(
+            f"'joints' has {len(situation.joints)} values, the model has {len(joint_names)} "
+            f"joints: {list(joint_names)}"
+        )
+    return situation
 
 
 def _check_keys(item: Any, what: str, required: set[str], optional: set[str]) -> None:

@@ -57,7 +57,7 @@ def test_frames_that_move_may_have_their_own_clock(tmp_path):
         ([{"joints": [0.0]}], r"1 values, the model has 2 joints: \['shoulder', 'elbow'\]"),
         ([{"joints": [0.0, "a"]}], "must be an array of numbers"),
         ([{"joints": [0.0, None]}], "NaN"),
-        ([{"joints": {"elbow": 0.0}}], r"lacks \['shoulder'\]"),
+        ([{"joints": {"elbow": 0.0}}], "'shoulder' is not in"),
         ([{"joints": {"wrist": 0.0}}], "joint 'wrist' is not in the model"),
         ([{"joints": [0, 0], "frames": {"cup": [0, 0, 0]}}], "frame 'cup' is an object"),
         ([{"joints": [0, 0], "frames": [POSE]}], "maps names to poses"),

@@ -161,7 +161,7 @@ def test_append_refuses_what_does_not_fit(tmp_path, other, arguments, message):
     assert {p: p.read_bytes() for p in root.rglob("*") if p.is_file()} == before
 
 
-@pytest.mark.parametrize("stage", ["_episode", "_flush", "_tables"])
+@pytest.mark.parametrize("stage", ["episode_statistics", "write_tables", "feature_table"])
 @pytest.mark.parametrize("append", [False, True])
 def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, stage, append):
     root = tmp_path / "set"
@@ -172,7 +172,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
     def interrupt(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(writer_module._Writer, stage, interrupt)
+    monkeypatch.setattr(writer_module, stage, interrupt)
     with pytest.raises(KeyboardInterrupt):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
     assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])

@@ -49,28 +49,15 @@ def draw_figures(
     solid: tuple[Any, Any, Any] = (reproduction, situation.frames, {})
     dashed = (position_only, situation.frames, other)
     joints = reproduction.joint_names
-    panels = {
-        "figure_3": (
-            "Left hand's position seen from the bottle's initial frame",
-            0,
-            {f"$x_{i + 1}$ [m]": i for i in range(3)},
-            [solid],
-        ),
-        "figure_4": (
-            "Left hand's orientation seen from the bottle's initial frame",
-            0,
-            {rf"$\epsilon_{i}$": 3 + i for i in range(4)},
-            [solid, dashed],
-        ),
-        "figure_5": (
-            "Waist and left shoulder",
-            1,
-            {
-                f"{name} [rad]": joints.index(name)
-                for name in ("waist_pitch", "waist_yaw", "l_shoulder_pitch")
-            },
-            [solid],
-        ),
+    seen = "seen from the bottle's initial frame"
+    shown_joints = ("waist_pitch", "waist_yaw", "l_shoulder_pitch")
+    position = {f"$x_{i + 1}$ [m]": i for i in range(3)}
+    orientation = {rf"$\epsilon_{i}$": 3 + i for i in range(4)}
+    angles = {f"{name} [rad]": joints.index(name) for name in shown_joints}
+    panels: dict[str, tuple[str, int, dict[str, int], list[Any]]] = {
+        "figure_3": (f"Left hand's position {seen}", 0, position, [solid]),
+        "figure_4": (f"Left hand's orientation {seen}", 0, orientation, [solid, dashed]),
+        "figure_5": ("Waist and left shoulder", 1, angles, [solid]),
     }
     drawings = {}
     for name, (title, operator, columns, shown) in panels.items():

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from tpgmm_datasets.checks.joints import joint_findings, quaternion_columns
-from tpgmm_datasets.checks.outliers import FEWEST, outliers
+from tpgmm_datasets.checks.outliers import outliers
 from tpgmm_datasets.checks.poses import pose_findings
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
@@ -26,8 +26,6 @@ __all__ = ["PACKAGE", "check", "check_summaries"]
 PACKAGE = str(Path(__file__).parents[1])
 #: No robot is recorded more often [s].
 QUICKEST_STEP = 1e-5
-#: Steps of time of one recording may differ from the others' by this factor.
-OTHER_RATE = 20.0
 #: Nothing is missing between steps of less than this [s], or so many usual ones, or this share
 #: of the recording.
 GAP, GAP_STEPS, GAP_SHARE = 0.25, 10.0, 0.02
@@ -114,13 +112,6 @@ def _time(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
     if 0 < usual < QUICKEST_STEP:
         message = f"time is in seconds, and a typical step of it is {usual:.3g} s"
         yield Finding("time", message, "Is it in another unit? Convert it", value=usual)
-    odd = [
-        i for i, s in enumerate(steps) if s and not 1 / OTHER_RATE <= s / usual <= OTHER_RATE
-    ]
-    if odd:
-        places = listed([f"{steps[i]:.3g} s in demonstration {i}" for i in odd])
-        message = f"steps of time are {usual:.3g} s, but {places}"
-        yield Finding("time", message, "Is its time in milliseconds?", (), tuple(odd))
     gaps = {
         i: one.gap
         for i, one in enumerate(episodes)
@@ -149,9 +140,7 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         phases = {i: one.events[name] for i, one in enumerate(episodes) if name in one.events}
         there, values = list(phases), np.array(list(phases.values()))
         usual = float(np.median(values))
-        inside = len(there) >= FEWEST and 0.05 < usual < 0.95
-        ends = [i for i, at in phases.items() if inside and min(at, 1 - at) < 0.005]
-        for i in sorted({*ends, *(there[i] for i in outliers(values, floor=SAME_PHASE))}):
+        for i in sorted(there[k] for k in outliers(values, floor=SAME_PHASE)):
             places.append(
                 f"{name!r} at {phases[i]:.0%} of demonstration {i}, usually at {usual:.0%}"
             )
@@ -164,11 +153,8 @@ def _events(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
         message = f"events are not where they usually are: {listed(places)}"
         yield Finding("events", message, BY_HAND, tuple(names), tuple(sorted(about)))
     for first, second in combinations(names, 2):
-        both = {
-            i: e.events
-            for i, e in enumerate(episodes)
-            if first in e.events and second in e.events
-        }
+        pair = {first, second}
+        both = {i: e.events for i, e in enumerate(episodes) if pair <= e.events.keys()}
         ahead = [i for i, at in both.items() if at[first] > at[second]]
         order = first, second
         if 2 * len(ahead) > len(both):
@@ -209,15 +195,12 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
         names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
         most = {i: names[int(joints[i].argmax())] for i in odd}
         places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
-        yield Finding(
-            "episodes",
+        message = (
             "paths differ from the median path, in ranges of the joints, by about "
-            f"{usual:.2g}, but {listed(places)}",
-            "Is it the same skill, with the columns in the same order and unit? Leave it out",
-            tuple(dict.fromkeys(most.values())),
-            tuple(odd),
-            float(distances[odd[0]]),
+            f"{usual:.2g}, but {listed(places)}"
         )
+        remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
+        yield Finding("episodes", message, remedy, tuple({*most.values()}), tuple(odd))
 
 
 def _aligned_signs(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:

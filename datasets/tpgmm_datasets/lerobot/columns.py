@@ -117,7 +117,10 @@ def demonstration_columns(
             "tpgmm_datasets.resample(demonstration, fps)"
         )
     joints = as_array(demonstration.joints)
-    columns = {STATE: joints, ACTION: np.concatenate((joints[1:], joints[-1:]))}
+    columns: dict[str, Array] = {
+        STATE: joints,
+        ACTION: np.concatenate((joints[1:], joints[-1:])),
+    }
     if demonstration.frames:
         columns[ENVIRONMENT] = np.concatenate(
             [pose_values(demonstration.frame(n), steps) for n in _frame_order(features)], axis=1

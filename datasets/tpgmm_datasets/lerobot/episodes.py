@@ -120,7 +120,7 @@ def _read_file(
             policy(problem)
         counters = [name for name in BOOKKEEPING[:4] if name in schema.names]
         columns = list(dict.fromkeys([*counters, *keys]))
-        for index, table in episode_tables(parquet, file, columns, set(expected)):
+        for index, table in episode_tables(parquet, file, columns):
             if index in seen:
                 message = "its rows are there twice, or are not together"
                 policy(DatasetError(message, check="duplicates", file=file, episode=index))

@@ -86,7 +86,7 @@ def read_columns(path: Path, root: Path, columns: Sequence[str]) -> pa.Table:
 
 
 def episode_tables(
-    parquet: pq.ParquetFile, file: Path, columns: Sequence[str], wanted: set[int]
+    parquet: pq.ParquetFile, file: Path, columns: Sequence[str]
 ) -> Iterator[tuple[int, pa.Table]]:
     """Yield the runs of rows of one episode in a data file, decoding a bounded part at a time.
 
@@ -98,9 +98,6 @@ def episode_tables(
         How errors call it.
     columns : sequence of str
         What to read; ``episode_index`` among them.
-    wanted : set of int
-        Indices of the episodes that are of interest; parts of the file without any of them
-        are skipped, where its statistics tell.
 
     Yields
     ------
@@ -114,12 +111,10 @@ def episode_tables(
         If the file is unreadable.
     """
     with _named(file):
-        groups = _groups(parquet, wanted)
         if parquet.metadata.num_rows <= BATCH_ROWS:
-            # faster than batches
-            batches = iter([parquet.read_row_groups(groups, list(columns))])
+            batches = iter([parquet.read(list(columns))])  # faster than batches
         else:
-            batches = parquet.iter_batches(BATCH_ROWS, groups, list(columns))
+            batches = parquet.iter_batches(BATCH_ROWS, columns=list(columns))
     current = -1
     parts: list[pa.Table] = []
     while (batch := _next(batches, file)) is not None:
@@ -143,27 +138,6 @@ def _next(batches: Iterator[Any], file: Path) -> Any:
         if batch is not None:
             batch.validate(full=True)
         return pa.table(batch) if isinstance(batch, pa.RecordBatch) else batch
-
-
-def _groups(parquet: pq.ParquetFile, wanted: set[int]) -> list[int]:
-    """Row groups that may hold wanted episodes, by their statistics where there are some."""
-    column = parquet.schema_arrow.names.index("episode_index")
-    groups = []
-    for group in range(parquet.num_row_groups):
-        metadata = parquet.metadata.row_group(group)
-        # nested columns count as one leaf each here, since all lists hold plain values
-        leaf = metadata.column(column) if column < metadata.num_columns else None
-        statistics = (
-            leaf.statistics if leaf and leaf.path_in_schema == "episode_index" else None
-        )
-        if (
-            statistics is None
-            or not statistics.has_min_max
-            or not isinstance(statistics.min, int)
-            or any(statistics.min <= index <= statistics.max for index in wanted)
-        ):
-            groups.append(group)
-    return groups
 
 
 def _episode_index(table: pa.Table, file: Path) -> np.ndarray[Any, Any]:
