@@ -586,7 +586,7 @@ class MultimodalController:
         joints: Any = None,
         frames: Mapping[str, Any] | None = None,
         *,
-        told: Mapping[str, str | None] | None = None,
+        holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
     ) -> Command:
         """Find the next reference, in another mode if that suits better now.
@@ -599,10 +599,10 @@ class MultimodalController:
             Where the robot stands.
         frames : mapping of str to Frame, optional
             Poses of the objects from now on.
-        told, ages
+        holds, ages
             As for :meth:`Controller.step`.
         """
-        self.command = self.controller.step(dt, joints, frames, told=told, ages=ages)
+        self.command = self.controller.step(dt, joints, frames, holds=holds, ages=ages)
         passed = float(dt)
         self._since += passed if 0 < passed < math.inf else 0.0
         if self._model.n_modes_ > 1 and self._since >= LOOK and not self.finished:
@@ -772,7 +772,7 @@ class MultimodalControllers:
         joints: Any = None,
         frames: Mapping[str, Any] | None = None,
         *,
-        told: Mapping[str, str | None] | None = None,
+        holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
     ) -> Command:
         """As :meth:`Controller.step`."""
@@ -780,7 +780,7 @@ class MultimodalControllers:
         stand, places = parts.of_joints(joints), parts.of_frames(frames)
         seconds = torch.as_tensor(dt, dtype=torch.float64).expand(parts.batch).flatten()
         commands = [
-            one.step(passed, at, place, told=told, ages=ages)
+            one.step(passed, at, place, holds=holds, ages=ages)
             for one, passed, at, place in zip(
                 self.controllers, seconds.tolist(), stand, places, strict=True
             )

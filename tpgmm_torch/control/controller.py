@@ -228,7 +228,7 @@ class Controller:
         joints: Any = None,
         frames: Mapping[str, Any] | None = None,
         *,
-        told: Mapping[str, str | None] | None = None,
+        holds: Mapping[str, str | None] | None = None,
         ages: Mapping[str, float] | None = None,
     ) -> Command:
         """Find the next reference.
@@ -244,7 +244,7 @@ class Controller:
         frames : mapping of str to Frame, optional
             Poses of the objects from now on. With ``trust`` also arrays (..., 7) of positions
             and quaternions (w, x, y, z), which need not be finite, or None for a lost one.
-        told : mapping of str to str or None, optional
+        holds : mapping of str to str or None, optional
             Which link holds an object from now on, None if it is free from now on: in place
             of the holds that the skill began with.
         ages : mapping of str to float, optional
@@ -269,7 +269,7 @@ class Controller:
             if tick.ended is not None and bool(tick.ended.all()):
                 assert self.command is not None
                 return self._sent(tick, self.command.estimate, self._wanted)
-        self._update_holds(tick, None if frames is None else dict(self._frames), told)
+        self._update_holds(tick, None if frames is None else dict(self._frames), holds)
         estimate, wanted = self._estimated(tick)
         return self._sent(tick, estimate, wanted, self._lead(tick, estimate, wanted))
 
@@ -427,16 +427,16 @@ class Controller:
         self,
         tick: _Tick,
         frames: Mapping[str, Frame] | None,
-        told: Mapping[str, str | None] | None,
+        holds: Mapping[str, str | None] | None,
     ) -> None:
         """What the robots hold: by the skill's times, by what was given, and as it is seen."""
         time, stands = self._progress.time, self._postures(tick, measured=True)
         seconds = _each(tick.seconds, stands)
-        self._given_holds = self._given_holds.union(told or ())
+        self._given_holds = self._given_holds.union(holds or ())
         shares: Mapping[str, Tensor] = {}
         if self._inputs is not None:
             shares = self._inputs.shares
-            if self._inputs.poses and not told:
+            if self._inputs.poses and not holds:
                 now = time.expand(stands.shape[:-1])
                 given = self._first_holds.keys() & self._given_holds
                 self._watch, self.holding, frames = self._watch.update(
@@ -444,7 +444,7 @@ class Controller:
                     seconds, {n: now < at for n, at in self._first_holds.items()},
                 )  # fmt: skip
         self.holding = self.holding.advance(
-            time, stands, frames, told, dt=seconds, shares=shares
+            time, stands, frames, holds, dt=seconds, shares=shares
         )
 
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:

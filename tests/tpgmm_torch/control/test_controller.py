@@ -1,4 +1,4 @@
-"""A running skill, tick by tick: its beginning, its end, what it is told on the way."""
+"""A running skill, tick by tick: its beginning, its end, its inputs."""
 
 from dataclasses import fields
 
@@ -128,7 +128,7 @@ def test_other_robots_are_refused():
 
 
 def watched(problem: Problem, robots: slice | int = slice(None), **options) -> Controller:
-    """A controller that looks at what it is told, of some of the robots."""
+    """A controller with trust, of some of the robots."""
     regression = problem.regression()
     frames = {name: frame[robots] for name, frame in problem.frames.items()}
     defaults = {
@@ -375,8 +375,8 @@ def test_a_robot_that_was_stopped_in_motion_goes_on_gently(holder, lead):
     controller, stands = model.controller(shown.joints[0], shown.frames), shown.joints[0]
     speeds: list[float] = []
     for tick in range(1, 700):
-        told = {"bottle": holder} if tick == 1 else None
-        command = controller.step(0.01, joints=stands, told=told)
+        holds = {"bottle": holder} if tick == 1 else None
+        command = controller.step(0.01, joints=stands, holds=holds)
         speeds.append(float(command.velocity.abs().max()))
         if not 300 <= tick < 600:
             stands = command.reference
