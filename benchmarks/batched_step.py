@@ -26,7 +26,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     }
     # at tiny sizes, what is asked is only whether it runs
     backend = "inductor" if settings.full else "aot_eager"
-    compiled = compile_skill(model.regression(), n_robots, backend).estimate
+    compiled = compile_skill(model.skill, n_robots, backend).estimate
     work = tick(model, settings, n_robots, False, compiled)
     measurements["one clock, compiled"] = per_call(work, 1)
     taken = medians(in_turns(measurements, rounds, warm_up=True))

@@ -28,7 +28,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         if how == "compiled":
             # at tiny sizes, what is asked is only whether it runs
             backend = "inductor" if settings.full else "aot_eager"
-            step = compile_skill(model.regression(), backend=backend).estimate
+            step = compile_skill(model.skill, backend=backend).estimate
         taken = 1e3 * _latencies(step, model.time_, settings, ticks)
         figures = float(np.median(taken)), float(np.percentile(taken, 99))
         names = "median", "99th percentile"

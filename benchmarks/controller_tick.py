@@ -19,7 +19,7 @@ from benchmarks.rows import Asked, Row
 from benchmarks.settings import Settings
 from benchmarks.skill import learned, skill
 from benchmarks.timing import in_turns, medians, seconds
-from tpgmm_torch import Situation
+from tpgmm_torch import Controller, Situation
 from tpgmm_torch.skills.compiled import export_estimate
 
 __all__ = ["measure"]
@@ -56,7 +56,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         return step
 
     def controlled(options: Mapping[str, Any]) -> Step:
-        made = model.controller(start, frames, **options)
+        made = Controller(model.skill, start, frames, **options)
         made.step(dt)
         given = {} if options else {"joints": start}
 
@@ -74,7 +74,7 @@ def measure(settings: Settings) -> Iterator[Row]:
         asked[name] = most if settings.full else None
     if settings.full:  # at tiny sizes, minutes of compiling show nothing
         path = settings.out / "estimate.pt2"
-        export_estimate(model.regression(), path)
+        export_estimate(model.skill, path)
         yield from _in_cpp(path, situation, dt, ticks, settings)
         path.unlink()
     taken = _latencies(ways, dt, ticks, length - 1)

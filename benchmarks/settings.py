@@ -12,7 +12,6 @@ CASES = {
     "import": "start_up",
     "em-13k": "em_small",
     "em-1m": "em_large",
-    "folds": "folds",
     "memory": "memory",
     "disk": "disk",
     "processes": "processes",

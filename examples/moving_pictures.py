@@ -29,7 +29,7 @@ from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
 from tpgmm_evaluation.benchmarks import BottleBenchmark, CarryBenchmark
 from tpgmm_tools.plotting import BLUE, VERMILION
-from tpgmm_torch import Frame, TaskParameterizedGMM
+from tpgmm_torch import Controller, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.impedance.stiffness import Impedance
@@ -91,7 +91,7 @@ def run(
     )
     observation, _ = env.reset(seed=seed)
     impedance = Impedance(model.kinematics_)
-    controller = model.controller(*told(observation, bench.objects), impedance=impedance)
+    controller = Controller(model.skill, *told(observation, bench.objects), impedance=impedance)
     over, step = False, 0
     while not over:
         command = controller.step(1 / env.fps, *told(observation, bench.objects))

@@ -82,7 +82,7 @@ def mean_error(shown: Sequence[Demonstration], geometry: str) -> float:
     wanted = quaternions.mean(torch.stack([one.joints[:, 3:] for one in shown], 1))
     operator = AbsoluteOrientation("hand", geometry=geometry)
     # every demonstration counts, however far from the others
-    model = TaskParameterizedGMM(6, [operator], Poses(["hand"]), blend=0, robust=False)
+    model = TaskParameterizedGMM(6, [operator], Poses(["hand"]))
     start = torch.cat((torch.zeros(3, dtype=torch.float64), wanted[0]))
     [found] = model.fit(shown).predict([Situation(start)], candidates=False)
     return float(degrees_between(quaternions.normalize(found.joints[:, 3:]), wanted).mean())
@@ -104,7 +104,7 @@ def log_likelihood(model: TaskParameterizedGMM, shown: Demonstration) -> float:
     widths = block_widths(model.operators_, model.kinematics_)
     blocks = torch.from_numpy(row).split(list(widths), 1)
     local = [block[:, 1:] for block in blocks]
-    return float(rotation_log_density(model.regression(), blocks[0][:, 0], local).mean())
+    return float(rotation_log_density(model.skill, blocks[0][:, 0], local).mean())
 
 
 def held_out(kind: str, folder: Path, components: int, step: int) -> np.ndarray:

@@ -28,7 +28,12 @@ from torch import Tensor
 
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import EvenClock, Frame, TaskParameterizedGMM
+from tpgmm_torch import (
+    Controller,
+    EvenClock,
+    Frame,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.clocks import EvenProgress
 from tpgmm_torch.regression.posture import NEGLIGIBLE, PostureCost, descend
@@ -84,14 +89,15 @@ def learned(n_demonstrations: int = 10, n_components: int = 30) -> TaskParameter
 def played(model: TaskParameterizedGMM, bottles: Frame, clock: EvenClock, ticks: int) -> Tensor:
     """References of all robots at each tick, (ticks, n, 17)."""
     starts = BottleShaking().neutral_posture().expand(len(bottles.position), -1)
-    controller = model.controller(starts, {"bottle": bottles}, clock=clock)
+    controller = Controller(model.skill, starts, {"bottle": bottles}, clock=clock)
     with torch.inference_mode():
         return torch.stack([controller.step(DT).reference for _ in range(ticks)])
 
 
 def calm(model: TaskParameterizedGMM, references: Tensor) -> dict[str, float]:
     """Reversals, and the largest speed and acceleration as shares of their bounds."""
-    bounds = model.motion_bounds()
+    bounds = model.skill.motion_bounds
+    assert bounds is not None
     speed = references.diff(dim=0) / DT
     acceleration = speed.diff(dim=0) / DT
     slower = torch.minimum(speed[1:].abs(), speed[:-1].abs())
@@ -108,7 +114,7 @@ def distances(
     model: TaskParameterizedGMM, bottles: Frame, joints: Tensor, starts: int, steps: int
 ) -> tuple[Tensor, Tensor]:
     """Where robots are (n,), and the least from many starts (n,)."""
-    regression, robot = model.regression(), BottleShaking().robot
+    regression, robot = model.skill, BottleShaking().robot
     time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
     activation = regression.estimate(time, joints, frames).activation
     index = (activation > NEGLIGIBLE).nonzero()[:, 0]

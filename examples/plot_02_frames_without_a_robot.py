@@ -71,7 +71,7 @@ operators = {
 situations = [demonstrate(random_frames()) for _ in range(20)]  # none of them learned from
 results, misses = {}, {}
 for name, chosen in operators.items():
-    model = TaskParameterizedGMM(4, chosen, hand, blend=0, random_state=0)
+    model = TaskParameterizedGMM(4, chosen, hand, random_state=0)
     results[name] = model.fit(demonstrations).predict(situations)
     ends = [
         (t.joints[[0, -1]] - s.joints[[0, -1]]).norm(dim=1)

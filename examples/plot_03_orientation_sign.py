@@ -10,6 +10,8 @@ demonstrations lie far apart that is not enough; another example is about these.
 """
 
 # sphinx_gallery_thumbnail_number = 1
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.robots import Poses
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 # %%
 # A hand that turns, recorded by a tracker that flips signs
@@ -57,19 +59,20 @@ wanted = turning(torch.zeros(3, dtype=torch.float64))
 # Two models of the same numbers
 # ------------------------------
 # The naive model takes the four columns for joints. The other one knows that they are an
-# orientation, because :class:`~tpgmm_torch.robots.Poses` and an orientation operator say so:
-# it makes each recording continuous, brings all of them into one hemisphere, and at
-# reproduction turns each Gaussian to the side of the present orientation. (That plain numbers
-# jump like these is warned of: ``plausibility="ignore"`` says that it is meant here.)
+# orientation, because :class:`~tpgmm_torch.robots.Poses` and an orientation operator say so: it makes
+# each recording continuous, brings all of them into one hemisphere, and at reproduction turns
+# each Gaussian to the side of the present orientation. (That plain numbers
+# jump like these is warned of: here it is meant.)
 
 numbers = [Demonstration(time, recording) for recording in recordings]
-naive = TaskParameterizedGMM(8, [Canonical()], blend=0, random_state=0, plausibility="ignore")
+naive = TaskParameterizedGMM(8, [Canonical()], random_state=0)
+warnings.simplefilter("ignore", PlausibilityWarning)
 [plain] = naive.fit(numbers).predict([Situation(recordings[0][0], time=time)])
 
 hand = Poses(["hand"])
 still = torch.zeros(len(time), 3, dtype=torch.float64)
 poses = [Demonstration(time, torch.cat((still, recording), dim=1)) for recording in recordings]
-model = TaskParameterizedGMM(8, [AbsoluteOrientation("hand")], hand, blend=0, random_state=0)
+model = TaskParameterizedGMM(8, [AbsoluteOrientation("hand")], hand, random_state=0)
 [aware] = model.fit(poses).predict([Situation(poses[0].joints[0], time=time)])
 
 

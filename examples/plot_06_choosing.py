@@ -67,7 +67,7 @@ room, tray = AbsolutePosition("hand"), RelativePosition("hand", "tray")
 sets = {"room": [room], "tray": [tray], "room and tray": [room, tray]}
 counts = [2, 4, 8, 12, 20]
 search = GridSearchCV(
-    TaskParameterizedGMM(robot=hand, blend=0, random_state=0),
+    TaskParameterizedGMM(robot=hand, random_state=0),
     {"operators": list(sets.values()), "n_components": counts},
     scoring={"path": reproduction_scorer, "take": PoseScorer("hand", event="take")},
     refit="path",
@@ -85,10 +85,10 @@ print(
 # The Bayesian information criterion looks at the training data alone. Within one operator set
 # it is a quick way to choose K.
 
-bic = [
-    search.best_estimator_.set_params(n_components=k).fit(demonstrations).bic(demonstrations)
-    for k in counts
-]
+bic = []
+for k in counts:
+    model = search.best_estimator_.set_params(n_components=k).fit(demonstrations)
+    bic.append(model.mixture_.bic(torch.cat(model.rows(demonstrations))))
 
 # %%
 # Neither the room nor the tray explains the whole motion: only a model that looks at both

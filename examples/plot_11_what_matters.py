@@ -4,7 +4,7 @@ What matters, and when
 
 Five objects stand around, and the demonstrations say nothing about which of them the skill is
 about. It need not be told: an operator matters if demonstrations that were left out are more
-likely with it than without. :class:`~tpgmm_torch.OperatorSelection` asks that of every link in
+likely with it than without. :class:`~tpgmm_torch.SelectOperators` asks that of every link in
 every frame, and says why it kept what it kept.
 """
 
@@ -13,7 +13,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from tpgmm_tools.plotting import STYLE, plot_relevance
-from tpgmm_torch import Demonstration, Frame, OperatorSelection, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    Frame,
+    SelectOperators,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.robots import Poses
 
 # %%
@@ -54,7 +59,7 @@ demonstrations = [demonstrate() for _ in range(5)]
 # more likely; then follows when it gains most, and how far the demonstration is from what the
 # operator expects there, beside what all others do.
 
-selection = OperatorSelection(robot=hand).fit(demonstrations)
+selection = SelectOperators(robot=hand).fit(demonstrations)
 print(selection.report())
 
 # %%
@@ -71,9 +76,9 @@ plt.show()
 # %%
 # In a model
 # ----------
-# ``operators="auto"`` does the same within ``fit``. The model asks of a new situation only the
+# A model of these operators asks of a new situation only the
 # frames that matter.
 
-model = TaskParameterizedGMM(12, operators="auto", robot=hand).fit(demonstrations)
+model = TaskParameterizedGMM(12, selection.operators_, hand).fit(demonstrations)
 print(model.operators_)
 print("frames:", ", ".join(model.frame_names_))

@@ -4,16 +4,24 @@ Parts of a skill
 
 Go to the cup, carry it to the tray, and stir there: nobody says where one part ends and the
 next begins, and every demonstration takes its own time. :class:`~tpgmm_torch.Segmentation`
-finds the parts, and ``parts="auto"`` learns each with what matters in it.
+finds the parts, and :func:`~tpgmm_torch.fit_parts` learns each with what matters in it.
 """
 
 # sphinx_gallery_thumbnail_number = 1
 import matplotlib.pyplot as plt
 import numpy as np
-from sklearn.pipeline import make_pipeline
 
 from tpgmm_tools.plotting import STYLE, plot_parts
-from tpgmm_torch import Demonstration, Frame, Segmentation, Situation, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    Frame,
+    Segmentation,
+    SelectOperators,
+    Situation,
+    TaskParameterizedGMM,
+    fit_parts,
+    rollout,
+)
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses
@@ -68,21 +76,20 @@ plot_parts(axes, segmentation, demonstrations)
 plt.show()
 
 # %%
-# One model of all parts
+# One skill of all parts
 # ----------------------
 # Demonstrations are brought into step at the boundaries. Then each part is learned from its own
-# stretch of time, with what matters in it; together they are one mixture, and ``predict``, a
-# controller and a saved model are what they always are.
+# stretch of time, with what matters in it; together they are a
+# :class:`~tpgmm_torch.Sequence`, a skill that is run and saved like any other.
 
-steps = make_pipeline(
-    Segmentation(hand),
-    EventAlignment(["part *"], robot=hand),
-    TaskParameterizedGMM(24, "auto", hand, parts="auto", blend=0),
-)
-model = steps.fit(demonstrations)[-1]
-for part in model.parts_:
+named = segmentation.transform(demonstrations)
+aligned = EventAlignment(["part *"], robot=hand).fit_transform(named)
+cuts = Segmentation(hand).fit(aligned).times()
+model = TaskParameterizedGMM(24, robot=hand)
+skill = fit_parts(model, aligned, cuts, SelectOperators(robot=hand))
+for part in skill.skills:
     texts = ", ".join(map(format_operator, part.operators))
-    print(f"{part.begin:5.2f} s  {part.n_components:2d} components  {texts}")
+    print(f"{part.begin:5.2f} s  {len(part.log_weights):2d} components  {texts}")
 
 # %%
 # A new situation
@@ -90,14 +97,14 @@ for part in model.parts_:
 # The hand's distance to the cup and to the tray. Dotted: where parts begin.
 
 new, _ = demonstrate()
-[trajectory] = model.predict([Situation(new.joints[0], new.frames)])
+[trajectory] = rollout(skill, [Situation(new.joints[0], new.frames)])
 figure, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 time, path, least = trajectory.time.numpy(), trajectory.joints.numpy(), {}
-for name in model.frame_names_:
+for name in skill.frame_names:
     distance = 1000 * np.linalg.norm(path - new.frames[name].position.numpy(), axis=1)
     least[name] = distance.min()
     axes.plot(time, distance, label=f"{name}: {least[name]:.1f} mm")
-for part in model.parts_[1:]:
+for part in skill.skills[1:]:
     axes.axvline(part.begin, color="0.6", linestyle=":")
 axes.set(xlabel="time [s]", ylabel="distance [mm]")
 axes.legend()

@@ -4,7 +4,7 @@ Two ways around an obstacle
 
 Some demonstrations pass an obstacle on one side, some on the other. The mean of both goes
 through the middle: what a single model learns of them is what nobody ever did.
-:class:`~tpgmm_torch.MultimodalTaskParameterizedGMM` finds that there are two ways, learns a
+:class:`~tpgmm_torch.SelectWays` finds that there are two ways, learns a
 model of each, and goes the way that suits the situation.
 """
 
@@ -17,10 +17,11 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    MultimodalTaskParameterizedGMM,
     RelativePosition,
+    SelectWays,
     Situation,
     TaskParameterizedGMM,
+    rollout,
 )
 from tpgmm_torch.robots import Poses
 
@@ -67,8 +68,8 @@ operators = [
     Canonical(),
 ]
 single = TaskParameterizedGMM(8, operators, hand)
-model = MultimodalTaskParameterizedGMM(single).fit(demonstrations)
-print(model.mode_selection_.report())
+ways = SelectWays(single).fit(demonstrations)
+print(ways.report())
 
 # %%
 # Which way
@@ -76,9 +77,9 @@ print(model.mode_selection_.report())
 # In new situations both are possible here, and the choice follows from how often each was
 # shown, and where. The single model learns from all demonstrations, too.
 
-single.set_params(robust=False).fit(demonstrations)
+single.fit(demonstrations)
 situations = [Situation([0.0, 0.0, 0.0], objects()) for _ in range(20)]
-print(model.choose(situations[0])[0])
+print(ways.skill_.choose(situations[0].joints, situations[0].frames)[0])
 
 
 def clearance(trajectory, situation):
@@ -88,26 +89,26 @@ def clearance(trajectory, situation):
 
 
 passed = {}
-for name, one in (("single model", single), ("two modes", model)):
-    trajectories = one.predict(situations)
+for name, one in (("single model", single.skill), ("two ways", ways.skill_)):
+    trajectories = rollout(one, situations)
     passed[name] = found = list(map(clearance, trajectories, situations))
     print(f"{name:<12} passes by {np.median(found):.1f} cm, at least {min(found):.1f} cm")
 
 # %%
 # On the left the demonstrations as they are divided, seen from the obstacle. On the right a new
-# situation: the single model goes through, each mode goes around it.
+# situation: the single model goes through, each way goes around it.
 
 plt.style.use(STYLE)
 figure, (shown, new) = plt.subplots(1, 2, figsize=(10, 3.8), layout="constrained")
-colors = (BLUE, SKY)  # of the two modes
-for demonstration, label in zip(demonstrations, model.labels_, strict=True):
+colors = (BLUE, SKY)  # of the two ways
+for demonstration, label in zip(demonstrations, ways.labels_, strict=True):
     path = demonstration.joints - demonstration.frames["obstacle"].position
     shown.plot(*path[:, :2].T, color=colors[label], alpha=0.7)
 [situation] = situations[:1]
 obstacle, goal = (situation.frames[name].position for name in ("obstacle", "goal"))
-for mode, color in zip(model.models_, colors, strict=True):
-    [trajectory] = mode.predict(situation)
-    new.plot(*trajectory.joints[:, :2].T, color=color, label="one mode")
+for way, color in zip(ways.models_, colors, strict=True):
+    [trajectory] = way.predict(situation)
+    new.plot(*trajectory.joints[:, :2].T, color=color, label="one way")
 [trajectory] = single.predict(situation)
 new.plot(*trajectory.joints[:, :2].T, color=VERMILION, linestyle="--", label="single model")
 new.plot(*goal[:2], "*", color=ORANGE, markersize=12)

@@ -8,13 +8,19 @@ showed and that is merged with the demonstrations.
 """
 
 # sphinx_gallery_thumbnail_number = 1
-import copy
-
 import matplotlib.pyplot as plt
 import numpy as np
+from sklearn.base import clone
 
 from tpgmm_tools.plotting import BLUE, STYLE, VERMILION
-from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM, ViaPoint
+from tpgmm_torch import (
+    Demonstration,
+    Situation,
+    TaskParameterizedGMM,
+    ViaPoint,
+    ViaPoints,
+    rollout,
+)
 from tpgmm_torch.corrections import in_skill_time
 
 # %%
@@ -31,7 +37,8 @@ def demonstrate():
     return Demonstration(time, (height * np.sin(1.5 * time) + offset)[:, None])
 
 
-model = TaskParameterizedGMM(n_components=12, blend=0).fit([demonstrate() for _ in range(6)])
+demonstrations = [demonstrate() for _ in range(6)]
+model = TaskParameterizedGMM(n_components=12).fit(demonstrations)
 situation = Situation(joints=[0.0], time=time)
 [before] = model.predict([situation])
 
@@ -40,23 +47,24 @@ situation = Situation(joints=[0.0], time=time)
 # -----------
 # At second 2 the joint shall be at 0.5. A second before and after that, the skill is as it was.
 
-[through] = model.with_via_points([ViaPoint(2.0, "canonical", [0.5])]).predict([situation])
+skill = ViaPoints(model.skill, [ViaPoint(2.0, "canonical", [0.5])])
+[through] = rollout(skill, [situation])
 
 # %%
 # A correction
 # ------------
 # Somebody leads the joint lower from second 2.5 to 3.5, on a clock of his own, twice. Where in
-# the skill that belongs is found, and the two oldest demonstrations are forgotten.
+# the skill that belongs is found, and the model is learned again, without the two oldest
+# demonstrations.
 
 part = np.linspace(2.5, 3.5, 80)
 lower = np.sin(1.5 * part) - 0.4 * np.sin(np.pi * (part - 2.5)) ** 2
 shown = Demonstration(1.2 * (part - 2.5), lower[:, None])
 again = Demonstration(0.9 * (part - 2.5), lower[:, None] + 0.02)
 placed = in_skill_time(model, [shown, again])
-corrected = copy.deepcopy(model).partial_fit(placed, forget=2)
+corrected = clone(model).fit([*demonstrations[2:], *placed])
 [after] = corrected.predict([situation])
 print([f"{float(p.time[0]):.2f} to {float(p.time[-1]):.2f} s" for p in placed])
-print("demonstrations that count:", corrected.demonstration_weights_.tolist())
 
 # %%
 # The picture

@@ -9,6 +9,8 @@ the number of demonstrations allows, and nothing has to be chosen.
 """
 
 # sphinx_gallery_thumbnail_number = 2
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -23,7 +25,7 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.robots import Poses
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 torch.set_num_threads(1)  # the matrices are small
 
@@ -35,6 +37,8 @@ torch.set_num_threads(1)  # the matrices are small
 
 hands = Poses(["left", "right"], orientation=False)
 time = np.linspace(0, 4, 60)
+warnings.simplefilter("ignore", PlausibilityWarning)  # it is meant to be unusual
+
 SIDES = np.array([[-0.05, 0.1, 0.05], [-0.05, -0.1, 0.05]])  # where they hold it
 HOMES = np.array([[0.0, 0.25, 0.1], [0.0, -0.25, 0.1]])
 
@@ -70,8 +74,6 @@ def fit(shown, shrinkage):
         [seen_from("box"), seen_from("shelf"), Canonical()],
         hands,
         covariance_shrinkage=shrinkage,
-        blend=0,
-        plausibility="ignore",  # it would warn of so few
     )
     return model.fit(shown)
 

@@ -10,6 +10,8 @@ rotation vector from the mean of the demonstrations at the same instant.
 """
 
 # sphinx_gallery_thumbnail_number = 1
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -22,7 +24,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     quaternions,
 )
-from tpgmm_torch.robots import Poses
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 # %%
 # A tool that turns
@@ -38,6 +40,9 @@ still = torch.zeros(len(time), 3, dtype=torch.float64)
 axis = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
 angle = torch.from_numpy(np.radians(100 * (1 - np.cos(np.pi * time / 2))))
 turn = quaternions.exp(angle[:, None] * axis)
+
+
+warnings.simplefilter("ignore", PlausibilityWarning)  # it is meant to be unusual
 
 
 def record(spread, generator):
@@ -61,8 +66,6 @@ def reproduce(recordings, geometry):
         8,
         [AbsoluteOrientation("tool", geometry=geometry)],
         hand,
-        blend=0,
-        robust=False,  # they are meant to be far apart
     )
     model.fit([Demonstration(time, poses[:, i]) for i in range(8)])
     start = torch.cat((still[0], quaternions.mean(recordings[0])))

@@ -8,12 +8,15 @@ a controller. One is the demonstration that is furthest from the others.
 """
 
 # sphinx_gallery_thumbnail_number = 1
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
 from tpgmm_tools.plotting import BLUE, ORANGE, STYLE, VERMILION
 from tpgmm_torch import (
+    Controller,
     Demonstration,
     Frame,
     RelativePosition,
@@ -21,6 +24,7 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 # %%
 # A skill that was shown eight times
@@ -70,7 +74,6 @@ model = TaskParameterizedGMM(
     8,
     [RelativePosition("tip", "object")],
     robot,
-    plausibility="ignore",  # it would warn of what is far outside
 )
 model.fit(demonstrations)
 
@@ -79,6 +82,9 @@ model.fit(demonstrations)
 # ------------
 # Each of eight demonstrations and of one new situation like them is as likely to be the
 # furthest: novelty is above one at most about once in nine times for what is like them.
+
+
+warnings.simplefilter("ignore", PlausibilityWarning)  # of what is far outside
 
 
 def ends(objects):
@@ -115,7 +121,8 @@ for name, chosen in (("up to 1", novelty <= 1), ("above 1", novelty > 1)):
 # Somebody pulls the object away while the arm is on its way. ``command.novelty`` is about where
 # it is now, and a program can stop, or ask, before anything is missed.
 
-controller, joints, told = model.controller(REST, {"object": Frame([0.55, 0, 0])}), REST, []
+controller = Controller(model.skill, REST, {"object": Frame([0.55, 0, 0])})
+joints, told = REST, []
 while not controller.finished:
     pulled = 0.4 * np.clip(0.01 * len(told) - 0.5, 0, 1)  # 40 cm in a second [m]
     frames = {"object": Frame([0.55 + pulled, 0.0, 0.0])}
@@ -139,7 +146,7 @@ grid = Frame(np.stack((x, y, 0 * x), axis=-1))
 image = plane.contourf(
     x,
     y,
-    model.summary_.novelty(REST, {"object": grid}),
+    model.skill.summary.novelty(REST, {"object": grid}),
     np.arange(0, 3.1, 0.25),
     cmap="Blues",
     extend="max",

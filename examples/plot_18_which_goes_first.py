@@ -9,6 +9,8 @@ fulfilled as if the others were not there, and these act in what is left of the 
 """
 
 # sphinx_gallery_thumbnail_number = 1
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
@@ -18,11 +20,13 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
+    InformationFusion,
     RelativePosition,
     Robot,
     Situation,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 # %%
 # Demonstrations
@@ -30,6 +34,8 @@ from tpgmm_torch import (
 # Four joints in the plane. The elbow comes down on the rest, the tip goes to the target; both
 # are met to a few millimetres. Rest and target stand somewhere else each time, at most 36 cm
 # apart: beyond 40 cm the tip does not reach while the elbow rests.
+
+warnings.simplefilter("ignore", PlausibilityWarning)  # it is meant to be unusual
 
 LINKS = ("base", "upper_arm", "middle", "forearm", "hand", "tip")
 urdf = '<robot name="planar arm">' + "".join(f'<link name="{link}"/>' for link in LINKS)
@@ -97,8 +103,7 @@ models = {
         10,
         operators,
         robot,
-        priorities=priorities,
-        plausibility="ignore",  # it would warn of what is far outside
+        fusion=InformationFusion(priorities=priorities),
     ).fit(demonstrations)
     for name, priorities in (("compromise", None), ("the tip first", [2, 1, 0]))
 }

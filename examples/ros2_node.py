@@ -32,7 +32,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from tpgmm_torch import Controller, Frame, TaskParameterizedGMM
+from tpgmm_torch import Controller, Frame
+from tpgmm_torch.persistence import load_model
 
 
 class SkillNode(Node):
@@ -44,10 +45,10 @@ class SkillNode(Node):
         self._follow = self.declare_parameter("follow_frames", True).value
         self._base = self.declare_parameter("base_frame", "").value
         self._period = 1.0 / self.declare_parameter("rate", 100.0).value
-        self._model = TaskParameterizedGMM.load(folder, device="cpu")
+        self._model = load_model(folder, device="cpu")
         self._names = self._model.kinematics_.joint_names
         # of a frame that follows from the start posture nobody has to tell
-        shown = self._model.summary_
+        shown = self._model.skill.summary
         given = {} if shown is None else shown.frames
         self._required = [
             name
@@ -101,7 +102,7 @@ class SkillNode(Node):
         if self._controller is None:
             if self._joints is None or not self._frames.keys() >= set(self._required):
                 return
-            self._controller = self._model.controller(self._joints, self._frames)
+            self._controller = Controller(self._model.skill, self._joints, self._frames)
             passed = self._period
         else:
             passed = now - self._last

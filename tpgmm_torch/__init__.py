@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.control.localizing_clock import LocalizingClock
+    from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
     from tpgmm_torch.data.holds import Hold
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     from tpgmm_torch.motion.motion_bounds import MotionBounds
-    from tpgmm_torch.multimodal import ModeChoice, MultimodalTaskParameterizedGMM
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,
@@ -32,14 +32,22 @@ if TYPE_CHECKING:
         RelativePosition,
         Stack,
     )
+    from tpgmm_torch.persistence import load, save
     from tpgmm_torch.regression.estimate import Estimate
-    from tpgmm_torch.regression.via_points import ViaPoint
+    from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
     from tpgmm_torch.robots.robot import Robot
     from tpgmm_torch.sensing.trust import Trust
-    from tpgmm_torch.structure.mode_selection import ModeSelection
-    from tpgmm_torch.structure.operator_selection import OperatorSelection
+    from tpgmm_torch.skills.sequence import Sequence
+    from tpgmm_torch.skills.via_point import ViaPoint
+    from tpgmm_torch.skills.via_points import ViaPoints
+    from tpgmm_torch.skills.ways import Ways
+    from tpgmm_torch.structure.fit_parts import fit_parts
     from tpgmm_torch.structure.segmentation import Segmentation
-    from tpgmm_torch.training.hold_detection import find_holds
+    from tpgmm_torch.structure.select_components import SelectComponents
+    from tpgmm_torch.structure.select_operators import SelectOperators
+    from tpgmm_torch.structure.select_ways import SelectWays
+    from tpgmm_torch.training.hold_detection import attach_holds, find_holds
+    from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
     __version__: str
 
@@ -51,21 +59,23 @@ __all__ = [
     "Clock",
     "Command",
     "Controller",
+    "CovarianceFusion",
     "Demonstration",
     "Estimate",
     "EvenClock",
     "Frame",
     "Hold",
+    "InformationFusion",
     "LocalizingClock",
-    "ModeChoice",
-    "ModeSelection",
     "MotionBounds",
-    "MultimodalTaskParameterizedGMM",
-    "OperatorSelection",
     "RelativeOrientation",
     "RelativePosition",
     "Robot",
     "Segmentation",
+    "SelectComponents",
+    "SelectOperators",
+    "SelectWays",
+    "Sequence",
     "Situation",
     "Stack",
     "Status",
@@ -73,9 +83,17 @@ __all__ = [
     "Trajectory",
     "Trust",
     "ViaPoint",
+    "ViaPoints",
     "WaitingClock",
+    "Ways",
+    "attach_holds",
+    "drop_outliers",
     "find_holds",
+    "fit_parts",
+    "load",
     "parse_clock",
+    "rollout",
+    "save",
 ]
 
 _HOMES = {
@@ -90,7 +108,6 @@ _HOMES = {
     "data.holds": ("Hold",),
     "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
     "motion.motion_bounds": ("MotionBounds",),
-    "multimodal": ("ModeChoice", "MultimodalTaskParameterizedGMM"),
     "operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",
@@ -100,14 +117,23 @@ _HOMES = {
         "Stack",
     ),
     "regression.estimate": ("Estimate",),
-    "regression.via_points": ("ViaPoint",),
+    "regression.fusion_forms": ("CovarianceFusion", "InformationFusion"),
+    "persistence": ("load", "save"),
+    "control.rollout": ("rollout",),
     "robots.robot": ("Robot",),
     "sensing.trust": ("Trust",),
-    "structure.mode_selection": ("ModeSelection",),
-    "structure.operator_selection": ("OperatorSelection",),
+    "skills.sequence": ("Sequence",),
+    "skills.via_point": ("ViaPoint",),
+    "skills.via_points": ("ViaPoints",),
+    "skills.ways": ("Ways",),
+    "structure.fit_parts": ("fit_parts",),
     "structure.segmentation": ("Segmentation",),
-    "data.trajectories": ("Trajectory",),
-    "training.hold_detection": ("find_holds",),
+    "structure.select_components": ("SelectComponents",),
+    "structure.select_operators": ("SelectOperators",),
+    "structure.select_ways": ("SelectWays",),
+    "data.trajectories": ("Candidate", "Trajectory"),
+    "training.hold_detection": ("attach_holds", "find_holds"),
+    "training.outlying_demonstrations": ("drop_outliers",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import copy
 import math
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
+from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["in_skill_time"]
 
@@ -62,23 +65,21 @@ def in_skill_time(
     >>> round(float(placed.time[0]), 1), round(float(placed.time[-1]), 1)
     (0.5, 1.5)
     """
-    if not hasattr(model, "weights_"):
-        raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
-    skill = copy.copy(model.with_via_points([]))
-    # what the model says, and not how a robot gets there
-    skill.blend, skill.keep_limits, skill.plausibility = 0.0, False, "ignore"
+    skill: Any = model.skill
     return [_placed(skill, one, number) for number, one in enumerate(demonstrations)]
 
 
-def _placed(skill: TaskParameterizedGMM, shown: Demonstration, number: int) -> Demonstration:
-    kinematics, grid = skill.kinematics_, skill.time_
+def _placed(skill: Skill, shown: Demonstration, number: int) -> Demonstration:
+    kinematics, grid = skill.kinematics, skill.time
     if len(shown) < 2:
         raise DataError(f"demonstration {number} has one time step: it shows no motion")
     shown = shown.reordered(kinematics.joint_names)
     count = min(STEPS, max(len(grid), 2))
     time = torch.linspace(float(grid[0]), float(grid[-1]), count, dtype=grid.dtype)
     situation = Situation(shown.joints[0], Situation.of(shown).frames, time)
-    [reproduced] = skill.predict([situation], candidates=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PlausibilityWarning)  # a correction begins anywhere
+        [reproduced] = rollout(skill, [situation])
     path, ends = (
         _features(skill, joints) for joints in (reproduced.joints, shown.joints[[0, -1]])
     )
@@ -106,9 +107,9 @@ def _placed(skill: TaskParameterizedGMM, shown: Demonstration, number: int) -> D
     )
 
 
-def _features(skill: TaskParameterizedGMM, joints: torch.Tensor) -> Array:
+def _features(skill: Skill, joints: torch.Tensor) -> Array:
     """Joints and positions of links (T, D), in units of what counts as a difference."""
-    state = skill.kinematics_.state(joints)
+    state = skill.kinematics.state(joints)
     parts = [state.joints / JOINTS]
-    parts += [state.position(link) / LINKS for link in skill.kinematics_.links]
+    parts += [state.position(link) / LINKS for link in skill.kinematics.links]
     return as_array(torch.cat(parts, dim=-1))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +13,7 @@ from matplotlib.figure import Figure
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_tools.plotting import ORANGE
-from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch import CovarianceFusion, Frame, Situation, TaskParameterizedGMM, rollout
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import largest_acceleration
 
@@ -37,16 +39,18 @@ def draw(out: Path) -> None:
     bottles = Frame.stack([situation.frames["bottle"] for situation in situations])
     model = TaskParameterizedGMM(30, bottle_operators(), skill.robot).fit(aligned)
 
-    def measure() -> tuple[float, float]:
-        motions = model.predict(situations, candidates=False)
+    def measure(form: Any) -> tuple[float, float]:
+        motions = rollout(form, situations, bounds="robot", blend=1.0)
         last = torch.stack([motion.joints[-1] for motion in motions])
         apart, _ = skill.grasp_error(last, bottles)
         fastest = [largest_acceleration(motion) for motion in motions]
         return 1e3 * float(apart.median()), float(np.median(fastest))
 
-    information = measure()
-    model.set_params(fusion="covariance")
-    covariance = [measure() for model.epsilon in EPSILONS]
+    information = measure(model.skill)
+    printed_forms = (
+        replace(model.skill, fusion=CovarianceFusion(float(epsilon))) for epsilon in EPSILONS
+    )
+    covariance = [measure(form) for form in printed_forms]
 
     drawing = Figure(figsize=(8.4, 3.2), layout="constrained")
     panels = drawing.subplots(1, 2)

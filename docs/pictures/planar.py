@@ -65,7 +65,7 @@ def situation(seed: int = 8) -> Situation:
 def model(skill: list[Demonstration]) -> TaskParameterizedGMM:
     """What is learned of it: the hand seen from the object, and the joints."""
     operators = [RelativePosition("hand", "object"), Canonical()]
-    return TaskParameterizedGMM(14, operators, arm(), blend=0.3).fit(skill)
+    return TaskParameterizedGMM(14, operators, arm()).fit(skill)
 
 
 def chain(joints: Tensor) -> np.ndarray:

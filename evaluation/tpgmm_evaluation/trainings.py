@@ -26,7 +26,13 @@ from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
 from tpgmm_evaluation.policies.replay import NearestPolicy
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 from tpgmm_evaluation.settings import Settings
-from tpgmm_torch import Canonical, Demonstration, TaskParameterizedGMM
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    TaskParameterizedGMM,
+    attach_holds,
+    drop_outliers,
+)
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.operators import Operator
 
@@ -65,8 +71,9 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         benchmark.robot,
         random_state=cell.seed,
     )
+    kept = drop_outliers(demonstrations, operators_of(base, benchmark), benchmark.robot)
     policy = TPGMMPolicy.from_estimator(
-        model.fit(demonstrations),
+        model.fit(attach_holds(kept, benchmark.robot)),
         fps=benchmark.rate,
         environment_names=_environment_names(episodes / "training"),
     )

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -18,7 +19,6 @@ from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import (
     Hold,
-    MultimodalTaskParameterizedGMM,
     Robot,
     TaskParameterizedGMM,
     Trust,
@@ -26,35 +26,30 @@ from tpgmm_torch import (
     parse_clock,
 )
 from tpgmm_torch.alignment.text import METHODS
+from tpgmm_torch.checks.report import PLAUSIBILITY
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.sensing.pose_filter import OneEuro
-from tpgmm_torch.structure.parts import parse_parts
+from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = [
     "FITTED",
-    "Skill",
     "StatePolicyConfig",
     "TPGMMConfig",
-    "Way",
-    "models_of",
     "state_features",
 ]
 
-#: What is learned: one way of a skill, or several.
-Skill = TaskParameterizedGMM | MultimodalTaskParameterizedGMM
 
 #: Parameters of the estimator that go into the configuration under their own names.
 HYPERPARAMETERS = (
-    "n_components", "priorities", "operator_weights", "covariance_type", "reg_covar",
-    "covariance_shrinkage", "tol", "max_iter", "n_init", "init_params", "responsibilities",
-    "fusion", "activation", "epsilon", "prior_std", "negligible", "blend", "keep_limits",
-    "robust", "plausibility", "random_state", "dtype",
+    "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
+    "n_init", "init_params", "responsibilities", "random_state", "dtype",
 )  # fmt: skip
 
 #: Robots that come with the package: what describes each, and its hands.
@@ -71,38 +66,10 @@ CHOICES = {
 }
 
 
-@dataclass
-class Way:
-    """One of the ways in which a policy does a skill: what :class:`TPGMMConfig` has for one.
-
-    Parameters
-    ----------
-    n_components, operators, n_steps, parts, holds, via_points, via_fade, shown, peaks
-        As there.
-    weight, limit : float
-        As in :class:`tpgmm_torch.MultimodalTaskParameterizedGMM`, a number of each.
-    episodes : list of int
-        The demonstrations that show this way.
-    """
-
-    n_components: int
-    operators: list[dict[str, Any] | str]
-    n_steps: int
-    parts: str | None
-    holds: list[str] | None
-    via_points: list[str] | None
-    via_fade: float
-    shown: dict[str, Any] | None
-    peaks: list[list[float]] | None
-    weight: float
-    limit: float
-    episodes: list[int]
-
-
-#: Fields that a fit fills in; where there are several ways, those of each.
-FITTED = tuple(
-    each.name for each in fields(Way) if each.name not in ("weight", "limit", "episodes")
-)
+#: Fields that a fit fills in.
+FITTED = (
+    "n_components", "operators", "n_steps", "holds", "shown", "peaks",
+)  # fmt: skip
 
 
 @dataclass
@@ -155,17 +122,25 @@ class TPGMMConfig(StatePolicyConfig):
 
     Parameters
     ----------
-    n_components, priorities, operator_weights, covariance_type, reg_covar, \
-    covariance_shrinkage, tol, max_iter, n_init, init_params, responsibilities, fusion, \
-    activation, epsilon, prior_std, negligible, blend, keep_limits, robust, random_state, dtype
+    n_components, covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, \
+    init_params, responsibilities, random_state, dtype
         As for :class:`tpgmm_torch.TaskParameterizedGMM`.
+    fusion : {"information", "covariance"}, default="information"
+        Form of the product, with the settings ``prior_std``, ``priorities`` and ``negligible``
+        of :class:`tpgmm_torch.InformationFusion`, or ``epsilon`` and ``activation`` of
+        :class:`tpgmm_torch.CovarianceFusion`.
+    blend : float, default=1.0
+        How long the difference between start posture and model fades [s].
+    keep_limits : bool, default=True
+        Whether references stay within the bounds of motion.
+    robust : bool, default=True
+        Whether training leaves out episodes that are unlike the others.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        What training does about recordings that are unlikely to be what they are taken for.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
         :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
         all links in all frames, stacked, and the joints.
-    parts : str, optional
-        Where the skill has parts that are learned one by one: ``"auto"``, or when they end, as
-        seconds and events joined by commas, ``"4.2,grasp"``.
     holds : list of str, optional
         From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
         the aligned skill. By default it is found in frames that are read at every step
@@ -190,11 +165,6 @@ class TPGMMConfig(StatePolicyConfig):
     peaks : list of two lists of float, optional
         Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
         the bounds of what neither the robot nor the user bounds.
-    modes : "auto" or int, default=1
-        In how many ways the skill is done, each a model of its own; "auto" finds it. A fitted
-        policy chooses one by the situation, and changes it while several are open.
-    ways : list of Way, optional
-        Of a policy that is fitted and has several: what each has in place of the fields above.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -275,7 +245,6 @@ class TPGMMConfig(StatePolicyConfig):
 
     n_components: int = 10
     priorities: list[int] | None = None
-    operator_weights: str = "equal"
     covariance_type: str = "full"
     reg_covar: float = 1e-5
     covariance_shrinkage: float | str = "auto"
@@ -298,7 +267,6 @@ class TPGMMConfig(StatePolicyConfig):
 
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
-    parts: str | None = None
     holds: list[str] | None = None
     via_points: list[str] | None = None
     via_fade: float = 1.0
@@ -309,8 +277,6 @@ class TPGMMConfig(StatePolicyConfig):
     n_steps: int = 0
     shown: dict[str, Any] | None = None
     peaks: list[list[float]] | None = None
-    modes: int | str = 1
-    ways: list[Way] = field(default_factory=list)
 
     state_names: list[str] | None = None
     action_names: list[str] | None = None
@@ -379,43 +345,18 @@ class TPGMMConfig(StatePolicyConfig):
         for text in self.events.values():
             parse_event(text)
         self.control()
-        self.estimator(None, ()).check_parameters()
-        check_parameters(MultimodalTaskParameterizedGMM(modes=self.modes))
-        self._check_ways()
-
-    def _check_ways(self) -> None:
-        """Whether nothing is said of all ways that is of each one."""
-        if self.ways:
-            wrong = [name for name, none in _unfitted().items() if getattr(self, name) != none]
-            if wrong:
-                raise DataError(
-                    f"the policy has {len(self.ways)} ways, each with its own "
-                    f"{', '.join(wrong)}: fit again to change them"
-                )
-        ways = self.each_way()  # each of them is checked
-        if self.fitted and self.modes != len(ways):
+        if self.fusion not in ("information", "covariance"):
+            raise DataError(f"fusion is 'information' or 'covariance', got {self.fusion!r}")
+        if self.plausibility not in PLAUSIBILITY:
             raise DataError(
-                f"the policy is fitted, modes={len(ways)}, got {self.modes!r}: train a new one "
-                "for another number of ways"
+                f"plausibility is one of {list(PLAUSIBILITY)}, got {self.plausibility!r}"
             )
+        check_parameters(self.estimator(None, ()))
 
     @property
     def fitted(self) -> bool:
         """Whether what a fit fills in is there."""
-        return bool(self.n_steps or self.ways)
-
-    def each_way(self) -> list[TPGMMConfig]:
-        """A configuration for each way, with what is its own in its place.
-
-        Raises
-        ------
-        DataError, InvalidParameterError
-            If a value is none that exists.
-        """
-        return [
-            replace(self, modes=1, ways=[], **{name: getattr(way, name) for name in FITTED})
-            for way in self.ways
-        ] or [self]
+        return bool(self.n_steps)
 
     @property
     def rate(self) -> float:
@@ -439,7 +380,10 @@ class TPGMMConfig(StatePolicyConfig):
             "trust": Trust(joint_timeout=self.patience, frame_timeout=self.frame_patience),
             "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
             "feedback": "measured" if self.feedback == "observation" else "reference",
-            "bounds": {name: limit for name, limit in limits.items() if limit is not None},
+            "bounds": None
+            if not self.keep_limits
+            else {name: limit for name, limit in limits.items() if limit is not None},
+            "blend": self.blend,
         }
 
     def link_poses(self) -> dict[str, LinkPose]:
@@ -493,58 +437,23 @@ class TPGMMConfig(StatePolicyConfig):
         self.kinematics()  # what cannot be read back is refused now
         self.decoded_operators()
 
-    def note(self, model: Skill) -> None:
-        """Write down what a fitted model is beside its mixtures."""
-        fitted = [_noted(one) for one in models_of(model)]
-        self.modes, self.ways = len(fitted), []
-        if isinstance(model, MultimodalTaskParameterizedGMM) and self.modes > 1:
-            self.ways = [
-                Way(
-                    **own,
-                    weight=float(model.weights_[mode]),
-                    limit=float(model.limits_[mode]),
-                    episodes=(model.labels_ == mode).nonzero()[0].tolist(),
-                )
-                for mode, own in enumerate(fitted)
-            ]
-            fitted = [_unfitted()]
-        for name, value in fitted[0].items():
+    def note(self, model: TaskParameterizedGMM) -> None:
+        """Fill in what a fit has learned beside the mixture's numbers."""
+        skill = model.skill
+        self.n_components, self.n_steps = len(model.weights_), len(model.time_)
+        # with the paths that it found
+        self.operators = list(map(_description, model.operators_))
+        self.holds = list(map(str, model.holds_))
+        self.shown = None if skill.summary is None else skill.summary.config()
+        self.peaks = None if skill.peaks is None else [each.tolist() for each in skill.peaks]
+        for name, value in _fusion(skill.fusion).items():
             setattr(self, name, value)
 
-    def recall(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
-        """The inverse of :meth:`note`, for a model made of a mixture; it is changed."""
-        if self.shown is not None:
-            model.summary_ = TrainingSummary.from_config(self.shown, model.kinematics_)
-        if self.peaks is not None:
-            like = model.kinematics_.lower
-            model.acceleration_, model.jerk_ = (like.new_tensor(peak) for peak in self.peaks)
-        if self.via_points:
-            return model.with_via_points(self.via_points, self.via_fade)
-        return model
-
-    def joined(self, models: Sequence[TaskParameterizedGMM]) -> Skill:
-        """The skill, of the models of its ways.
-
-        Raises
-        ------
-        DataError
-            If they do not fit together.
-        """
-        if not self.ways:
-            [model] = models
-            return model
-        labels = {
-            episode: mode for mode, way in enumerate(self.ways) for episode in way.episodes
-        }
-        count = sum(len(way.episodes) for way in self.ways)
-        if labels.keys() != set(range(count)):
-            raise DataError("ways: each episode shows one of them, and none is left out")
-        return MultimodalTaskParameterizedGMM.from_models(
-            models,
-            [way.weight for way in self.ways],
-            [way.limit for way in self.ways],
-            [labels[episode] for episode in range(count)],
-        )
+    def skill(self, model: TaskParameterizedGMM) -> Any:
+        """What an episode runs: the model's skill, through the via-points."""
+        if not self.via_points:
+            return model.skill
+        return ViaPoints(model.skill, self.via_points, self.via_fade)
 
     def via_operators(self) -> list[Operator]:
         """Whose coordinates the via-points are."""
@@ -553,9 +462,27 @@ class TPGMMConfig(StatePolicyConfig):
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters, for one way."""
         settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
-        settings["parts"] = parse_parts(self.parts)
-        settings["holds"] = "auto" if self.holds is None else list(map(Hold.parse, self.holds))
-        return TaskParameterizedGMM(operators=operators, robot=kinematics, **settings)
+        fusion: Fusion = InformationFusion(self.prior_std, self.priorities, self.negligible)
+        if self.fusion == "covariance":
+            fusion = CovarianceFusion(self.epsilon, self.activation)
+        return TaskParameterizedGMM(
+            operators=operators, robot=kinematics, fusion=fusion, **settings
+        )
+
+    def learned(self) -> dict[str, Any]:
+        """What a fit has learned beside the mixture, for ``from_parameters``."""
+        summary = None
+        if self.shown is not None:
+            summary = TrainingSummary.from_config(self.shown, self.kinematics())
+        peaks = None
+        if self.peaks is not None:
+            peaks = tuple(torch.tensor(each, dtype=torch.float64) for each in self.peaks)
+        return {
+            "holds": list(map(Hold.parse, self.holds or ())),
+            "n_demonstrations": None if summary is None else summary.n_demonstrations,
+            "peaks": peaks,
+            "summary": summary,
+        }
 
     def validate_features(self) -> None:
         """Check that there are a state and an action."""
@@ -572,36 +499,21 @@ class TPGMMConfig(StatePolicyConfig):
         return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0)
 
 
-def models_of(skill: Skill) -> list[TaskParameterizedGMM]:
-    """The models of the ways of a fitted skill."""
-    return [skill] if isinstance(skill, TaskParameterizedGMM) else skill.models_
-
-
-def _noted(model: TaskParameterizedGMM) -> dict[str, Any]:
-    """The fields ``FITTED`` of a model of one way."""
-    via_points = list(map(str, model.via_points_))
-    for text, point in zip(via_points, model.via_points_, strict=True):
-        if ViaPoint.parse(text) != point:
-            raise DataError(f"the via-point {text} is of an operator that has no text")
-    peaks = None
-    if model.acceleration_ is not None and model.jerk_ is not None:
-        peaks = [model.acceleration_.tolist(), model.jerk_.tolist()]
+def _fusion(fusion: Fusion) -> dict[str, Any]:
+    """Fields of the configuration that stand for a form of fusion."""
+    if isinstance(fusion, CovarianceFusion):
+        return {
+            "fusion": "covariance",
+            "epsilon": fusion.epsilon,
+            "activation": fusion.activation,
+        }
+    priorities = None if fusion.priorities is None else list(fusion.priorities)
     return {
-        "n_components": model.n_components_,
-        "operators": list(map(_description, model.operators_)),  # with the paths that it found
-        "n_steps": len(model.time_),
-        "parts": ",".join(f"{part.begin:.6g}" for part in model.parts_[1:]) or None,
-        "holds": list(map(str, model.holds_)),
-        "via_points": via_points or None,
-        "via_fade": model.via_fade_,
-        "shown": None if model.summary_ is None else model.summary_.config(),
-        "peaks": peaks,
+        "fusion": "information",
+        "prior_std": fusion.prior_std,
+        "priorities": priorities,
+        "negligible": fusion.negligible,
     }
-
-
-def _unfitted() -> dict[str, Any]:
-    """The fields ``FITTED`` where no fit has filled them in."""
-    return {each.name: each.default for each in fields(TPGMMConfig) if each.name in FITTED}
 
 
 def _description(operator: Operator) -> dict[str, Any] | str:

@@ -5,21 +5,21 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from lerobot_policy_tpgmm.configuration_tpgmm import Skill
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets.signals import Signals
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import read_whole
 from tpgmm_torch.exceptions import ModelFileError
 
 __all__ = ["write_pretrained"]
 
 
-def write_pretrained(model: Skill, path: Path, signals: Signals) -> None:
+def write_pretrained(model: TaskParameterizedGMM, path: Path, signals: Signals) -> None:
     """Write the directory that LeRobot's commands take as ``--policy.path``.
 
     Parameters
     ----------
-    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+    model : TaskParameterizedGMM
         Fitted.
     signals : Signals
         Of the data set that the model was fitted to.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -146,7 +147,7 @@ class MixtureParameters(nn.Module):
         self.fitted.fill_(True)
 
     @torch.no_grad()
-    def to_estimator(self, model: TaskParameterizedGMM) -> TaskParameterizedGMM:
+    def to_estimator(self, model: TaskParameterizedGMM, **learned: Any) -> TaskParameterizedGMM:
         """The fitted model that these parameters describe.
 
         Parameters
@@ -174,5 +175,5 @@ class MixtureParameters(nn.Module):
         weights, means, covariances = self.tensors()
         copies, time = [mean.clone() for mean in means], self.time.clone()
         return TaskParameterizedGMM.from_parameters(
-            weights, copies, covariances, time, **settings
+            weights, copies, covariances, time, **learned, **settings
         )

@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,9 +20,7 @@ from torch import Tensor
 from lerobot_policy_tpgmm.configuration_tpgmm import (
     FITTED,
     HYPERPARAMETERS,
-    Skill,
     TPGMMConfig,
-    models_of,
     state_features,
 )
 from lerobot_policy_tpgmm.control_rate import check_rate
@@ -49,6 +46,7 @@ from tpgmm_torch.exceptions import (
     PlausibilityWarning,
     ShapeError,
 )
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 
 __all__ = ["TPGMMPolicy"]
@@ -148,8 +146,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self.config = config
         if dataset_meta is not None:
             (check_dataset if config.fitted else adopt)(config, dataset_meta)
-        kinematics, ways = config.kinematics(), config.each_way()
-        operators = [one for way in ways for one in way.decoded_operators() or ()]
+        kinematics, operators = config.kinematics(), config.decoded_operators()
         if kinematics is None or not operators:
             raise DataError(
                 "a policy that is not fitted needs a data set to be trained on: lerobot-train "
@@ -158,18 +155,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         config.validate_features()
         self.kinematics = kinematics.to(getattr(torch, config.dtype))
-        needed = [
-            frame_names([*(way.decoded_operators() or ()), *way.via_operators()], kinematics)
-            for way in ways
-        ]
-        required = list(dict.fromkeys(chain(*needed)))
+        required = list(frame_names([*operators, *config.via_operators()], kinematics))
         # an object that only stands where links do is told from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
         known |= {*(config.frames or ()), *poses_named(config.environment_names)}
         known |= {*poses_named(config.state_names)}
         for operator in operators:
             operator.check(self.kinematics, known - set(self.kinematics.links))
-        self._make_mixtures()
+        self._make_mixture(operators)
         names = self.kinematics.joint_names
         state_names = config.state_names or names
         if config.fitted:  # the robot at hand may state more than the data set did
@@ -182,7 +175,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         environment = config.env_state_feature
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names
-        told = list(dict.fromkeys(chain(*map(observed_frames, ways, needed))))
+        told = observed_frames(config, required)
         default = config.default_environment_state
         self.frames = FrameFeatures(told, config.frames, *named, default, width)
         self._learner: Learner | None = None
@@ -211,38 +204,22 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"another robot? Else name the entries in order, --policy.{field}='[...]'"
             )
 
-    def _make_mixtures(self) -> None:
-        """A mixture for each way that has none yet.
+    def _make_mixture(self, operators: Sequence[Operator]) -> None:
+        """The mixture, once the number of time steps is known."""
+        config, dtype = self.config, getattr(torch, self.config.dtype)
+        dimensions = [one.dimension(self.kinematics) for one in operators]
+        self.mixture = MixtureParameters(config.n_components, dimensions, config.n_steps, dtype)
 
-        That of the first is ``mixture``, as if it were the only one, and others are
-        ``mixture_1``, ``mixture_2``, ...
-        """
-        for number, way in enumerate(self.config.each_way()):
-            name = f"mixture_{number}" if number else "mixture"
-            if not hasattr(self, name):
-                operators = way.decoded_operators() or ()
-                dimensions = [one.dimension(self.kinematics) for one in operators]
-                dtype = getattr(torch, self.config.dtype)
-                made = MixtureParameters(way.n_components, dimensions, way.n_steps, dtype)
-                self.add_module(name, made)
-
-    @property
-    def mixtures(self) -> list[MixtureParameters]:
-        """Of each way."""
-        return [module for module in self.children() if isinstance(module, MixtureParameters)]
-
-    def _become(self, model: Skill) -> None:
+    def _become(self, model: TaskParameterizedGMM) -> None:
         """Take over what a fitted model is."""
         self.config.note(model)
-        self._make_mixtures()
-        for mixture, one in zip(self.mixtures, models_of(model), strict=True):
-            mixture.copy_from(one)
+        self.mixture.copy_from(model)
         self.to(self.mixture.time.device)
 
     @classmethod
     def from_estimator(
         cls,
-        model: Skill,
+        model: TaskParameterizedGMM,
         *,
         fps: float | None = None,
         state_names: Sequence[str] | None = None,
@@ -255,7 +232,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
         Parameters
         ----------
-        model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+        model : TaskParameterizedGMM
             Fitted.
         fps : float, optional
             Steps per second; by default those of the model's time grid.
@@ -277,27 +254,26 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             If names or frames do not fit the model, or it holds an operator or a robot of
             your own, which a file cannot describe.
         """
+        if not isinstance(model, TaskParameterizedGMM):
+            raise DataError(
+                f"a policy is made of a TaskParameterizedGMM, got {type(model).__name__}"
+            )
         if not hasattr(model, "weights_"):
             raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
-        models = models_of(model)
-        kinematics, time = models[0].kinematics_, models[0].time_
+        kinematics, time = model.kinematics_, model.time_
         if fps is None and len(time) > 1:
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        settings, *others = map(_settings, models)
-        if differ := [n for n in settings if any(one[n] != settings[n] for one in others)]:
-            raise DataError(f"all ways of a policy have the same settings; {differ} differ")
+        settings = _settings(model)
         config = TPGMMConfig(
             **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
         )
-        config.describe(kinematics, models[0].operators_)
+        config.describe(kinematics, model.operators_)
         config.note(model)
         config.state_names = list(state_names or kinematics.joint_names)
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
-        pairs = zip(config.each_way(), models, strict=True)
-        told = [name for way, one in pairs for name in observed_frames(way, one.frame_names_)]
-        told = list(dict.fromkeys(told))
+        told = observed_frames(config, model.frame_names_)
         poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
         given = frames or {}
         order = [name for name in poses.in_environment if name not in given]
@@ -316,15 +292,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         policy._become(model)
         return policy.eval().to(config.device)
 
-    def to_estimator(self) -> Skill:
-        """The fitted model that the policy is; of several ways, one of them all."""
-        device, models = self.mixture.time.device, []
-        kinematics = self.kinematics.to(device=device)
-        for way, mixture in zip(self.config.each_way(), self.mixtures, strict=True):
-            model = way.estimator(kinematics, way.decoded_operators())
-            model.device = str(device)
-            models.append(way.recall(mixture.to_estimator(model)))
-        return self.config.joined(models)
+    def to_estimator(self) -> TaskParameterizedGMM:
+        """The fitted model that the policy is."""
+        device = self.mixture.time.device
+        operators, kinematics = (
+            self.config.decoded_operators(),
+            self.kinematics.to(device=device),
+        )
+        model = self.config.estimator(kinematics, operators).set_params(device=str(device))
+        return self.mixture.to_estimator(model, **self.config.learned())
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
@@ -413,11 +389,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
-        model = self.to_estimator()
+        skill = self.config.skill(self.to_estimator())
         joints, frames = self._observed(batch), self.frames.frames(batch)
         if len(joints) == 1:  # one robot is sooner computed without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
-        return model.controller(joints, frames, **self.config.control())
+        return Controller(skill, joints, frames, **self.config.control())
 
     def _told(
         self, batch: Mapping[str, Tensor], controller: Controller

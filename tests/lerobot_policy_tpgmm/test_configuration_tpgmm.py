@@ -89,8 +89,8 @@ def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):
     assert back.holds_ == model.holds_
     assert torch.equal(back.acceleration_, model.acceleration_)
     assert torch.equal(back.jerk_, model.jerk_)
-    for name, bound in vars(model.motion_bounds()).items():
-        assert torch.equal(getattr(back.motion_bounds(), name), bound)
+    for name, bound in vars(model.skill.motion_bounds).items():
+        assert torch.equal(getattr(back.skill.motion_bounds, name), bound)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,9 @@ from tests.support.command_line import output, refusal
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
-from tests.support.two_ways import ARM, Handles, two_ways_set
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import (
     Demonstration,
-    MultimodalTaskParameterizedGMM,
-    TaskParameterizedGMM,
 )
 
 NAMES = fitted().kinematics.joint_names
@@ -70,51 +67,6 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
     torch.testing.assert_close(first, observed[STATE], rtol=0, atol=1e-3)
     (tmp_path / "policy" / "config.json").write_text("{}")
     assert "exists and is not a tpgmm policy" in refusal(*arguments, tmp_path / "policy")
-
-
-def test_a_skill_in_parts_is_the_models_controller(tmp_path):
-    save_lerobot(generator().demonstrations(4, seed=0), tmp_path / "set", fps=20, task="shake")
-    arguments = (
-        "fit", tmp_path / "set", "--robot", "upper_body", "--link", "l_hand", "--link",
-        "r_hand", "--parts", "auto", "--alignment", "parts", "--rate", 10, "--n-components", 8,
-        "--tol", 0.1, "--out",
-    )  # fmt: skip
-    output(*arguments, tmp_path / "model")
-    assert "part 4 " in output(*arguments, tmp_path / "policy", "--format", "lerobot")
-    model = TaskParameterizedGMM.load(tmp_path / "model")
-    policy = TPGMMPolicy.from_pretrained(tmp_path / "policy")
-    observed = {key: value[:1] for key, value in batch().items()}
-    [start] = situations(observed)
-    controller = model.controller(start.joints, start.frames, **policy.config.control())
-    for tick in range(12 * 10):
-        action = policy.select_action(observed)
-        at = observed[STATE][0].double()
-        command = controller.step(0.1, at, start.frames if tick else None)
-        torch.testing.assert_close(action[0], command.reference.float(), rtol=0, atol=1e-6)
-        observed[STATE] = action
-    moved = command.reference - start.joints
-    assert float(command.time) > model.parts_[-1].begin and float(moved.abs().max()) > 0.2
-
-
-def test_several_ways_are_one_policy(tmp_path):
-    two_ways_set(tmp_path)
-    arguments = (
-        "fit", tmp_path / "set", "--robot", tmp_path / "arm.urdf", "--link", "tip",
-        "--operator", "position:tip@object", "--operator", "canonical",
-        "--alignment", "none", "--n-components", 8, "--modes", "auto", "--out",
-    )  # fmt: skip
-    output(*arguments, tmp_path / "model")
-    text = output(*arguments, tmp_path / "policy", "--format", "lerobot")
-    assert "2 ways:" in text and text.endswith(f"saved            {tmp_path / 'policy'}\n")
-    policy = TPGMMPolicy.from_pretrained(tmp_path / "policy")
-    assert policy.config.modes == 2 and policy.config.fps == 20
-    assert tuple(policy.config.state_names) == ARM.joint_names
-    model = MultimodalTaskParameterizedGMM.load(tmp_path / "model")
-    given = Handles().situations(3, 0)
-    for one, other in zip(
-        policy.to_estimator().predict(given), model.predict(given), strict=True
-    ):
-        torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-9)
 
 
 def test_an_unknown_format_is_refused(tmp_path):

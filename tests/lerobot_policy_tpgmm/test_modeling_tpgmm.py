@@ -42,6 +42,7 @@ from tests.support.two_ways import Handles, another_handle_each, tip
 from tests.support.two_ways import fitted as ways
 from tpgmm_torch import (
     Canonical,
+    Controller,
     Frame,
     MultimodalTaskParameterizedGMM,
     RelativePosition,
@@ -90,7 +91,7 @@ def test_a_start_off_the_skill_is_blended_in_as_predict_does():
 
 def test_references_keep_the_speed_limit():
     observed = batch()
-    joints = act(policy(blend=0.0, **OPEN), observed, STEPS).double()
+    joints = act(policy(**OPEN), observed, STEPS).double()
     model = copy.copy(small_bottle()).set_params(blend=0.0)
     assert_close(joints, predicted(model, situations(observed)))
     speed = joints.diff(dim=1) / small_bottle().time_.diff()[:, None]
@@ -151,7 +152,7 @@ def test_a_sub_environment_that_jumps_disturbs_no_other(feedback):
 
 def test_q_before_may_be_what_was_measured():
     model = copy.copy(small_bottle()).set_params(keep_limits=False)
-    acting = policy(feedback="observation", blend=0.0, keep_limits=False, clock="even")
+    acting = policy(feedback="observation", clock="even")
     generator = torch.Generator().manual_seed(0)
     frames = {"bottle": Frame(*batch()[ENVIRONMENT].double().split([3, 4], dim=-1))}
     action = batch()[STATE]
@@ -231,7 +232,7 @@ def test_tracked_bodies_are_moved_on_their_manifold():
 def test_parts_with_operators_of_their_own_are_played(tmp_path):
     cup, tray = RelativePosition("hand", "cup"), RelativePosition("hand", "tray")
     lists = [[cup, Canonical()], [cup, tray, Canonical()]]
-    model = TaskParameterizedGMM(8, lists, HAND, parts=[3.0], blend=0.0).fit(errands())
+    model = TaskParameterizedGMM(8, lists, HAND, parts=[3.0]).fit(errands())
     with pytest.warns(PlausibilityWarning, match="in the order in which the operators name"):
         TPGMMPolicy.from_estimator(model, **OPEN)
     names = [f"{name}.{part}" for name in ("cup", "tray") for part in POSE_PARTS]
@@ -439,7 +440,7 @@ def test_what_is_held_is_part_of_the_policy(tmp_path):
     assert loaded.to_estimator().holds_ == model.holds_
     poses = [x for f in scene.frames.values() for x in (f.position, f.orientation)]
     seen = {STATE: scene.start.float(), ENVIRONMENT: torch.cat(poses, -1).float()}
-    controller = model.controller(scene.start, scene.frames, **policy.config.control())
+    controller = Controller(model.skill, scene.start, scene.frames, **policy.config.control())
     for now in model.time_.tolist():
         actions = loaded.select_action(seen)
         controller.step(1 / policy.config.rate)
@@ -466,7 +467,8 @@ def test_of_several_ways_each_robot_goes_the_one_that_suits(tmp_path):
         acting.reset()
         now, at = dict(observed), observed[ENVIRONMENT].double()
         controllers = [
-            model.controller(
+            Controller(
+                model.skill,
                 now[STATE][robot].double(),
                 {"object": Frame(at[robot, :3], at[robot, 3:])},
                 **acting.config.control(),

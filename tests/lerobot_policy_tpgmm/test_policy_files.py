@@ -22,8 +22,8 @@ from tests.support.skills import same, small_bottle
 from tests.support.two_ways import Handles
 from tests.support.two_ways import fitted as ways
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError
+from tpgmm_torch.persistence import load_model
 
 FILES = {
     "config.json",
@@ -51,7 +51,7 @@ def test_the_directory_is_complete(saved):
     assert config["robot"]["config"]["urdf"] == upper_body_urdf()
     assert config["operators"][1] == "canonical"
     with pytest.raises(ModelFileError):  # it is no model of the estimator's own format
-        TaskParameterizedGMM.load(saved)
+        load_model(saved)
 
 
 def test_a_policy_comes_back_equal(saved):

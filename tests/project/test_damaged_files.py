@@ -13,6 +13,7 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support import lerobot_sets, skills
 from tests.support.damage import TABLES, WITH_JSON, blocks, bounded, damaged, one
 from tests.support.policies import fitted
+from tests.support.skills import hands
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_datasets.situation_files import read_situations
@@ -49,7 +50,7 @@ def check_all(original, tmp_path, damages, seeds, load, check):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "saved"
-    skills.hands().save(path)
+    skills.save(hands(), path)
     return path
 
 

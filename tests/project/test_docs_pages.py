@@ -19,7 +19,7 @@ from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import TASK, BottleShaking
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_tools.cli.application import app
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM, save
 from tpgmm_torch.alignment import DynamicTimeWarping
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,7 @@ def demo(tmp_path_factory) -> Path:
     demonstrations = load_lerobot(path, robot=skill.robot)
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)
     model = TaskParameterizedGMM(12, bottle_operators(), skill.robot).fit(aligned)
-    model.save(folder / "out" / "demo" / "model")
+    save(model, folder / "out" / "demo" / "model")
     (folder / "robot.urdf").write_text(upper_body_urdf(), encoding="utf-8")
     return folder
 

@@ -14,8 +14,9 @@ from tests.support.kills import exit_code, forked, killed_between
 from tests.support.policies import changed, fitted
 from tests.support.written_sets import FPS, assert_same, demonstration
 from tpgmm_datasets import load_lerobot, save_lerobot
-from tpgmm_torch import TaskParameterizedGMM, atomic
+from tpgmm_torch import atomic
 from tpgmm_torch.large_data.checkpoints import FOLDER
+from tpgmm_torch.persistence import load_model
 
 KILLS = 200 if FULL else 4
 
@@ -39,10 +40,10 @@ def test_models(tmp_path):
 
     def save(number):
         model.n_iter_, model.means_[0] = number, mean + number
-        model.save(path)
+        save(model, path)
 
     def load():
-        found = TaskParameterizedGMM.load(path)
+        found = load_model(path)
         assert torch.equal(found.means_[0], mean + found.n_iter_)
         return found.n_iter_
 
@@ -176,13 +177,13 @@ def test_who_reads_while_it_is_saved_has_the_old_or_the_new(tmp_path):
         while not enough.exists():
             number += 1
             model.n_iter_, model.means_[0] = number, mean + number
-            model.save(path)
+            save(model, path)
 
     model.n_iter_ = 0
-    model.save(path)
+    save(model, path)
     pid, seen = forked(save), set()
     while len(seen) < 5:  # however slowly either of them gets a processor
-        found = TaskParameterizedGMM.load(path)
+        found = load_model(path)
         assert torch.equal(found.means_[0], mean + found.n_iter_)
         seen.add(found.n_iter_)
     enough.touch()
@@ -196,10 +197,10 @@ def test_savers_of_one_model_leave_a_whole_one(tmp_path):
     def save(number):
         model.n_iter_, model.means_[0] = number, mean + number
         for _ in range(10):
-            model.save(path)
+            save(model, path)
 
     pids = [forked(lambda number=number: save(number)) for number in range(4)]
     assert [exit_code(pid) for pid in pids] == [0] * 4
-    found = TaskParameterizedGMM.load(path)
+    found = load_model(path)
     assert torch.equal(found.means_[0], mean + found.n_iter_)
     assert left_alone(path)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from tests.support import ros_stub, skills
+from tests.support.skills import small_bottle
+from tpgmm_torch import save
 
 FILE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
 
@@ -15,7 +17,7 @@ FILE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
 @pytest.fixture
 def node(monkeypatch, tmp_path):
     model = skills.small_bottle()
-    model.save(tmp_path / "model")
+    save(model, tmp_path / "model")
     ros_stub.install(monkeypatch, model=str(tmp_path / "model"), rate=10.0, base_frame="torso")
     return runpy.run_path(str(FILE))["SkillNode"]()
 
@@ -62,7 +64,7 @@ def test_nothing_is_sent_before_everything_is_known(node):
 
 def test_a_robot_that_follows_is_led_as_the_controller_leads_it(node):
     joints = START.joints[0]
-    direct = skills.small_bottle().controller(joints, START.frames)
+    direct = skills.Controller(small_bottle().skill, joints, START.frames)
     for _ in range(400):
         tell_joints(node, joints.tolist())
         tell_bottle(node)

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from tests.support.worlds import upper_body
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import Demonstration, Frame, Hold, Situation, TaskParameterizedGMM, quaternions
+from tpgmm_torch import (
+    Controller,
+    Demonstration,
+    Frame,
+    Hold,
+    Situation,
+    TaskParameterizedGMM,
+    quaternions,
+)
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator
@@ -146,7 +154,7 @@ def placed(model: TaskParameterizedGMM, scene: Scene, slips: Tensor) -> Tensor:
     Taking them moves them by ``slips`` (n, 3) in the hand; they are seen at each tick.
     """
     robot, grasp = upper_body(), None
-    controller = model.controller(scene.start, scene.frames)
+    controller = Controller(model.skill, scene.start, scene.frames)
     bottle = scene.bottle
     for now in model.time_.tolist():
         if now >= HELD.end:

@@ -33,8 +33,10 @@ from tpgmm_torch import (
     Situation,
     TaskParameterizedGMM,
     quaternions,
+    save,
 )
 from tpgmm_torch.data.pose_names import POSE_PARTS
+from tpgmm_torch.persistence import load_model
 from tpgmm_torch.robots import Poses
 
 __all__ = ["MISTAKES", "Mistake"]
@@ -831,17 +833,17 @@ def a_set_without_a_state(folder):
 
 @mistake("files", r"is missing|not a saved")
 def a_model_that_is_not_there(folder):
-    TaskParameterizedGMM.load(folder / "model")
+    load_model(folder / "model")
 
 
 @mistake("files", r"changed after it was saved")
 def a_model_that_was_edited(folder):
-    learned().save(folder / "model")
+    save(learned(), folder / "model")
     path = folder / "model" / "config.json"
     config = json.loads(path.read_text())
     config["parameters"]["blend"] = 3.0
     path.write_text(json.dumps(config))
-    TaskParameterizedGMM.load(folder / "model")
+    load_model(folder / "model")
 
 
 @mistake("files", r"robot\.urdf")

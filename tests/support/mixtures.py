@@ -23,6 +23,7 @@ from tpgmm_torch import (
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import RobotState
 
@@ -98,6 +99,18 @@ class Problem:
         at = self.at(index)
         rows = self.case.rows(at)
         return oracles.regress(time, at.joints, rows, self.mixtures, self.weights, **how)
+
+
+def form(
+    fusion: str = "information",
+    activation: str = "time",
+    epsilon: float = 1e-4,
+    **information: Any,
+) -> Fusion:
+    """A form of fusion by its name."""
+    if fusion == "covariance":
+        return CovarianceFusion(epsilon, activation)
+    return InformationFusion(**information)
 
 
 def times(*batch: int) -> Tensor:

@@ -102,7 +102,7 @@ HANDLING: tuple[Operator, ...] = (pose("left", "cup"), pose("right", "left"))
 
 def hands_model(**options: object) -> TaskParameterizedGMM:
     """A model for :func:`handlings`, unfitted."""
-    settings = {"n_components": 6, "operators": list(HANDLING), "robot": HANDS, "blend": 0.0}
+    settings = {"n_components": 6, "operators": list(HANDLING), "robot": HANDS}
     return TaskParameterizedGMM(**{**settings, **options})
 
 
@@ -170,7 +170,7 @@ def tensors(thing: object) -> list[Tensor]:
 
 def canonical(**options: object) -> TaskParameterizedGMM:
     """A model for :func:`waves`, unfitted."""
-    return TaskParameterizedGMM(**{"n_components": 6, "blend": 0.0, **options})
+    return TaskParameterizedGMM(**{"n_components": 6, **options})
 
 
 def new_handling(moves: bool = False, seed: int = 7) -> tuple[Situation, torch.Tensor]:

@@ -21,7 +21,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     Trajectory,
 )
-from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
+from tpgmm_torch.structure.select_ways import SelectWays
 
 LINKS = ("base", "upper_arm", "forearm", "hand", "tip")
 LENGTHS = {"shoulder": 0.0, "elbow": 0.4, "wrist": 0.3, "tool": 0.2}
@@ -200,6 +200,6 @@ def shown(task: type[TwoWays], seed: int = 0, n: int = 10) -> tuple:
 
 
 @functools.cache
-def fitted(task: type[TwoWays], seed: int = 0) -> MultimodalTaskParameterizedGMM:
+def fitted(task: type[TwoWays], seed: int = 0) -> SelectWays:
     """A model of both ways."""
-    return MultimodalTaskParameterizedGMM(task().model()).fit(shown(task, seed)[0])
+    return SelectWays(task().model()).fit(shown(task, seed)[0])

@@ -24,13 +24,13 @@ from tpgmm_tools.plotting import (
     save,
     shade,
 )
-from tpgmm_torch import Demonstration, OperatorSelection, Situation, TaskParameterizedGMM
+from tpgmm_torch import Demonstration, SelectOperators, Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 
 
 def joints_model() -> TaskParameterizedGMM:
-    return TaskParameterizedGMM(4, blend=0.0).fit(waves())
+    return TaskParameterizedGMM(4).fit(waves())
 
 
 def test_phases_are_bands_with_names():
@@ -160,7 +160,7 @@ def test_a_figure_is_written_in_vectors_with_fonts_that_publishers_take(
 
 
 def test_candidates_that_matter_stand_above_the_others():
-    selection = OperatorSelection(robot=HANDS).fit(handlings())
+    selection = SelectOperators(robot=HANDS).fit(handlings())
     [axes] = figure(1, "").axes
     plot_relevance(axes, selection)
     labels = [label.get_text() for label in axes.get_yticklabels()]

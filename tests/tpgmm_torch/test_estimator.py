@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal, multivariate_t, norm
-from sklearn import config_context
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError as SklearnNotFittedError
 from sklearn.model_selection import GridSearchCV, KFold, LeaveOneOut, cross_val_score
@@ -47,14 +46,19 @@ from tests.support.worlds import MOVED, OBJECT, OnPoses, OnRobot, moved, upper_b
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
     Canonical,
+    Controller,
+    CovarianceFusion,
     Demonstration,
     Frame,
     Hold,
+    InformationFusion,
+    MotionBounds,
     RelativePosition,
     Robot,
     Situation,
     Stack,
     TaskParameterizedGMM,
+    save,
 )
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.em.covariance_shrinkage import oracle_approximating_intensity
@@ -67,13 +71,11 @@ from tpgmm_torch.exceptions import (
     TPGMMError,
     UnknownNameError,
 )
-from tpgmm_torch.large_data.checkpoints import Checkpoint
-from tpgmm_torch.large_data.processes import ALONE
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.variance_moderation import moderated_variances
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
-from tpgmm_torch.persistence import MODEL
+from tpgmm_torch.persistence import MODEL, load_model
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.local_data import local_data
@@ -204,19 +206,6 @@ def test_the_shrinkage_of_batches_is_that_of_all_their_demonstrations():
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-9)
 
 
-def test_models_of_before_shrinkage_are_as_they_were(tmp_path):
-    model = hands_model(covariance_shrinkage=0).fit(handlings(5))
-    model.save(tmp_path / "model")
-    config, tensors = MODEL.read(tmp_path / "model")
-    own = ("format", "version", "tensors", "tensors_sha256", "digest")
-    old = {name: value for name, value in config.items() if name not in own}
-    del old["parameters"]["covariance_shrinkage"]
-    MODEL.write(tmp_path / "old", old, tensors)
-    back = TaskParameterizedGMM.load(tmp_path / "old")
-    assert back.covariance_shrinkage == 0
-    assert all(map(torch.equal, back.covariances_, model.covariances_))
-
-
 def test_few_demonstrations_say_more_of_others_when_shrunk():
     shown = handlings(9)
     plain = hands_model(covariance_shrinkage=0).fit(shown[:3]).score(shown[3:])
@@ -250,14 +239,6 @@ def test_the_same_random_state_gives_the_same_model():
     ]
     same(fits[0], fits[1])
     assert not torch.equal(fits[0].means_[0], fits[2].means_[0])
-
-
-def test_a_warm_start_goes_on_from_the_last_model():
-    model = canonical(tol=1e-6, warm_start=True).fit(waves())
-    cold, bound = model.n_iter_, model.lower_bound_
-    model.fit(waves())
-    assert model.n_iter_ < cold and model.n_iter_ <= 3
-    assert model.lower_bound_ >= bound - 1e-9
 
 
 def test_order_of_joints_does_not_matter():
@@ -333,7 +314,7 @@ TIME = torch.linspace(0, 2, 30, dtype=torch.float64)
 
 
 def joints_only(**options) -> TaskParameterizedGMM:
-    return TaskParameterizedGMM(**{"n_components": 4, "blend": 0.0, **options})
+    return TaskParameterizedGMM(**{"n_components": 4, **options})
 
 
 def refused(call, error, *parts: str) -> None:
@@ -661,7 +642,6 @@ def test_a_model_of_known_parameters_takes_arrays():
         model.time_.numpy(),
         operators=model.operators_,
         robot=HANDS,
-        blend=0.0,
     )
     assert torch.equal(known.predict(shown)[0].joints, model.predict(shown)[0].joints)
     assert known.summary_ is None  # nor how many demonstrations there were
@@ -801,15 +781,6 @@ def test_copies_answer_the_same(copied, model):
     assert other.operators == model.operators and other.robot == model.robot
 
 
-def test_settings_of_reproduction_take_effect_without_a_new_fit():
-    model = copy.deepcopy(hands())
-    [before] = model.predict(handlings()[:1])
-    [product] = model.set_params(activation="product").predict(handlings()[:1])
-    assert not torch.equal(before.joints, product.joints)
-    [again] = model.set_params(activation="time").predict(handlings()[:1])
-    assert torch.equal(before.joints, again.joints)
-
-
 def test_a_new_fit_replaces_the_old_model():
     model = copy.deepcopy(hands())
     model.predict(handlings()[:1])
@@ -859,7 +830,7 @@ def test_folds_are_lists_of_demonstrations():
 
 def test_a_pipeline_aligns_and_learns():
     uneven = [*waves(2, length=30), *waves(2, length=45)]
-    model = make_pipeline(LinearTimeNormalization(), TaskParameterizedGMM(4, blend=0.0))
+    model = make_pipeline(LinearTimeNormalization(), TaskParameterizedGMM(4))
     model.fit(uneven)
     assert model[-1].mixture_.group_size == 4
     [own], [given] = (
@@ -868,18 +839,6 @@ def test_a_pipeline_aligns_and_learns():
     )
     assert torch.equal(own.time, model[-1].time_)
     assert torch.equal(given.time, uneven[0].time)
-
-
-def test_what_fit_takes_besides_data_is_routed_through_pipelines(tmp_path):
-    # https://scikit-learn.org/stable/metadata_routing.html
-    with config_context(enable_metadata_routing=True):
-        learner = TaskParameterizedGMM(4, blend=0.0).set_fit_request(checkpoint=True)
-        model = make_pipeline(LinearTimeNormalization(), learner)
-        model.fit(waves(3), checkpoint=Checkpoint(tmp_path / "em"))
-        assert (tmp_path / "em").is_dir()
-        with pytest.raises(ValueError, match="processes"):
-            model.fit(waves(3), processes=ALONE)  # it was not asked for
-    assert model[-1].joint_names_ == JOINT_NAMES
 
 
 def test_it_says_that_samples_are_no_rows():
@@ -892,7 +851,10 @@ def test_it_says_that_samples_are_no_rows():
 @pytest.mark.parametrize("fusion", ["information", "covariance"])
 def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
     epsilon = 1e-4 if fusion == "covariance" else None
-    model = bottle_model(8, tol=1e-2, fusion=fusion, activation=activation, negligible=0.0)
+    used = InformationFusion(negligible=0.0)
+    if fusion == "covariance":
+        used = CovarianceFusion(1e-4, activation)
+    model = bottle_model(8, tol=1e-2, fusion=used)
     model.fit(few_bottles())
     demonstration = few_bottles()[1]
     state = model.kinematics_.state(demonstration.joints[12])
@@ -914,7 +876,7 @@ def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
         mixtures,
         model.weights_.numpy(),
         activation=activation,
-        epsilon=epsilon,
+        fusion=CovarianceFusion(epsilon),
     )
     estimate = model.step(
         demonstration.time[12], state, {"bottle": demonstration.frames["bottle"]}
@@ -925,23 +887,21 @@ def test_a_fitted_model_answers_as_table_i_says(fusion, activation):
 
 def test_joints_of_few_demonstrations_give_way(tmp_path):
     model = small_bottle()
-    assert model.regression().n_samples == 4
+    assert model.skill.n_samples == 4
     [bottle] = model.predict(few_bottles()[:1])
-    model.save(tmp_path / "model.safetensors")
-    [again] = TaskParameterizedGMM.load(tmp_path / "model.safetensors").predict(
-        few_bottles()[:1]
-    )
+    save(model, tmp_path / "model.safetensors")
+    [again] = load_model(tmp_path / "model.safetensors").predict(few_bottles()[:1])
     assert torch.equal(again.joints, bottle.joints)
     # who says how covariances are shrunk is taken at the word
     for number in (0, 0.1):
         said = bottle_model(4, tol=1e-1, covariance_shrinkage=number).fit(few_bottles())
-        assert said.regression().n_samples is None
+        assert said.skill.n_samples is None
         said.set_params(covariance_shrinkage="auto")
-        assert said.regression().n_samples == 4  # what was prepared is not kept
+        assert said.skill.n_samples == 4  # what was prepared is not kept
 
 
 def test_predict_is_step_after_step():
-    model = small_bottle().__sklearn_clone__().set_params(blend=0.0, keep_limits=False)
+    model = small_bottle().__sklearn_clone__().set_params(keep_limits=False)
     model.fit(few_bottles())
     demonstration = few_bottles()[2]
     [trajectory] = model.predict([demonstration])
@@ -1065,7 +1025,7 @@ def test_a_score_is_the_mean_over_all_time_steps():
 
 def test_time_counts_once_however_many_operators_there_are():
     model, [shown] = hands_model(covariance_shrinkage=0).fit(handlings()), handlings(1)
-    rows = local_data([shown], model.operators_, HANDS, model.regression().expected)[0].numpy()
+    rows = local_data([shown], model.operators_, HANDS, model.skill.expected)[0].numpy()
     sides, component = np.split(rows, 2, axis=1), []
     for k in range(len(model.weights_)):
         logs = [np.log(float(model.weights_[k]))]
@@ -1161,10 +1121,8 @@ def test_bounds_of_a_motion_follow_what_was_demonstrated():
     model = bottle()
     acceleration, jerk = demonstrated_peaks(bottle_demonstrations(), upper_body().joint_names)
     assert torch.equal(model.acceleration_, acceleration) and torch.equal(model.jerk_, jerk)
-    bounds = model.motion_bounds(velocity=2.0)
+    bounds = MotionBounds.of(model.skill, velocity=2.0)
     assert torch.equal(bounds.acceleration, torch.clamp(3 * acceleration, min=8.0))
-    with pytest.raises(NotFittedError):
-        TaskParameterizedGMM().motion_bounds()
 
 
 def test_batches_tell_the_same_peaks():
@@ -1201,22 +1159,22 @@ def test_objects_never_held_change_nothing_bit_for_bit():
 
 def test_holds_are_kept_and_models_of_before_have_none(tmp_path):
     model = carrying_model()
-    model.save(tmp_path / "model")
-    loaded = TaskParameterizedGMM.load(tmp_path / "model")
+    save(model, tmp_path / "model")
+    loaded = load_model(tmp_path / "model")
     assert loaded.holds_ == model.holds_ and loaded.holds == "auto"
     assert loaded.holds_[0].share == 1.0
     situation = carrying_scenes(1, seed=4)[0].situation
     expected, actual = model.predict([situation])[0], loaded.predict([situation])[0]
     assert torch.equal(actual.joints, expected.joints)
     given = copy.copy(model).set_params(holds=[HELD])
-    given.save(tmp_path / "given")
-    assert TaskParameterizedGMM.load(tmp_path / "given").holds == [HELD]
+    save(given, tmp_path / "given")
+    assert load_model(tmp_path / "given").holds == [HELD]
     config, tensors = MODEL.read(tmp_path / "model")
     settings = {name: value for name, value in config["parameters"].items() if name != "holds"}
     own = ("format", "version", "tensors", "tensors_sha256", "digest", "holds")
     old = {name: value for name, value in config.items() if name not in own}
     MODEL.write(tmp_path / "old", old | {"parameters": settings}, tensors)
-    before = TaskParameterizedGMM.load(tmp_path / "old")
+    before = load_model(tmp_path / "old")
     assert before.holds_ == () and before.holds == "auto"
 
 
@@ -1242,7 +1200,7 @@ def test_holds_that_cannot_be_are_refused(holds, error, parts):
 
 
 def test_things_need_the_information_form():
-    model = clone(carrying_model()).set_params(fusion="covariance")
+    model = clone(carrying_model()).set_params(fusion=CovarianceFusion())
     refused(lambda: model.fit(carries()), DataError, "['bottle']", "fusion='information'")
     refused(
         lambda: (
@@ -1280,9 +1238,9 @@ def test_where_a_link_starts_follows_from_the_start_posture(starting, tmp_path):
     given = Situation(shown.joints[0], shown.frames)
     bottle = {"bottle": shown.frames["bottle"]}
     silent = Situation(shown.joints[0], bottle)
-    model.save(tmp_path / "model")
+    save(model, tmp_path / "model")
     expected, found = model.predict([given, silent], candidates=False)
-    [loaded] = TaskParameterizedGMM.load(tmp_path / "model").predict([silent], candidates=False)
+    [loaded] = load_model(tmp_path / "model").predict([silent], candidates=False)
     for other in (found, loaded):
         torch.testing.assert_close(other.joints, expected.joints, rtol=0, atol=1e-9)
     # a pose that is given counts
@@ -1295,10 +1253,13 @@ def test_a_controller_of_many_robots_knows_where_each_starts(starting):
     model, shown = starting
     starts = shown.joints[0] + torch.tensor([[0.0], [0.05], [-0.05]])
     bottle = {"bottle": shown.frames["bottle"]}
-    together = model.controller(starts, bottle, clock="even")
+    together = Controller(model.skill, starts, bottle, clock="even")
     alone = [
-        model.controller(
-            q, started(replace(shown, joints=q.repeat(len(shown), 1))).frames, clock="even"
+        Controller(
+            model.skill,
+            q,
+            started(replace(shown, joints=q.repeat(len(shown), 1))).frames,
+            clock="even",
         )
         for q in starts
     ]
@@ -1314,7 +1275,7 @@ def test_a_frame_that_the_start_does_not_tell_has_to_be_given(starting):
     for frames in ({}, {"start": shown.frames["start"]}):
         for use in (
             lambda f: model.predict([Situation(shown.joints[0], f)]),
-            lambda f: model.controller(shown.joints[0], f),
+            lambda f: Controller(model.skill, shown.joints[0], f),
         ):
             with pytest.raises(
                 UnknownNameError, match=r"'bottle' is not in the situation.*event"

@@ -17,8 +17,8 @@ from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.structure.operator_selection import OperatorSelection
 from tpgmm_torch.structure.segmentation import Segmentation
+from tpgmm_torch.structure.select_operators import SelectOperators
 from tpgmm_torch.training.local_data import local_data
 
 if TYPE_CHECKING:
@@ -294,7 +294,7 @@ def plot_local(
         shown.append((motion, {**look, **style}))
 
     def expected(_operator: int, time: Tensor) -> Tensor:
-        return model.regression().expected(operator, time)
+        return model.skill.expected(operator, time)
 
     motions = [motion for motion, _ in shown]
     rows = local_data(motions, [chosen], model.kinematics_, expected, model.holds_)
@@ -333,14 +333,14 @@ def plot_candidates(
     axes.set_ylabel(f"{joint} [rad]")
 
 
-def plot_relevance(axes: Axes, selection: OperatorSelection) -> None:
+def plot_relevance(axes: Axes, selection: SelectOperators) -> None:
     """When which candidate matters: gains over time, those kept above, in bold.
 
     Parameters
     ----------
     axes : matplotlib Axes
         Where to draw.
-    selection : OperatorSelection
+    selection : SelectOperators
         Fitted.
     """
     order = np.lexsort((-selection.relevance_.mean(0), ~selection.support_))

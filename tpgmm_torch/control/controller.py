@@ -22,6 +22,7 @@ from tpgmm_torch.control.displacement import Displacement
 from tpgmm_torch.control.hold_watch import HoldWatch
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.control.localizing_clock import LocalizingClock
+from tpgmm_torch.control.situations import completed_frames, report_start
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
 from tpgmm_torch.impedance.stiffness import Impedance
@@ -161,7 +162,10 @@ class Controller:
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
         kinematics = skill.kinematics
         self.reference = kinematics.joint_tensor(joints)
-        self._frames = self._first_frames = self._converted(kinematics, frames or {})
+        frames = completed_frames(skill, joints, frames or {})
+        if trust is not None:
+            report_start(skill, joints, frames)
+        self._frames = self._first_frames = self._converted(kinematics, frames)
         self._skill = skill = skill.start(self.reference, self._frames)
         self._end = skill.end if end is None else end
         self.command: Command | None = None

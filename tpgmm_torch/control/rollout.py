@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +11,8 @@ import torch
 from tpgmm_torch.control.clocks import EvenClock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.data.demonstrations import Situation
+from tpgmm_torch.control.situations import completed_situations, with_novelty
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
 from tpgmm_torch.motion.motion_bounds import MotionBounds
@@ -24,7 +25,7 @@ __all__ = ["rollout"]
 
 def rollout(
     skill: Skill,
-    situations: Sequence[Situation],
+    situations: Situation | Demonstration | Iterable[Situation | Demonstration],
     *,
     bounds: MotionBounds | str | None = None,
     blend: float = 0.0,
@@ -35,8 +36,9 @@ def rollout(
     Parameters
     ----------
     skill : Skill
-    situations : sequence of Situation
-        With time grids.
+        A fitted model's ``skill``, or one that holds others.
+    situations : sequence of Situation or Demonstration
+        Without a time of its own a situation has the skill's.
     bounds : MotionBounds, "robot" or None, default=None
         Of position, speed, acceleration and jerk; "robot" takes those of the robot and of the
         demonstrations, None takes the estimates for references.
@@ -50,13 +52,20 @@ def rollout(
     -------
     list of Trajectory
         In the order of the situations.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError, PlausibilityError
+        If a situation does not fit the skill, or cannot be what it is taken for.
     """
+    known = completed_situations(skill, situations)
     trajectories: dict[int, Trajectory] = {}
-    for members in _groups(situations):
-        batch = [situations[index] for index in members]
+    for members in _groups(known):
+        batch = [known[index] for index in members]
         together = _run_together(skill, batch, bounds, blend, candidates)
         trajectories.update(zip(members, together, strict=True))
-    return [trajectories[index] for index in range(len(situations))]
+    done = [trajectories[index] for index in range(len(known))]
+    return with_novelty(skill, known, done)
 
 
 def _groups(situations: Sequence[Situation]) -> list[list[int]]:
@@ -78,7 +87,7 @@ def _run_together(
 ) -> list[Trajectory]:
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
-    assert time is not None  # the estimator fills it in
+    assert time is not None  # they are complete
     frames = {
         name: Frame.stack([situation.frames[name] for situation in situations])
         for name in situations[0].frames
@@ -130,7 +139,7 @@ def _run_together(
     )
     joints = torch.stack(references).view(len(grid), *start.shape)
     own: list[Candidate] = []
-    if candidates:
+    if candidates and hasattr(skill, "candidates"):
         states = torch.cat((start[None], joints[:-1]))
         own = _candidates(skill, held, states, frames, holdings, whole)
     return [

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 if TYPE_CHECKING:
@@ -96,6 +97,9 @@ class Demonstration(_PlainFrames):
     events : mapping of str to float, optional
         Instants that matter, by name [s], for example ``{"grasp": 4.2}``. ``"start"`` and
         ``"end"`` need not be given: they are the first and the last instant.
+    holds : sequence of Hold, optional
+        From when to when the robot holds which object, see
+        :func:`~tpgmm_torch.attach_holds`; empty if it holds none, None if nobody knows.
 
     Raises
     ------
@@ -121,6 +125,7 @@ class Demonstration(_PlainFrames):
     frames: Mapping[str, Frame] = field(default_factory=dict)
     joint_names: tuple[str, ...] | None = None
     events: Mapping[str, float] = field(default_factory=dict)
+    holds: tuple[Hold, ...] | None = None
 
     def __post_init__(self) -> None:
         time = _checked_time(self.time)
@@ -144,7 +149,9 @@ class Demonstration(_PlainFrames):
                 )
         frames = _checked_frames(self.frames, len(time))
         kept = MappingProxyType(events)
+        holds = None if self.holds is None else check_holds(self.holds, frames)
         _set(self, time=time, joints=joints, frames=frames, joint_names=names, events=kept)
+        _set(self, holds=holds)
 
     def __len__(self) -> int:
         """Number of time steps T."""

@@ -124,7 +124,7 @@ class Hold:
 
 
 def check_holds(
-    holds: Iterable[Any], frames: Collection[str], links: Collection[str]
+    holds: Iterable[Any], frames: Collection[str], links: Collection[str] | None = None
 ) -> tuple[Hold, ...]:
     """Holds in the order of their beginnings, checked to be possible.
 
@@ -154,7 +154,7 @@ def check_holds(
             raise UnknownNameError(
                 "frame", hold.frame, f"the demonstration (hold {hold})", frames
             )
-        if hold.link not in links:
+        if links is not None and hold.link not in links:
             raise UnknownNameError("link", hold.link, f"the robot (hold {hold})", links)
     checked = tuple(sorted(checked, key=lambda hold: (hold.begin, hold.end)))
     of_frame: dict[str, list[Hold]] = {hold.frame: [] for hold in checked}

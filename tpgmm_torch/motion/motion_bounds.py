@@ -115,7 +115,7 @@ class MotionBounds:
     @classmethod
     def of(
         cls,
-        kinematics: Kinematics,
+        kinematics: Any,
         demonstrated: tuple[Tensor, Tensor] | None = None,
         **given: Any,
     ) -> Self:
@@ -129,7 +129,7 @@ class MotionBounds:
 
         Parameters
         ----------
-        kinematics : Kinematics
+        kinematics : Kinematics or Skill
         demonstrated : tuple of two Tensor of shape (n_joints,), optional
             Peaks of acceleration and jerk, of
             :func:`~tpgmm_torch.motion.demonstrated_peaks.demonstrated_peaks`.
@@ -148,6 +148,9 @@ class MotionBounds:
             If the description of the robot lacks limits of position or speed that are not
             given either.
         """
+        if not isinstance(kinematics, Kinematics):  # a skill
+            demonstrated = demonstrated or kinematics.peaks
+            kinematics = kinematics.kinematics
         names = [field.name for field in fields(cls)]
         for name in given:
             if name not in names:

@@ -184,11 +184,35 @@ class Operator(ABC):
         frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
         if holds:
             state, frames = held_objects(state, time, frames, holds)
+        return self.along(time, state, frames, kinematics)
+
+    def along(
+        self,
+        time: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        kinematics: Kinematics,
+    ) -> Tensor:
+        """Local coordinates (T, D) of the states of a motion, its quaternions continuous.
+
+        Parameters
+        ----------
+        time : Tensor of shape (T,)
+        state : RobotState
+            Of batch shape (T,).
+        frames : mapping of str to Frame
+        kinematics : Kinematics
+
+        Raises
+        ------
+        ShapeError
+            If ``coordinates`` gave another shape.
+        """
         local = self.at(time).coordinates(state, frames)
-        if tuple(local.shape) != (len(demonstration), self.dimension(kinematics)):
+        if tuple(local.shape) != (len(time), self.dimension(kinematics)):
             raise ShapeError(
                 f"{self!r} has {self.dimension(kinematics)} coordinates, but its coordinates() "
-                f"gave shape {tuple(local.shape)} for {len(demonstration)} time steps"
+                f"gave shape {tuple(local.shape)} for {len(time)} time steps"
             )
         starts = self.quaternion_starts(kinematics)
         return quaternions.continuous(local, starts=starts) if starts else local

@@ -147,6 +147,13 @@ class Conditionals(_OfComponents):
         mean, covariance = gaussians.product(means, covariances)
         return cls(mean.to(like), gain.to(like), covariance.to(like), *time)
 
+    @property
+    def second_moment(self) -> Tensor:
+        """``E[x_d^2]`` of each coordinate, (K, D), time not given."""
+        variance = self.covariance.diagonal(dim1=-2, dim2=-1)
+        moved = self.gain.square() * self.time_variance.unsqueeze(-1)
+        return self.mean.square() + variance + moved
+
     def marginal(self, coordinates: Tensor) -> Conditionals:
         """Of some of the coordinates, by their indices."""
         covariance = self.covariance[:, coordinates][:, :, coordinates]

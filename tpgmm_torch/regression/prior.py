@@ -1,4 +1,4 @@
-"""How wide the prior is that closes the fusion where no operator determines every joint."""
+"""Standard deviations of the prior that closes the fusion where operators leave joints free."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from torch import Tensor
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["PRIOR_STD", "given_widths", "prior_widths"]
 
-#: The default, [rad] or times the learned positions' size.
+#: The default [rad], or in units of the learned positions' size: wider than any joint moves, so
+#: that it decides nothing that operators decide.
 PRIOR_STD = 10.0
 
 
@@ -24,9 +26,8 @@ def prior_widths(
     prior_std: Any,
     kinematics: Kinematics,
     operators: Sequence[Operator],
+    conditionals: Sequence[Conditionals],
     weights: Tensor,
-    means: Sequence[Tensor],
-    covariances: Sequence[Tensor],
 ) -> Tensor:
     """Standard deviations of the prior around q_{t-1}, in the unit of each joint.
 
@@ -39,8 +40,10 @@ def prior_widths(
         array has them all.
     kinematics : Kinematics
     operators : sequence of Operator
-    weights, means, covariances
-        The mixture's parameters, as in :class:`TaskParameterizedGMM`.
+    conditionals : sequence of Conditionals
+        Of each operator.
+    weights : Tensor of shape (K,)
+        Mixing coefficients.
 
     Returns
     -------
@@ -49,26 +52,23 @@ def prior_widths(
     Raises
     ------
     DataError, ShapeError, UnknownNameError
-        If a value is no positive number, there are more or fewer than joints, or a name is none
-        of theirs.
+        If a value is not positive, there are more or fewer than joints, or a name is unknown.
     """
-    names, like = kinematics.joint_names, weights.detach()
+    names = kinematics.joint_names
     given = given_widths(prior_std, names)
     number = prior_std if isinstance(prior_std, Real) else PRIOR_STD
-    widths = like.new_full((len(names),), float(number))
+    widths = weights.detach().new_full((len(names),), float(number))
     lengths = list(kinematics.lengths)
     if lengths:  # not detached: while a policy learns, it depends on what is learned
-        widths[lengths] = widths[lengths] * _size(
-            kinematics, operators, weights, means, covariances
-        )
+        widths[lengths] = widths[lengths] * _size(kinematics, operators, conditionals, weights)
     for name, value in given.items():
-        widths[names.index(name)] = value.to(like)
+        widths[names.index(name)] = value.to(widths)
     _check_positive(widths.tolist())  # what was learned may be NaN
     return widths
 
 
 def given_widths(prior_std: Any, names: Sequence[str]) -> dict[str, Tensor]:
-    """What is given joint by joint, checked: nothing of a number, which is for all of them.
+    """Widths that are given joint by joint, checked; none where one number is for all.
 
     Parameters
     ----------
@@ -115,18 +115,16 @@ def _check_positive(widths: Sequence[float]) -> None:
 def _size(
     kinematics: Kinematics,
     operators: Sequence[Operator],
+    conditionals: Sequence[Conditionals],
     weights: Tensor,
-    means: Sequence[Tensor],
-    covariances: Sequence[Tensor],
 ) -> Tensor:
     """Root mean square of the learned positions, in their unit; 1 where there are none."""
     squares = []
-    for operator, mean, covariance in zip(operators, means, covariances, strict=True):
+    for operator, one in zip(operators, conditionals, strict=True):
         turns = {s + i for s in operator.quaternion_starts(kinematics) for i in range(4)}
         turns |= {s + i for s in operator.rotation_vector_starts(kinematics) for i in range(3)}
         if operator.links():
-            columns = [1 + i for i in range(mean.shape[-1] - 1) if i not in turns]
-            second = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
-            squares.append(weights @ second[:, columns])
+            columns = [i for i in range(one.mean.shape[-1]) if i not in turns]
+            squares.append(weights @ one.second_moment[:, columns])
     together = torch.cat(squares) if squares else weights[:0]
     return together.mean().sqrt() if bool(together.any()) else weights.new_ones(())

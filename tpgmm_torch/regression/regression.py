@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,9 +35,10 @@ from tpgmm_torch.regression.conditionals import (
 )
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.joint_limits import within
 from tpgmm_torch.regression.posture import PostureSearch
-from tpgmm_torch.regression.prior import PRIOR_STD
+from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -95,22 +97,8 @@ class Regression:
         The components' Gaussians given time, one for each operator.
     log_weights : Tensor of shape (K,)
         Logarithms of the mixing coefficients pi_i.
-    fusion : {"information", "covariance"}
-        The form of the product (2).
-    activation : {"time", "product"}
-        Whose time marginal the mixing weights h_i come from: the mixture's or the product's.
-    epsilon : float
-        Added to the diagonal of projected covariances by the covariance form [rad^2].
-    prior_std : float or Tensor of shape (n_joints,)
-        Standard deviations of the prior N(q_{t-1}, .) that closes the information form where
-        no operator determines every joint, in the joints' units.
-    negligible : float
-        Components with less than that share of the largest weight are left out: the mean moves
-        by at most the weight left out times the distance of the components' means. 0 keeps
-        all.
-    priorities : sequence of int, optional
-        One per operator: those of a higher number are fulfilled as if the others were not
-        there, and these in what is left of the joints, see :attr:`fused`.
+    fusion : InformationFusion or CovarianceFusion
+        The form of the product (2), and its settings.
     n_samples : float, optional
         Of each component, if joints shall give way by what few of them leave unknown, see
         :attr:`fused`.
@@ -124,18 +112,15 @@ class Regression:
         Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
     summary : TrainingSummary, optional
         Distance of a situation from the demonstrations.
+    time : Tensor of shape (T,), optional
+        Time grid of a typical demonstration [s].
     """
 
     kinematics: Kinematics
     operators: Sequence[Operator]
     conditionals: Sequence[Conditionals]
     log_weights: Tensor
-    fusion: str = "information"
-    activation: str = "time"
-    epsilon: float = 1e-4
-    prior_std: float | Tensor = PRIOR_STD
-    negligible: float = 1e-9
-    priorities: Sequence[int] | None = None
+    fusion: Fusion = field(default_factory=InformationFusion)
     n_samples: float | None = None
     begin: float = -math.inf
     end: float = math.inf
@@ -143,23 +128,7 @@ class Regression:
     motion_bounds: MotionBounds | None = None
     peaks: tuple[Tensor, Tensor] | None = None
     summary: TrainingSummary | None = None
-
-    def step(
-        self,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        candidates: bool = False,
-        bounds: tuple[Tensor, Tensor] | None = None,
-    ) -> Estimate:
-        """References at ``time`` (scalar or of the batch's shape) from the state q_{t-1}.
-
-        ``bounds`` are the lowest and the highest joints allowed, (..., n_joints) each.
-        """
-        estimate = self.bounded(self._unbounded(time, state, frames), bounds)
-        if not candidates:
-            return estimate
-        return replace(estimate, candidates=self.candidates(time, state, frames, estimate))
+    time: Any = None
 
     def estimate(
         self,
@@ -167,12 +136,19 @@ class Regression:
         state: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
+        *,
+        candidates: bool = False,
     ) -> Estimate:
-        """:meth:`step` from joint vectors: kinematics included, without candidates.
+        """See :meth:`Skill.estimate`; with each operator's own estimate, if ``candidates``.
 
         Many robots run part by part, of those that are at about the same time: few components
-        count for them. Robots that carry something are given by their states.
+        count for them.
         """
+        if candidates:
+            whole = self.kinematics.state(state) if isinstance(state, Tensor) else state
+            estimate = self.estimate(time, whole, frames, bounds)
+            own = self.candidates(time, whole, frames, estimate)
+            return replace(estimate, candidates=own)
         given = state if isinstance(state, RobotState) else None
         joints = state.joints if isinstance(state, RobotState) else state
         poses = {name: frames[name] for name in self.frame_names if name in frames}
@@ -224,7 +200,7 @@ class Regression:
         else:
             precision, vector, square = self._sum(components, time, state, frames)
             steps, covariances = gaussians.from_information(precision, vector[..., 0])
-            if self.activation == "time":
+            if self.fusion.activation == "time":
                 log_h = self._log_activation(components, time)
             else:
                 log_h = self._product_activation(components, time, precision, vector, square)
@@ -297,6 +273,32 @@ class Regression:
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
 
+    def surprise(self, time: Tensor, joints: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+        """How much less likely local coordinates are than those that are expected [nats].
+
+        Parameters
+        ----------
+        time : Tensor of shape (...)
+        joints : Tensor of shape (..., n_joints)
+        frames : mapping of str to Frame
+
+        Returns
+        -------
+        Tensor of shape (...)
+        """
+        state, batch = self.kinematics.state(joints), joints.shape[:-1]
+        times = time.expand(batch).flatten()
+        local, expected = [], []
+        for j, operator in enumerate(self.operators):
+            rows = operator.at(time).coordinates(state, frames)
+            rows = rows.expand(*batch, -1).reshape(len(times), -1)
+            wanted = self.expected(j, times)
+            starts = operator.quaternion_starts(self.kinematics)
+            local.append(quaternions.hemisphere_signs(rows, wanted, starts) * rows)
+            expected.append(wanted)
+        most = self.log_density(times, expected, self.n_samples)
+        return (most - self.log_density(times, local, self.n_samples)).reshape(batch)
+
     def candidates(
         self,
         time: Tensor,
@@ -341,9 +343,9 @@ class Regression:
         it: where a new one is turned otherwise, joints would hold the hands back.
         """
         scales = [1.0] * len(self.operators)
-        if self.priorities is not None:
-            levels = sorted(set(self.priorities))
-            scales = [STRICT ** levels.index(priority) for priority in self.priorities]
+        if self.fusion.priorities is not None:
+            levels = sorted(set(self.fusion.priorities))
+            scales = [STRICT ** levels.index(one) for one in self.fusion.priorities]
         wider = math.sqrt(predictive_scale(self.n_samples))
         if all(isinstance(leaf, Canonical) for leaf in leaves(self.operators)):
             wider = 1.0  # there is nobody to give way to
@@ -367,12 +369,23 @@ class Regression:
     @cached_property
     def _update(self) -> KalmanUpdate | None:
         """The update of a prior over the joints, where that is what is asked for."""
-        usual = self.fusion == "information" and self.activation == "time"
-        if not usual or not KalmanUpdate.serves(self.operators, self.kinematics):
+        information = isinstance(self.fusion, InformationFusion)
+        if not information or not KalmanUpdate.serves(self.operators, self.kinematics):
             return None
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
             return KalmanUpdate(self.kinematics, self.operators, self.fused)
+
+    @cached_property
+    def prior_std(self) -> Tensor:
+        """Standard deviations (n_joints,) of the prior where joints are left free."""
+        return prior_widths(
+            self.fusion.prior_std,
+            self.kinematics,
+            self.operators,
+            self.conditionals,
+            self.log_weights.exp(),
+        )
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -416,10 +429,10 @@ class Regression:
             return self
         if not operators:
             return None
-        priorities = self.priorities and [self.priorities[index] for index in kept]
-        return replace(
-            self, operators=operators, conditionals=conditionals, priorities=priorities
-        )
+        fusion = self.fusion
+        if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
+            fusion = replace(fusion, priorities=[fusion.priorities[index] for index in kept])
+        return replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
 
     @cached_property
     def _marginals(self) -> TimeMarginals:
@@ -441,9 +454,10 @@ class Regression:
     def _active(self) -> ActiveComponents | None:
         """Which components count when, where not all do at any time."""
         learning = self.log_weights.requires_grad or self.conditionals[0].mean.requires_grad
-        if self.activation != "time" or self.negligible == 0 or learning:
+        fusion = self.fusion
+        if fusion.activation != "time" or fusion.negligible == 0 or learning:
             return None  # while learning, it would cost more than it saves
-        return ActiveComponents(self._marginals, self.negligible)
+        return ActiveComponents(self._marginals, fusion.negligible)
 
     @cached_property
     def _selected(self) -> dict[tuple[int, ...], Components]:
@@ -544,17 +558,17 @@ class Regression:
         local = self._local(components.conditionals, time, state, frames)
         for at, mean, gain, covariance in local:
             columns = mean.unsqueeze(-1)
-            if self.activation != "time":
+            if self.fusion.activation != "time":
                 columns = torch.stack(torch.broadcast_tensors(mean, gain), dim=-1)
             one = Projection.of(at, columns, covariance)
-            if self.fusion == "covariance":
-                one = one.in_joint_space(self.epsilon)
+            if isinstance(self.fusion, CovarianceFusion):
+                one = one.in_joint_space(self.fusion.epsilon)
             terms.append(gaussians.information(one.jacobian, one.targets, one.covariance))
         precision, vector, square = (
             sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True)
         )
-        closed = self.fusion == "covariance" or any(o.determines_joints for o in self.operators)
-        if not closed:
+        determined = any(one.determines_joints for one in self.operators)
+        if isinstance(self.fusion, InformationFusion) and not determined:
             like = state.joints
             identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
             precision = precision + identity / self.prior_std**2

@@ -149,6 +149,8 @@ class CompiledRegression(Regression):
         state: Tensor | RobotState,
         frames: Mapping[str, Frame],
         bounds: tuple[Tensor, Tensor] | None = None,
+        *,
+        candidates: bool = False,
     ) -> Estimate:
         """Gaussian of the joints; see :meth:`Regression.estimate`."""
         if isinstance(state, RobotState) or not self._serves(time, state, frames):

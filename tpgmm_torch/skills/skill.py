@@ -96,6 +96,11 @@ class Skill(Protocol):
         return None
 
     @property
+    def time(self) -> Tensor:
+        """Time grid of references (T,) [s]."""
+        ...
+
+    @property
     def peaks(self) -> tuple[Tensor, Tensor] | None:
         """Largest accelerations and jerks (n_joints,) of the demonstrations, or None."""
         return None

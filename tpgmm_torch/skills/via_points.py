@@ -10,12 +10,12 @@ from torch import Tensor
 
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, UnknownNameError
-from tpgmm_torch.regression.conditioning import Conditioning
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
-from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.skills.conditioning import Conditioning
 from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.via_point import ViaPoint
 
 __all__ = ["ViaPoints"]
 

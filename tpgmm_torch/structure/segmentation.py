@@ -22,7 +22,7 @@ from tpgmm_torch.events import find_boundaries
 from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.structure.operator_selection import FEWEST, OperatorSelection
+from tpgmm_torch.structure.select_operators import FEWEST, SelectOperators
 
 __all__ = ["Segmentation"]
 
@@ -58,7 +58,7 @@ class Cut:
 
 
 class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
-    """Find the parts of a skill, as ``parts="auto"`` does.
+    """Find the parts of a skill.
 
     In each demonstration a part may end where a gripper closes or opens, where an object is
     taken or let go, and where the robot comes to rest
@@ -76,7 +76,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         The share of the demonstrations that must have a boundary.
     shortest : float, default=0.04
         Parts last at least this share of the duration.
-    selection : "auto", OperatorSelection or None, default="auto"
+    selection : "auto", SelectOperators or None, default="auto"
         What tells when operators matter, of at least three demonstrations; "auto" is one with
         default settings, None looks at what happens alone.
 
@@ -114,7 +114,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         "robot": [Kinematics, None],
         "agreement": [Interval(Real, 0, 1, closed="right")],
         "shortest": [Interval(Real, 0, 1, closed="left")],
-        "selection": [Options("auto"), OperatorSelection, None],
+        "selection": [Options("auto"), SelectOperators, None],
     }
 
     def __init__(
@@ -123,7 +123,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         *,
         agreement: float = 0.6,
         shortest: float = 0.04,
-        selection: OperatorSelection | str | None = "auto",
+        selection: SelectOperators | str | None = "auto",
     ) -> None:
         self.robot = robot
         self.agreement = agreement
@@ -233,6 +233,11 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             )
         return Report.of(findings, f"{len(demonstrations)} demonstrations")
 
+    def times(self) -> list[float]:
+        """Median times at which parts end, but for the last [s]."""
+        self._check_fitted()
+        return np.median(self.boundaries_, axis=0).tolist() if self.n_parts_ > 1 else []
+
     def _candidates(
         self, demonstrations: Sequence[Demonstration]
     ) -> tuple[list[Array], list[list[str]]]:
@@ -292,8 +297,8 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """Where operators matter in passing, between the boundaries that are known."""
         if self.selection is None or self.robot is None or len(demonstrations) < FEWEST:
             return []
-        selection = OperatorSelection()
-        if isinstance(self.selection, OperatorSelection):
+        selection = SelectOperators()
+        if isinstance(self.selection, SelectOperators):
             selection = clone(self.selection)
         if selection.robot is None:
             selection.set_params(robot=self.robot)

@@ -8,10 +8,12 @@ poses that were recorded once, where an object was at first, are never held.
 from __future__ import annotations
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,12 +21,12 @@ from torch import Tensor
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = ["find_holds", "holds_for"]
+__all__ = ["attach_holds", "demonstrated_holds", "find_holds", "with_holds"]
 
 #: What moved by less than so many tolerances may as well have been jolted, or seen badly.
 TRAVEL = 3.0
@@ -139,36 +141,95 @@ def _change_in(tolerance: float, angle: float) -> Change:
     return change
 
 
-def holds_for(
-    holds: str | Sequence[Hold] | None,
+def attach_holds(
+    demonstrations: Sequence[Demonstration], robot: Kinematics | None, **settings: Any
+) -> list[Demonstration]:
+    """Demonstrations with what the robot holds in them, :func:`find_holds`, as their ``holds``.
+
+    Call it on demonstrations that are aligned in time, as the next to last step before ``fit``.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    robot : Kinematics or None
+        Without one nothing is held.
+    **settings
+        Of :func:`find_holds`.
+
+    Returns
+    -------
+    list of Demonstration
+
+    Raises
+    ------
+    UnknownNameError, DataError
+        As of :func:`find_holds`.
+    """
+    holds = () if robot is None else find_holds(demonstrations, robot, **settings)
+    return with_holds(demonstrations, holds)
+
+
+def with_holds(
+    demonstrations: Sequence[Demonstration], holds: Sequence[Hold]
+) -> list[Demonstration]:
+    """Demonstrations in which the robot holds what is given.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+    holds : sequence of Hold
+        Empty if it holds nothing.
+    """
+    return [replace(one, holds=tuple(holds)) for one in demonstrations]
+
+
+def demonstrated_holds(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
 ) -> tuple[Hold, ...]:
-    """What an estimator's parameter ``holds`` comes to, once demonstrations are given.
+    """Holds of the objects that operators refer to, as the demonstrations' own ``holds`` say.
+
+    Where they say nothing and objects move with a link, there is a warning.
 
     Parameters
     ----------
-    holds : "auto", sequence of Hold or None
-        Found, given, or none.
     demonstrations : sequence of Demonstration
-        At least one.
     operators : sequence of Operator
-        Only the frames that they refer to matter.
     kinematics : Kinematics
+
+    Returns
+    -------
+    tuple of Hold
 
     Raises
     ------
     DataError, UnknownNameError
-        If the holds that are given cannot be.
+        If demonstrations differ in their holds, or a link is not the robot's.
     """
-    if holds is None:
-        return ()
     names = frame_names(operators, kinematics)
-    if isinstance(holds, str):
-        return find_holds(demonstrations, kinematics, frames=names)
-    checked = check_holds(holds, demonstrations[0].frames, kinematics.links)
-    return tuple(hold for hold in checked if hold.frame in names)
+    first = demonstrations[0].holds
+    for number, one in enumerate(demonstrations):
+        if one.holds != first:
+            raise DataError(
+                f"demonstration {number} has the holds {one.holds}, demonstration 0 has "
+                f"{first}: give all the same, attach_holds(demonstrations, robot) after "
+                "alignment"
+            )
+    if first is not None:
+        checked = check_holds(first, demonstrations[0].frames, kinematics.links)
+        return tuple(hold for hold in checked if hold.frame in names)
+    found = find_holds(demonstrations, kinematics, frames=names)
+    if found:
+        warnings.warn(
+            f"objects move as if links held them ({', '.join(map(str, found))}, in seconds), "
+            "and the demonstrations do not say so: they are taken for objects that move by "
+            "themselves. Call attach_holds(demonstrations, robot) before fit, or give "
+            "Demonstration(..., holds=()) where nothing is held",
+            PlausibilityWarning,
+            stacklevel=4,
+        )
+    return ()
 
 
 @dataclass(frozen=True, eq=False)

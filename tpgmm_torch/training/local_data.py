@@ -1,33 +1,94 @@
-"""The P local data sets X^(j) of a list of demonstrations (paper, section II-B)."""
+"""Local data sets X^(j): what every operator sees of a demonstration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.held_objects import held_objects
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["at_equal_phase", "constant_columns", "like", "local_data"]
+__all__ = [
+    "Expected",
+    "Motion",
+    "at_phases",
+    "columns_of",
+    "constant_columns",
+    "like",
+    "local_data",
+    "local_rows",
+    "one_constant",
+]
 
 #: The local coordinates (T, D_j) of operator j that are expected at times (T,).
-Sides = Callable[[int, Tensor], Tensor]
+Expected = Callable[[int, Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A demonstration in the robot's joint order, its kinematics computed once.
+
+    Parameters
+    ----------
+    time : Tensor of shape (T,)
+    state : RobotState
+        Of batch shape (T,), with the objects that it holds.
+    frames : mapping of str to Frame
+        Objects, those that are held where they were last free.
+    """
+
+    time: Tensor
+    state: RobotState
+    frames: Mapping[str, Frame]
+
+    @classmethod
+    def of(
+        cls, demonstration: Demonstration, kinematics: Kinematics, holds: Sequence[Hold] = ()
+    ) -> Self:
+        """The motion of a ``demonstration`` in which ``holds`` says what the robot holds.
+
+        Raises
+        ------
+        ShapeError
+            If it has not the robot's joints.
+        """
+        n, names = kinematics.n_joints, demonstration.joint_names
+        if demonstration.n_joints != n and (names is None or demonstration.n_joints < n):
+            raise ShapeError(
+                f"a demonstration has {demonstration.n_joints} joints, the robot has {n}: "
+                f"{kinematics.joint_names}"
+            )
+        ordered = demonstration.reordered(kinematics.joint_names)
+        state = kinematics.state(ordered.joints)
+        frames = {name: frame.to(state.joints) for name, frame in ordered.frames.items()}
+        time = ordered.time.to(kinematics.lower)
+        if holds:
+            state, frames = held_objects(state, time, frames, holds)
+        return cls(time, state, frames)
+
+    def coordinates(self, operator: Operator, kinematics: Kinematics) -> Tensor:
+        """Local coordinates (T, D_j), quaternions continuous in sign."""
+        return operator.along(self.time, self.state, self.frames, kinematics)
 
 
 def local_data(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    expected: Sides | None = None,
+    expected: Expected | None = None,
     holds: Sequence[Hold] = (),
 ) -> list[Tensor]:
-    """Time and local coordinates of every operator, side by side.
+    """Rows of time and local coordinates of each demonstration.
 
     Parameters
     ----------
@@ -35,112 +96,144 @@ def local_data(
     operators : sequence of Operator
     kinematics : Kinematics
     expected : callable, optional
-        ``expected(j, time)`` gives the local coordinates (T, D_j) that a model expects at
-        ``time``; quaternions are brought to its side. By default to that of the first
-        demonstration, compared at equal phase, and coordinates that vary by rounding alone
-        are made constant.
+        Quaternions come to the side of what it says; by default to that of the first
+        demonstration, and columns that vary by rounding alone become constant.
     holds : sequence of Hold, default=()
-        Objects that the robot held: as places they are where they were last free.
+        From when to when the robot holds objects.
 
     Returns
     -------
     list of Tensor of shape (T_m, sum_j (1 + D_j))
-        One per demonstration; each block begins with time.
 
     Raises
     ------
-    ShapeError, UnknownNameError
-        If a demonstration does not have the robot's joints.
+    ShapeError
+        If a demonstration has not the robot's joints.
     """
-    rows: list[Tensor] = []
-    sides = expected
-    for index, demonstration in enumerate(demonstrations):
-        n, names = kinematics.n_joints, demonstration.joint_names
-        if demonstration.n_joints != n and (names is None or demonstration.n_joints < n):
-            raise ShapeError(
-                f"demonstration {index} has {demonstration.n_joints} joints, the robot has "
-                f"{n}: {kinematics.joint_names}"
-            )
-        if sides is None:
-            sides = like(demonstration, operators, kinematics, holds)
-        time = demonstration.time.to(kinematics.lower)
-        blocks: list[Tensor] = []
-        for j, operator in enumerate(operators):
-            local = operator.local(demonstration, kinematics, holds)
-            for start in operator.quaternion_starts(kinematics):
-                local = _same_side(local, sides(j, time), slice(start, start + 4))
-            blocks += [time[:, None], local]
-        rows.append(torch.cat(blocks, dim=1))
-    if expected is None:
-        widths = [1 + operator.dimension(kinematics) for operator in operators]
-        together = torch.cat(rows)
-        turns = [bool(operator.rotation_vector_starts(kinematics)) for operator in operators]
-        mask = constant_columns(together.amin(0), together.amax(0), widths, turns)
-        together = torch.where(mask, together[0], together)
-        rows = list(together.split([len(row) for row in rows]))
-    return rows
+    motions = [Motion.of(one, kinematics, holds) for one in demonstrations]
+    local = [[motion.coordinates(one, kinematics) for one in operators] for motion in motions]
+    sides = expected or like(local[0])
+    rows = [
+        local_rows(motion.time, x, operators, kinematics, sides)
+        for motion, x in zip(motions, local, strict=True)
+    ]
+    return rows if expected is not None else one_constant(rows, operators, kinematics)
 
 
-def like(
-    demonstration: Demonstration,
+def local_rows(
+    time: Tensor,
+    local: Sequence[Tensor],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    holds: Sequence[Hold] = (),
-) -> Sides:
-    """What to expect of others, if they are like this one: its coordinates at equal phase.
+    expected: Expected,
+) -> Tensor:
+    """Rows of time and local coordinates.
 
     Parameters
     ----------
-    demonstration : Demonstration
+    time : Tensor of shape (T,)
+    local : sequence of Tensor of shape (T, D_j)
+        Of each operator.
     operators : sequence of Operator
     kinematics : Kinematics
-    holds : sequence of Hold, default=()
+    expected : callable
+        Quaternions come to the side of what it says.
 
     Returns
     -------
-    callable
-        For ``expected`` of :func:`local_data`.
+    Tensor of shape (T, sum_j (1 + D_j))
     """
-    return at_equal_phase([o.local(demonstration, kinematics, holds) for o in operators])
+    blocks: list[Tensor] = []
+    for j, (operator, coordinates) in enumerate(zip(operators, local, strict=True)):
+        for start in operator.quaternion_starts(kinematics):
+            block, template = slice(start, start + 4), expected(j, time)
+            sign = torch.ones_like(coordinates[0])
+            agreement = (coordinates[:, block] * template[:, block]).sum()
+            sign[block] = quaternions.hemisphere_sign(agreement)
+            coordinates = coordinates * sign
+        blocks += [time[:, None], coordinates]
+    return torch.cat(blocks, dim=1)
 
 
-def at_equal_phase(templates: Sequence[Tensor]) -> Sides:
-    """What to expect of others at equal phase.
+def one_constant(
+    rows: Sequence[Tensor], operators: Sequence[Operator], kinematics: Kinematics
+) -> list[Tensor]:
+    """Rows of demonstrations, with what varies by rounding alone as in the first row.
+
+    Parameters
+    ----------
+    rows : sequence of Tensor of shape (T_m, sum_j (1 + D_j))
+    operators : sequence of Operator
+    kinematics : Kinematics
+    """
+    together = torch.cat(list(rows))
+    columns = columns_of(operators, kinematics)
+    mask = constant_columns(together.amin(0), together.amax(0), *columns)
+    together = torch.where(mask, together[0], together)
+    return list(together.split([len(row) for row in rows]))
+
+
+def columns_of(
+    operators: Sequence[Operator], kinematics: Kinematics
+) -> tuple[list[int], list[bool]]:
+    """1 + D_j of each operator, and whether it has rotation vectors.
+
+    Parameters
+    ----------
+    operators : sequence of Operator
+    kinematics : Kinematics
+    """
+    turns = [bool(one.rotation_vector_starts(kinematics)) for one in operators]
+    return [1 + one.dimension(kinematics) for one in operators], turns
+
+
+def like(templates: Sequence[Tensor]) -> Expected:
+    """Coordinates of one motion, at equal phase, as what is expected.
 
     Parameters
     ----------
     templates : sequence of Tensor of shape (T, D_j)
-        Local coordinates of one demonstration, per operator.
+        Of each operator.
     """
 
     def expected(j: int, time: Tensor) -> Tensor:
-        last = len(templates[j]) - 1
-        return templates[j][torch.linspace(0, last, len(time)).round().long()]
+        return at_phases(templates[j], len(time))
 
     return expected
+
+
+def at_phases(rows: Tensor, count: int) -> Tensor:
+    """Some rows of one motion, at equal distances from first to last.
+
+    Parameters
+    ----------
+    rows : Tensor of shape (T, ...)
+    count : int
+
+    Returns
+    -------
+    Tensor of shape (count, ...)
+    """
+    return rows[((len(rows) - 1) * torch.linspace(0, 1, count)).round().long()]
 
 
 def constant_columns(
     smallest: Tensor, largest: Tensor, widths: Sequence[int], turns: Sequence[bool]
 ) -> Tensor:
-    """Which columns vary by rounding alone: learned, they would be certain beyond reason.
-
-    Rounding is measured by the largest coordinate of the operator, from which it comes: think
-    of a quaternion that turns about one axis. Rotation vectors come from quaternions, which
-    are of size 1.
+    """Columns that vary by rounding alone, to be made constant.
 
     Parameters
     ----------
-    smallest, largest : Tensor of shape (sum widths,)
-        Of each column, in the precision of the data.
+    smallest, largest : Tensor of shape (sum_j (1 + D_j),)
+        Of each column.
     widths : sequence of int
-        ``1 + D_j`` for each operator; each block begins with time.
+        1 + D_j of each operator.
     turns : sequence of bool
-        For each operator, whether there are rotation vectors among its coordinates.
+        Whether it has rotation vectors, whose rounding is that of numbers of the order of 1.
 
     Returns
     -------
-    Tensor of bool, of shape (sum widths,)
+    Tensor of shape (sum_j (1 + D_j),)
     """
     # recorded poses went through more than our own rounding
     rounding = max(100 * torch.finfo(smallest.dtype).eps, 1e-10)
@@ -151,10 +244,3 @@ def constant_columns(
         size = torch.maximum(low.abs(), high.abs())[1:].max().clamp(min=float(turn))
         masks.append(high - low <= rounding * size)
     return torch.cat(masks)
-
-
-def _same_side(local: Tensor, template: Tensor, block: slice) -> Tensor:
-    """Flip a whole quaternion path if it lies on the other hemisphere than the template's."""
-    sign = torch.ones_like(local[0])
-    sign[block] = quaternions.hemisphere_sign((local[:, block] * template[:, block]).sum())
-    return local * sign

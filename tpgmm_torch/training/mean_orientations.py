@@ -1,4 +1,4 @@
-"""The mean orientation of demonstrations over time, about which tangent spaces are laid."""
+"""Mean orientations over time, about which rotation vectors are Gaussian."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from dataclasses import replace
 import torch
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import AbsoluteOrientation, Operator, RelativeOrientation, Stack
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.local_data import Motion
 
 __all__ = ["with_mean_orientations"]
 
@@ -20,27 +19,27 @@ MOST = 1000
 
 
 def with_mean_orientations(
-    operators: Sequence[Operator],
-    demonstrations: Sequence[Demonstration],
-    kinematics: Kinematics,
-    holds: Sequence[Hold] = (),
+    operators: Sequence[Operator], motions: Sequence[Motion], kinematics: Kinematics
 ) -> tuple[Operator, ...]:
-    """Operators with ``geometry="tangent"`` given the path that they lack.
+    """Operators of ``geometry="tangent"`` with the mean of the demonstrated orientations.
 
-    At each instant of the longest demonstration's time it is the Karcher mean of the
-    orientations seen from the operator's frame; a demonstration that is over counts with its
-    last one.
+    At each instant it is the mean on the sphere of what the demonstrations show then.
 
     Parameters
     ----------
     operators : sequence of Operator
-        Those in other coordinates, and those that have a path, stay as they are.
-    demonstrations : sequence of Demonstration
-        At least one.
+        Those that have a path keep it.
+    motions : sequence of Motion
+        In step.
     kinematics : Kinematics
-    holds : sequence of Hold, default=()
-        Objects that were held: as places they are where they were last free.
+
+    Returns
+    -------
+    tuple of Operator
     """
+    grid = max((one.time for one in motions), key=lambda time: float(time[-1]))
+    places = torch.linspace(0, len(grid) - 1, min(len(grid), MOST)).round().long()
+    instants = grid.double()[places]
 
     def completed(operator: Operator) -> Operator:
         if isinstance(operator, Stack):
@@ -52,17 +51,12 @@ def with_mean_orientations(
         plain = replace(operator, geometry="quaternion")
         shown = [
             quaternions.interpolate(
-                instants,
-                one.time.to(instants),
-                plain.local(one, kinematics, holds).double(),
+                instants, one.time.double(), one.coordinates(plain, kinematics).double()
             )
-            for one in demonstrations
+            for one in motions
         ]
         means = quaternions.mean(torch.stack(shown, -2))
         rows = torch.cat((instants.unsqueeze(-1), means), -1)
         return replace(operator, path=tuple(map(tuple, rows.tolist())))
 
-    grid = max((one.time for one in demonstrations), key=lambda time: float(time[-1]))
-    places = torch.linspace(0, len(grid) - 1, min(len(grid), MOST)).round().long()
-    instants = grid.to(kinematics.lower.device, torch.float64)[places]
     return tuple(map(completed, operators))

@@ -8,27 +8,32 @@ demonstration widens the covariances of exactly those instants that the skill is
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch.checks.report import Finding, listed
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.local_data import local_data
-from tpgmm_torch.training.training_rows import at_phases, typical_time
+from tpgmm_torch.training.hold_detection import attach_holds, demonstrated_holds
+from tpgmm_torch.training.local_data import Motion, at_phases, local_data
+from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
+from tpgmm_torch.training.training_rows import TrainingRows, typical_time
 
 __all__ = [
     "Outlying",
     "comparable_coordinates",
-    "left_out",
+    "drop_outliers",
+    "outliers_among",
     "outlying_demonstrations",
     "outlying_rows",
+    "unlike_the_others",
 ]
 
 #: Fewer demonstrations do not show how far they differ.
@@ -186,15 +191,72 @@ def comparable_coordinates(
                 yield leaf, local, NEAR * float(torch.linalg.vector_norm(spread))
 
 
-def left_out(outlying: Sequence[Outlying], count: int) -> Finding:
-    """What to say of demonstrations that were left out.
+def drop_outliers(
+    demonstrations: Sequence[Demonstration],
+    operators: Sequence[Operator],
+    robot: Kinematics | None = None,
+) -> list[Demonstration]:
+    """Demonstrations without those unlike the others, of which a warning tells.
+
+    Of five or more, up to a third are left out.
+
+    Parameters
+    ----------
+    demonstrations : sequence of Demonstration
+        Aligned in time. Where they do not say what is held, it is found.
+    operators : sequence of Operator
+        In whose coordinates they are compared.
+    robot : Kinematics, optional
+        As of the estimator.
+
+    Returns
+    -------
+    list of Demonstration
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If the demonstrations do not fit together, or with the robot and the operators.
+    """
+    known, operators = check_demonstrations(demonstrations), check_operators(operators)
+    kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
+    if known[0].holds is None:
+        known = attach_holds(known, kinematics)
+    holds = demonstrated_holds(known, operators, kinematics)
+    motions = [Motion.of(one, kinematics, holds) for one in known]
+    completed = with_mean_orientations(operators, motions, kinematics)
+    outlying = outlying_demonstrations(known, completed, kinematics, holds)
+    if outlying:
+        finding = replace(unlike_the_others(outlying, len(known)), remedy="They are left out")
+        Report.of([finding], f"{len(known)} demonstrations").act()
+    dropped = {one.episode for one in outlying}
+    return [one for number, one in enumerate(demonstrations) if number not in dropped]
+
+
+def outliers_among(data: TrainingRows, kinematics: Kinematics) -> Iterator[Finding]:
+    """A finding, if there are demonstrations in memory unlike the others.
+
+    Parameters
+    ----------
+    data : TrainingRows
+    kinematics : Kinematics
+    """
+    if data.parts:
+        rows = torch.stack([at_phases(part, len(data.time)) for part in data.parts])
+        outlying = outlying_rows(rows, data.time, data.operators, kinematics)
+        if outlying:
+            yield unlike_the_others(outlying, len(rows))
+
+
+def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:
+    """A finding that names demonstrations unlike the others, the worst first.
 
     Parameters
     ----------
     outlying : sequence of Outlying
         At least one.
     count : int
-        How many demonstrations there were.
+        Of all demonstrations.
     """
     worst = max(outlying, key=lambda one: one.ratio)
     places = [
@@ -203,10 +265,10 @@ def left_out(outlying: Sequence[Outlying], count: int) -> Finding:
         for one in sorted(outlying, key=lambda one: -one.ratio)
     ]
     return Finding(
-        "left out",
-        f"{len(outlying)} of {count} are unlike the others and were not learned from: "
-        f"{listed(places)}",
-        "Is the frame right, and the event's time? robust=False learns from all",
+        "outliers",
+        f"{len(outlying)} of {count} are unlike the others: {listed(places)}",
+        "Is the frame right, and the event's time? drop_outliers(demonstrations, operators, "
+        "robot) leaves them out",
         (format_operator(worst.operator),),
         tuple(one.episode for one in outlying),
         worst.ratio,

@@ -13,7 +13,7 @@ import platform
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
 from tpgmm_torch import (
     Canonical,
+    CovarianceFusion,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -38,6 +39,8 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
     Trajectory,
+    rollout,
+    save,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
@@ -126,26 +129,24 @@ class BottleExperiment:
 
         self.report(f"learning, K = {self.n_components}")
         model = self._model(self.n_components).fit(aligned)
-        model.save(self.out / "model")
+        save(model, self.out / "model")
         self.report(f"reproducing, K = {self.n_components}")
-        reproductions = model.predict(situations)
+        reproductions = _run(model.skill, situations, candidates=True)
         rows = {
             f"information form, K = {self.n_components}": measure(reproductions, situations)
         }
         self.report("learning and reproducing, K = 10")
         rows["information form, K = 10"] = measure(
-            self._model(10).fit(aligned).predict(situations, candidates=False), situations
+            _run(self._model(10).fit(aligned).skill, situations), situations
         )
-        learned = model.get_params(deep=False)
         for epsilon in EPSILONS:
             name = f"covariance form, epsilon = {epsilon:g}"
             self.report(f"reproducing, {name}")
-            model.set_params(fusion="covariance", epsilon=epsilon)
-            rows[name] = measure(model.predict(situations, candidates=False), situations)
-        model.set_params(fusion=learned["fusion"], epsilon=learned["epsilon"])
+            printed = replace(model.skill, fusion=CovarianceFusion(epsilon))
+            rows[name] = measure(_run(printed, situations), situations)
         self.report("learning and reproducing without orientation")
         position_only = self._model(self.n_components, orientation=False).fit(aligned)
-        ablated = position_only.predict(situations, candidates=False)
+        ablated = _run(position_only.skill, situations)
         rows["position only"] = measure(ablated, situations)
 
         self.report("learning and reproducing without time warping")
@@ -189,7 +190,7 @@ class BottleExperiment:
         linear = LinearTimeNormalization().fit(demonstrations)
         aligned = linear.transform(demonstrations)
         model = self._model(self.n_components).fit(aligned)
-        others = model.predict(situations, candidates=False)
+        others = _run(model.skill, situations)
         normalised = _Measure(self.skill, aligned)
         return {
             "time warping": measure.alignment(demonstrations, warping.paths_, reproductions),
@@ -209,6 +210,13 @@ class BottleExperiment:
             "python": platform.python_version(),
             "versions": {name: version(name) for name in packages},
         }
+
+
+def _run(
+    skill: Any, situations: Sequence[Situation], candidates: bool = False
+) -> list[Trajectory]:
+    """Reproductions within the robot's bounds, faded in from the start posture."""
+    return rollout(skill, situations, bounds="robot", blend=1.0, candidates=candidates)
 
 
 class _Measure:

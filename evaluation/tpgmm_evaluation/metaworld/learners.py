@@ -26,6 +26,7 @@ from tpgmm_evaluation.metaworld.networks import NETWORKS, Network
 from tpgmm_evaluation.metaworld.perceptron import Perceptron
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
+from tpgmm_torch.training.hold_detection import with_holds
 
 __all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "switches"]
 
@@ -184,16 +185,10 @@ class TaskParameterized:
                 metaworld_operators(present(episodes)),
                 robot,
                 **{
-                    "blend": 0.0,
-                    "holds": [],
-                    "plausibility": "ignore",
-                    "robust": False,
                     "random_state": seed,
-                    # a gripper that closes is a step, which Gaussians across it would smear
-                    "parts": [*demonstrations[0].events] or None,
                     **self.options,
                 },
-            ).fit(demonstrations)
+            ).fit(with_holds(demonstrations, ()))
         if self.nearness is not None:
             model = self.nearness.applied(model, len(learned))
         frames = {
@@ -204,6 +199,7 @@ class TaskParameterized:
         policy = TPGMMPolicy.from_estimator(
             model,
             fps=FPS,
+            blend=0.0,
             environment_names=[f"e{i}" for i in range(7 * len(FRAMES))],
             frames=frames,
             follow_frames=False,

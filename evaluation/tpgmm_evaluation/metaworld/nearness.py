@@ -113,16 +113,18 @@ class Nearness:
                 deviation = self.deviation(distance).expand(-1, mean.shape[1] - 1)
             covariances.append(self.posterior(covariance, deviation, n_demonstrations, lengths))
         settings = model.get_params(deep=False) | {
-            "n_components": model.n_components_,
+            "n_components": len(model.weights_),
             "operators": list(model.operators_),
             "robot": model.kinematics_,
-            "holds": [],
-            "parts": None,  # they are in the components
             "covariance_shrinkage": 0.0,  # the prior says what few demonstrations do not
         }
-        prior = TaskParameterizedGMM.from_parameters(
-            model.weights_, model.means_, covariances, model.time_, **settings
+        return TaskParameterizedGMM.from_parameters(
+            model.weights_,
+            model.means_,
+            covariances,
+            model.time_,
+            n_demonstrations=model.n_demonstrations_,
+            peaks=model.skill.peaks,
+            summary=model.skill.summary,
+            **settings,
         )
-        prior.summary_ = model.summary_
-        prior.acceleration_, prior.jerk_ = model.acceleration_, model.jerk_
-        return prior

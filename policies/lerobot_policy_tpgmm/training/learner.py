@@ -14,14 +14,14 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, distributed
 
-from lerobot_policy_tpgmm.configuration_tpgmm import Skill, TPGMMConfig, models_of
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import FrameFeatures, JointFeatures
 from lerobot_policy_tpgmm.training.clocks import Clock
@@ -47,7 +47,6 @@ from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_torch import (
     Demonstration,
     Hold,
-    MultimodalTaskParameterizedGMM,
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment.base import Alignment
@@ -58,9 +57,13 @@ from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarnin
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
+from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
-from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
+from tpgmm_torch.training.outlying_demonstrations import (
+    drop_outliers,
+    outlying_demonstrations,
+)
 
 __all__ = ["Learner"]
 
@@ -109,7 +112,7 @@ class Learner:
         joints: JointFeatures,
         frames: FrameFeatures,
         dataset_meta: Any,
-        become: Callable[[Skill], None],
+        become: Callable[[TaskParameterizedGMM], None],
     ) -> None:
         self._config, self._mixture, self._become = config, mixture, become
         self._kinematics, self._operators = kinematics, tuple(operators)
@@ -198,10 +201,6 @@ class Learner:
             return f"objects are held, {', '.join(config.holds)}"
         if config.link_frames:  # nor where a link is at an event of the episode
             return f"frames are at events, {', '.join(config.link_frames.values())}"
-        if config.parts:  # and would narrow what does not matter in a part
-            return f"parts are learned one by one, they end at {config.parts} s"
-        if config.ways:  # nor which of them an episode shows
-            return f"the skill is done in {len(config.ways)} ways"
         return ""
 
     def check_saveable(self) -> None:
@@ -225,7 +224,7 @@ class Learner:
         action = self._config.plausibility
         with warnings.catch_warnings():
             if action in ("error", "ignore"):
-                warnings.simplefilter(action, PlausibilityWarning)
+                warnings.simplefilter(action, PlausibilityWarning)  # type: ignore[arg-type]
             self._learn(recorder)
 
     def _learn(self, recorder: EpochRecorder) -> None:
@@ -259,28 +258,27 @@ class Learner:
 
     def _fit(self, model: TaskParameterizedGMM, aligned: Sequence[Demonstration]) -> None:
         """Learn aligned demonstrations, of as many ways as there are."""
-        config, skill = self._config, cast(Skill, model)
-        if config.modes != 1:
-            log.info("looking for several ways: --policy.modes=%s", config.modes)
-            skill = MultimodalTaskParameterizedGMM(model, config.modes)
+        config = self._config
         log.info("EM: fitting %d components", config.n_components)
-        skill.fit(aligned)
-        if isinstance(skill, MultimodalTaskParameterizedGMM) and skill.mode_selection_:
-            log.info("%s", skill.mode_selection_.report())
-        self._become(skill)
-        self._operators = models_of(skill)[0].operators_
-        for one in models_of(skill):
-            log.info(
-                "%d components fitted by %d steps of EM: the policy is trained",
-                one.n_components_,
-                one.n_iter_,
-            )
+        shown = list(aligned)
+        if config.holds is not None:
+            shown = with_holds(shown, list(map(Hold.parse, config.holds)))
+        if config.robust:
+            shown = drop_outliers(shown, self._operators, model.robot)
+        if config.holds is None:
+            shown = attach_holds(shown, model.robot)
+        model.fit(shown)
+        self._become(model)
+        self._operators = model.operators_
+        log.info(
+            "%d components fitted by %d steps of EM: the policy is trained",
+            len(model.weights_),
+            model.mixture_.n_iter_,
+        )
 
     def _go_on_from(self, aligned: Mapping[int, Demonstration], kinematics: Kinematics) -> None:
         """Find what the loss of later steps needs to know of the demonstrations."""
         config, mixture, operators = self._config, self._mixture, self._operators
-        if config.ways:
-            return
         holds = list(map(Hold.parse, config.holds or ()))
         shown = list(aligned.values())
         if config.robust:  # as in fit, which says so
@@ -322,7 +320,7 @@ class Learner:
         """Demonstrations with the events and the frames at links that are asked for."""
         config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
-        named = config.parts or config.alignment.startswith("events")
+        named = config.alignment.startswith("events")
         if self._stored and (poses or named):
             # LeRobot's preprocessor hands no such columns on
             log.info("reading events: %s", ", ".join(self._stored))

@@ -14,10 +14,8 @@ from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
-from tpgmm_torch.regression.prior import prior_widths
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.robots import Kinematics, RobotState
-from tpgmm_torch.training.mixture_settings import fused_samples
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
 
@@ -61,22 +59,13 @@ def regression(
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
         local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
     shown = None if config.shown is None else config.shown["n_demonstrations"]
-    weights = mixture.logits.softmax(0)
-    covariances = [triangle @ triangle.mT for triangle in mixture.triangles()]
     return Regression(
         kinematics,
         operators,
         local,
-        torch.log_softmax(mixture.logits, 0),
-        config.fusion,
-        config.activation,
-        config.epsilon,
-        prior_widths(
-            config.prior_std, kinematics, operators, weights, list(mixture.means), covariances
-        ),
-        config.negligible,
-        config.priorities,
-        fused_samples(config.covariance_shrinkage, shown),
+        mixture.logits.log_softmax(0),
+        fusion=config.estimator(None, ()).fusion or InformationFusion(),
+        n_samples=shown if config.covariance_shrinkage == "auto" else None,
     )
 
 
@@ -139,5 +128,5 @@ def imitation_loss(
     asked : Tensor of shape (n,)
         Which of the model's joints these are.
     """
-    estimate = model.step(samples.next_time, samples.state, samples.poses)
+    estimate = model.estimate(samples.next_time, samples.state, samples.poses)
     return SQUARE_MILLIRADIANS * (estimate.joints[:, asked] - wanted).square().mean()

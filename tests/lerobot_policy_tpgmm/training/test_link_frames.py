@@ -69,7 +69,7 @@ def test_training_learns_what_the_loader_and_the_estimator_do(policy, grips):
     assert [one.events["close"] for one in read] == pytest.approx(list(CLOSINGS), abs=0.11)
     aligned = EventAlignment(robot=robot()).fit_transform(read)
     operators = [parse_operator(OPERATORS[0]), Canonical()]
-    model = TaskParameterizedGMM(3, operators, robot(), random_state=0, plausibility="ignore")
+    model = TaskParameterizedGMM(3, operators, robot(), random_state=0)
     same(policy.to_estimator(), model.fit(aligned), 1e-6)
 
 
@@ -140,7 +140,7 @@ def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_
     assert [one.events["close"] for one in read] == pytest.approx(list(when[1:]), abs=0.11)
     aligned = EventAlignment(robot=robot()).fit_transform(read)
     operators = [parse_operator(OPERATORS[0]), Canonical()]
-    model = TaskParameterizedGMM(3, operators, robot(), random_state=0, plausibility="ignore")
+    model = TaskParameterizedGMM(3, operators, robot(), random_state=0)
     same(policy.to_estimator(), model.fit(aligned), 1e-6)
 
 

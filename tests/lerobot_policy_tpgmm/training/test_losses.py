@@ -119,7 +119,7 @@ def test_what_em_left_out_is_not_learned_by_gradient(tmp_path):
     shown[2] = replace(shown[2], frames={"cup": Frame(cup.position + 0.3, cup.orientation)})
     save_lerobot(shown, tmp_path / "set", fps=FPS, task="handle")
     data = dataset(tmp_path / "set")
-    for policy in (trained(data, **POINTS), trained(data, robust=False, **POINTS)):
+    for policy in (trained(data, **POINTS), trained(data, **POINTS)):
         policy.train()
         batch = whole(data)
         wrong = batch["episode_index"].flatten() == 2
@@ -161,7 +161,7 @@ def test_more_steps_do_not_undo_the_shrinkage(handlings, monkeypatch):
 def test_the_loss_is_the_log_density_that_em_raises(handlings):
     policy = trained(handlings, alignment="none", **HANDLINGS)
     model, shown = policy.to_estimator(), load_lerobot(handlings.root)
-    expected = model.regression().expected
+    expected = model.skill.expected
     rows = torch.cat(local_data(shown, model.operators_, model.kinematics_, expected))
     loss = value(policy, whole(handlings))
     assert loss == pytest.approx(-model.mixture_.score(rows.numpy()), rel=1e-9)
@@ -200,7 +200,7 @@ def test_the_likelihood_rises_where_em_stopped_early(waves):
 
 
 def test_the_imitation_error_falls_and_the_policy_acts_on_it(handlings, tmp_path):
-    options = {**HANDLINGS, "loss": "imitation", "n_components": 3, "blend": 0.0}
+    options = {**HANDLINGS, "loss": "imitation", "n_components": 3}
     untrained = trained(handlings, **options)
     policy = fresh(handlings, optimizer_lr=1e-3, **options)
     assert train(policy, epoch(handlings, 32), 60)[:4] == [0.0] * 4

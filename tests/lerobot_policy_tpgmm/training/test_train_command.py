@@ -15,7 +15,7 @@ from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import MultimodalTaskParameterizedGMM, TaskParameterizedGMM
+from tpgmm_torch import Controller, MultimodalTaskParameterizedGMM, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
 from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.operators.text import parse_operator
@@ -178,7 +178,7 @@ def test_several_ways_are_found_learned_and_taken_by_lerobots_commands(tmp_path)
     sent = torch.tensor([[*one.values()] for one in json.loads(moved.read_text())])
     joints, frames = situation.joints.float(), {"object": place}
     control = saved(tmp_path, 3).config.control()
-    controller = model.controller(joints.double(), frames, **control)
+    controller = Controller(model.skill, joints.double(), frames, **control)
     assert len(sent) >= 12
     for tick, action in enumerate(sent):
         command = controller.step(0.05, joints.double(), frames if tick else None)

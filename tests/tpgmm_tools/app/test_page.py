@@ -18,8 +18,9 @@ from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.tables import demonstrations_to_frame, read_table, write_table
 from tpgmm_tools.app import page
-from tpgmm_torch import Demonstration, Frame, Situation, TaskParameterizedGMM, quaternions
+from tpgmm_torch import Demonstration, Frame, Situation, quaternions
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.persistence import load_model
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_a_table_becomes_a_moving_picture_and_files(table, tmp_path):
     assert "s of motion" in report and "times as far" in report
     with zipfile.ZipFile(model) as archive:
         archive.extractall(tmp_path)
-    again = TaskParameterizedGMM.load(tmp_path / "model")
+    again = load_model(tmp_path / "model")
     [same] = again.predict([page.moved(situation, [place])])
     columns = read_table(motion)[list(same.joint_names)]
     np.testing.assert_allclose(columns, same.joints, atol=1e-9)

@@ -12,7 +12,7 @@ from tpgmm_datasets.tables import (
     demonstrations_from_frame,
     read_table,
 )
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.persistence import load_model
 
 
 def arrays(path):
@@ -29,7 +29,7 @@ def test_reproductions_of_a_data_set_are_those_of_the_model(dataset, fitted, tmp
     assert len(printed) == 3
     assert all("rad/s^2" in line and "limit" in line for line in printed[:2])
     assert [path.name for path in out.parent.iterdir()] == [out.name]
-    model = TaskParameterizedGMM.load(fitted[0])
+    model = load_model(fitted[0])
     names = list(model.kinematics_.joint_names)
     if suffix == "npz":
         found = arrays(out)
@@ -76,7 +76,7 @@ def test_reproduce_takes_situations_from_a_file(fitted, tmp_path):
     ]
     file.write_text(json.dumps(items))
     output("reproduce", fitted[0], "--situations", file, "--out", out)
-    expected = TaskParameterizedGMM.load(fitted[0]).predict(situations, candidates=False)
+    expected = load_model(fitted[0]).predict(situations, candidates=False)
     joints = torch.cat([trajectory.joints for trajectory in expected])
     np.testing.assert_allclose(arrays(out)["joints"], joints, atol=1e-12)
     items[1]["frames"] = {"cup": items[1]["frames"]["bottle"]}

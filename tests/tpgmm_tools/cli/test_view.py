@@ -13,6 +13,7 @@ import pytest
 from tests.support import skills
 from tests.support.command_line import output, refusal
 from tests.support.recordings import Recording
+from tests.support.skills import small_bottle
 from tpgmm_datasets import save_lerobot
 
 
@@ -20,7 +21,7 @@ from tpgmm_datasets import save_lerobot
 def demo(tmp_path_factory):
     """A folder as ``tpgmm demo`` writes it."""
     folder = tmp_path_factory.mktemp("demo")
-    skills.small_bottle().save(folder / "model")
+    skills.save(small_bottle(), folder / "model")
     demonstrations = skills.generator().demonstrations(2)
     save_lerobot(demonstrations, folder / "dataset", fps=20, task="shake")
     return folder

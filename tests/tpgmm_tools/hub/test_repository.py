@@ -8,7 +8,7 @@ import torch
 from tests.support.hub_server import local_hub
 from tests.support.skills import small_bottle
 from tpgmm_tools.hub import load, push
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM, save
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
 
 
@@ -50,7 +50,7 @@ def test_what_was_changed_on_the_hub_is_refused(hub):
 
 
 def test_a_folder_is_taken_as_it_is(tmp_path, hub):
-    small_bottle().save(tmp_path / "model")
+    save(small_bottle(), tmp_path / "model")
     load(tmp_path / "model")
     load(str(tmp_path / "model"))
     assert not hub.paths

@@ -9,8 +9,9 @@ import pytest
 
 from tests.support import skills
 from tpgmm_tools.viewing.curves import Mark, as_html, motion_marks, motion_panels
-from tpgmm_torch import Hold, Situation, TaskParameterizedGMM
+from tpgmm_torch import Hold, Situation, save
 from tpgmm_torch.impedance.stiffness import Impedance
+from tpgmm_torch.persistence import load_model
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +73,8 @@ def test_events_of_the_demonstrations_and_parts_are_marked_where_they_are(tmp_pa
     [trajectory] = model.predict([Situation.of(shown[0])])
     [mark] = motion_marks(model, trajectory)  # not all have slipped
     assert (mark.time, mark.label) == (pytest.approx(1.0), "grasp & lift")
-    model.save(tmp_path / "model")
-    assert motion_marks(TaskParameterizedGMM.load(tmp_path / "model"), trajectory) == [mark]
+    save(model, tmp_path / "model")
+    assert motion_marks(load_model(tmp_path / "model"), trajectory) == [mark]
     parted = skills.canonical(n_components=4, parts=[1.5]).fit(shown)
     assert motion_marks(parted, trajectory)[1] == Mark(1.5, "part 2")
     named = skills.canonical(n_components=4, parts=["grasp*"]).fit(shown)

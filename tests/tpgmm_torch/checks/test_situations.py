@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from tests.support.skills import bottle_model, few_bottles, small_bottle
-from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch import Controller, Frame, Situation, TaskParameterizedGMM, save
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
+from tpgmm_torch.persistence import load_model
 
 ODD = {"bottle": Frame([0.3, 0.0, 2.0])}
 
@@ -63,13 +64,13 @@ def test_only_the_first_tick_is_checked_and_a_posture_only_at_the_start():
     with pytest.warns(PlausibilityWarning, match="start posture"):
         model.fit(few_bottles()).step(0.0, bent, one.frames)
     with pytest.warns(PlausibilityWarning, match="start posture"):
-        model.controller(bent, one.frames)
+        Controller(model.skill, bent, one.frames)
 
 
 def test_a_saved_model_knows_its_demonstrations(tmp_path):
     model, [one] = learned(), given()
-    model.save(tmp_path / "model")
-    again = TaskParameterizedGMM.load(tmp_path / "model")
+    save(model, tmp_path / "model")
+    again = load_model(tmp_path / "model")
     assert again.summary_ == model.summary_
     with pytest.warns(PlausibilityWarning, match="bottle: z = 2, shown"):
         again.predict([Situation(one.joints, ODD)])
@@ -93,15 +94,17 @@ def test_a_command_has_the_novelty_of_the_situation_now():
     model, [one] = learned(), given()
     bottle = one.frames["bottle"]
     away = Frame(bottle.position + 0.3, bottle.orientation)
-    controller = model.controller(one.joints.expand(2, -1), one.frames, trust=None)
+    controller = Controller(model.skill, one.joints.expand(2, -1), one.frames, trust=None)
     [before, _] = controller.step(0.02).novelty.tolist()
     after = controller.step(0.02, frames={"bottle": Frame.stack([bottle, away])}).novelty
     assert after[0] == before == pytest.approx(model.predict([one])[0].novelty)
     assert after[1] > 1
     # a posture from which nobody starts counts only where the skill begins
-    begun = model.controller(one.joints + 0.5, one.frames, clock="localizing:initial=anywhere")
+    begun = Controller(
+        model.skill, one.joints + 0.5, one.frames, clock="localizing:initial=anywhere"
+    )
     middle = model.predict([one])[0].joints[len(model.time_) // 2]
-    resumed = model.controller(middle, one.frames, clock="localizing:initial=anywhere")
+    resumed = Controller(model.skill, middle, one.frames, clock="localizing:initial=anywhere")
     assert float(begun.step(0.02).novelty) > 1 >= float(resumed.step(0.02).novelty)
 
 
@@ -112,4 +115,4 @@ def test_a_model_without_a_summary_gives_no_novelty():
         operators=model.operators_, robot=model.kinematics_,
     )  # fmt: skip
     assert bare.predict([one])[0].novelty is None
-    assert bare.controller(one.joints, one.frames).step(0.02).novelty is None
+    assert Controller(bare.skill, one.joints, one.frames).step(0.02).novelty is None

@@ -26,7 +26,7 @@ WAITING, LOCALIZING = WaitingClock(), LocalizingClock()
 @pytest.fixture(scope="module")
 def regression() -> Regression:
     """Three joints that move by up to 3 rad/s, for two seconds."""
-    return canonical(reg_covar=1e-6).fit(waves(4, 60)).regression()
+    return canonical(reg_covar=1e-6).fit(waves(4, 60)).skill
 
 
 def begun(regression: Regression, clock: Clock, *batch: int, **options) -> Run:
@@ -168,7 +168,7 @@ def test_what_the_model_leaves_open_is_no_error(regression):
 def test_a_quaternion_and_its_negative_are_one_rotation():
     situation, _ = new_handling()
     model = hands()
-    progress = WAITING.start(model.regression(), situation.joints, situation.frames, 0.0, 1.0)
+    progress = WAITING.start(model.skill, situation.joints, situation.frames, 0.0, 1.0)
     flipped = situation.joints.clone()
     flipped[3:7] *= -1
     progress = progress.advance(0.1, seen(flipped, situation.joints))

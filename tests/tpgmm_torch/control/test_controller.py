@@ -22,7 +22,7 @@ from tpgmm_torch.sensing.trust import Trust
 NAMES = ["the paper's", "poses in two frames"]
 EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
 DT, LAST = 0.1, 1.2
-PLAIN = {"clock": EvenClock(), "trust": None, "smoothing": None, "bounds": None, "blend": 0.0}
+PLAIN = {"clock": EvenClock(), "trust": None, "smoothing": None, "bounds": None}
 
 
 def begun(problem: Problem, **options) -> Controller:
@@ -41,7 +41,7 @@ def test_what_was_measured_may_stand_for_the_last_reference(case: Case):
         measured = kinematics.retract(controller.reference + 0.01)
         controller.step(DT, measured)
         time = torch.tensor(0.2 + k * DT, dtype=torch.float64)
-        expected = regression.step(time, kinematics.state(measured), problem.frames)
+        expected = regression.estimate(time, kinematics.state(measured), problem.frames)
         assert_close(controller.reference, kinematics.retract(expected.joints))
         assert float(controller.time) == pytest.approx(float(time))
 
@@ -297,8 +297,8 @@ def test_a_robot_of_the_bottle_in_a_batch_is_what_it_is_alone():
     situations = generator().situations(12, seed=5)
     start = torch.stack([situation.joints for situation in situations])
     frame = Frame.stack([situation.frames["bottle"] for situation in situations])
-    batch, chosen = model.controller(start, {"bottle": frame}), (2, 3, 4, 5)
-    alone = {one: model.controller(start[one], {"bottle": frame[one]}) for one in chosen}
+    batch, chosen = Controller(model.skill, start, {"bottle": frame}), (2, 3, 4, 5)
+    alone = {one: Controller(model.skill, start[one], {"bottle": frame[one]}) for one in chosen}
     for tick in range(120):
         joints = batch.reference + torch.from_numpy(1e-4 * rng.standard_normal(start.shape))
         poses = torch.cat((frame.position, frame.orientation), -1)
@@ -372,7 +372,7 @@ def test_commands_are_within_bounds_whatever_is_told(clock):
 def test_a_robot_that_was_stopped_in_motion_goes_on_gently(holder, lead):
     """For three seconds; what it missed was looked for elsewhere."""
     model, shown = small_bottle(), bottle_demonstrations()[0]
-    controller, stands = model.controller(shown.joints[0], shown.frames), shown.joints[0]
+    controller, stands = Controller(model.skill, shown.joints[0], shown.frames), shown.joints[0]
     speeds: list[float] = []
     for tick in range(1, 700):
         holds = {"bottle": holder} if tick == 1 else None

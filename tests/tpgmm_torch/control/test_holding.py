@@ -18,6 +18,7 @@ from tests.support.carrying import (
 )
 from tests.support.worlds import LEFT, RIGHT, upper_body
 from tpgmm_torch import (
+    Controller,
     Frame,
     Hold,
     RelativeOrientation,
@@ -424,7 +425,7 @@ def test_what_is_carried_is_put_exactly_however_it_was_grasped():
 def test_hands_do_not_run_away_with_what_they_take_too_early(early):
     """8 to 15 cm beside the grasp that was shown: it moves with the hand from then on."""
     model, scene = carrying_model(), scenes(4, seed=9)
-    controller = model.controller(scene.start, scene.frames, trust=Trust())
+    controller = Controller(model.skill, scene.start, scene.frames, trust=Trust())
     bottle, grasp, fastest = scene.bottle, None, 0.0
     while float(controller.time.max()) < HELD.end + 0.1:
         if float(controller.time.max()) < HELD.end:

@@ -38,7 +38,7 @@ def shaking() -> Regression:
     path[:, 2:4] += (0.4 * envelope * np.sin(np.pi * (time - 10)))[:, None]
     shifts = np.random.default_rng(0).uniform(-0.03, 0.03, (5, 5))
     demonstrations = [Demonstration(time, path + shift) for shift in shifts]
-    return TaskParameterizedGMM(34).fit(demonstrations).regression()
+    return TaskParameterizedGMM(34).fit(demonstrations).skill
 
 
 def localizing(regression: Regression, *batch: int, **options) -> Run:
@@ -248,7 +248,7 @@ def test_localised_robots_do_not_depend_on_their_batch(shaking):
 def test_a_robot_that_carries_something_is_localised_with_it():
     """On its way to the tray it is pushed back by a second; the bottle stays in the hand."""
     scene, model = scenes(1, seed=7)[0], carrying_model()
-    regression, time = model.regression(), model.time_
+    regression, time = model.skill, model.time_
     holding = Holding.start(upper_body(), regression.carried_names, [HELD], scene.frames)
     joints = scene.start
     progress = LOCALIZING.start(regression, joints, scene.frames, 0.0, float(time[-1]))

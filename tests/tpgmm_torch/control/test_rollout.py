@@ -66,12 +66,12 @@ def assert_same(a: Trajectory, b: Trajectory) -> None:
 def test_each_reference_is_the_state_of_the_next_step(case: Case):
     problem = Problem.of(case, 3, 1)
     regression, kinematics = problem.regression(), case.world.kinematics
-    [trajectory] = run(regression, situations(problem, grid()), blend=0)
+    [trajectory] = run(regression, situations(problem, grid()))
     joints, frames = problem.state.joints[0], {OBJECT: problem.frames[OBJECT][0]}
     for time, reference, covariance in zip(
         grid(), trajectory.joints, trajectory.covariance, strict=True
     ):
-        estimate = regression.step(time, kinematics.state(joints), frames)
+        estimate = regression.estimate(time, kinematics.state(joints), frames)
         joints = kinematics.retract(estimate.joints)
         assert_close(reference, joints)
         assert_close(covariance, estimate.covariance)
@@ -149,7 +149,7 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
     for k, now in enumerate(time):
         here = {name: pose[k] if moves else pose for name, pose in together.items()}
         state = case.world.kinematics.state(joints)
-        estimate = regression.step(now, state, here, candidates=True)
+        estimate = regression.estimate(now, state, here, candidates=True)
         joints = torch.stack([trajectory.joints[k] for trajectory in trajectories])
         for row, trajectory in enumerate(trajectories):
             for one, other in zip(trajectory.candidates, estimate.candidates, strict=True):
@@ -164,7 +164,7 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
 def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
     problem = Problem.of(CASES["canonical"], 3, 1)  # its references do not depend on the state
     given = situations(problem, grid(41))
-    [plain] = run(problem.regression(), given, blend=0)
+    [plain] = run(problem.regression(), given)
     [blended] = run(problem.regression(), given, blend=0.8)
     fade = 1 - minimum_jerk(grid(41) / 0.8)
     gap = given[0].joints - plain.joints[0]
@@ -178,7 +178,7 @@ def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
 def test_a_gap_to_where_the_skill_begins_is_no_speed():
     problem = Problem.of(CASES["canonical"], 3, 1)
     time = grid(161)
-    [free] = run(problem.regression(), situations(problem, time), blend=0)
+    [free] = run(problem.regression(), situations(problem, time))
     kinematics = copy.copy(problem.case.world.kinematics)
     kinematics.velocity = torch.full_like(kinematics.velocity, torch.inf)
     kinematics.lower = torch.full_like(kinematics.lower, -torch.inf)
@@ -187,7 +187,7 @@ def test_a_gap_to_where_the_skill_begins_is_no_speed():
     regression = replace(problem.regression(), kinematics=kinematics)
     begin = free.joints[0] + 0.5
     given = [replace(situations(problem, time)[0], joints=begin)]
-    [bounded] = run(regression, given, blend=0, keep_limits=True, peaks=peaks)
+    [bounded] = run(regression, given, keep_limits=True, peaks=peaks)
     assert_close(bounded.joints[0], begin)
     # taken for a speed, 0.5 within a tick of 12.5 ms led 50 beyond
     assert (bounded.joints - free.joints).abs().max() <= 0.5 + 1e-9

@@ -14,6 +14,7 @@ from tests.support.mixtures import (
     assert_close,
     assert_equal_estimates,
     conditionals_of,
+    form,
     random_local,
 )
 from tests.support.own_operators import (
@@ -39,8 +40,10 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
     Canonical,
+    CovarianceFusion,
     Demonstration,
     Frame,
+    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Stack,
@@ -299,7 +302,7 @@ class Problem:
     def step(self, operators: list[Operator] | None = None, joints: Tensor = Q, **options):
         regression = self.regression(operators, **options)
         state = regression.kinematics.state(joints)
-        return regression.step(NOW, state, {}, candidates=True)
+        return regression.estimate(NOW, state, {}, candidates=True)
 
     def answer(self, rows: list[oracles.Row], **how) -> oracles.Answer:
         q = Q.numpy()
@@ -329,7 +332,7 @@ def test_the_null_space_operator_is_the_printed_one(operator):
 @pytest.mark.parametrize("batch", [(), (2,)], ids=["one", "batch"])
 def test_a_null_space_operator_fuses_in_covariance_form(activation, batch):
     problem = Problem.of(PlanarPosition(), NullSpace(), Canonical())
-    options = {"fusion": "covariance", "epsilon": 1e-3, "activation": activation}
+    options = {"fusion": CovarianceFusion(1e-3, activation)}
     joints = Q.expand(*batch, 3)
     printed = problem.step(joints=joints, **options)
     state = PlanarArm().state(Q)
@@ -341,7 +344,7 @@ def test_a_null_space_operator_fuses_in_covariance_form(activation, batch):
         oracles.Row(np.eye(3), np.eye(3) - seen, seen @ q - q),
         oracles.Row(np.eye(3), np.eye(3), -q),
     ]
-    expected = problem.answer(rows, activation=activation, epsilon=1e-3)
+    expected = problem.answer(rows, activation=activation, fusion=CovarianceFusion(1e-3))
     assert_close(printed.joints, expected.mean + np.zeros((*batch, 3)))
     assert_close(printed.covariance, expected.covariance + np.zeros((*batch, 3, 3)))
     by_rows = problem.step([PlanarPosition(), NullSpaceRows(), Canonical()], joints, **options)
@@ -356,14 +359,14 @@ def test_a_null_space_operator_of_full_row_rank_fuses_in_information_form():
     tip, posture = (conditionals_of(local).at(NOW)[0] for local in problem.mixtures)
     asked = torch.cat((tip - state.position("tip")[:2], basis @ (posture - Q)))
     expected = Q + torch.linalg.solve(torch.cat((jacobian, basis)), asked)
-    assert_close(problem.step(prior_std=1e5).joints, expected)
+    assert_close(problem.step(fusion=InformationFusion(1e5)).joints, expected)
 
 
 def test_both_forms_agree_on_task_and_null_space_together():
     whole = Stack(PlanarPosition(), NullSpaceRows())  # a square Jacobian
     problem = Problem.of(whole)
-    information = problem.step(prior_std=1e5)
-    covariance = problem.step(fusion="covariance", epsilon=0.0)
+    information = problem.step(fusion=InformationFusion(1e5))
+    covariance = problem.step(fusion=CovarianceFusion(0.0))
     assert_equal_estimates(information, covariance, 1e-7)
 
 
@@ -378,16 +381,16 @@ def test_an_operator_known_by_its_a_and_b():
     assert_close(CONSTANT.linear(state, {}), np.stack((matrix, matrix)))
     assert_close(CONSTANT.offset(state, {}), np.stack((shift, shift)))
     problem = Problem.of(CONSTANT, Canonical())
-    estimate = problem.step(fusion="covariance", epsilon=1e-2)
+    estimate = problem.step(fusion=CovarianceFusion(1e-2))
     q = Q.numpy()
     rows = [oracles.Row(np.eye(3), matrix, shift - q), oracles.Row(np.eye(3), np.eye(3), -q)]
-    expected = problem.answer(rows, activation="time", epsilon=1e-2)
+    expected = problem.answer(rows, activation="time", fusion=CovarianceFusion(1e-2))
     assert_close(estimate.joints, expected.mean)
     assert_close(estimate.covariance, expected.covariance)
 
 
 def test_a_joint_without_variance_of_its_own_gets_no_share():
-    estimate = Problem.of(CONSTANT, Canonical()).step(fusion="covariance", epsilon=1e-2)
+    estimate = Problem.of(CONSTANT, Canonical()).step(fusion=CovarianceFusion(1e-2))
     constant, canonical = (candidate.share for candidate in estimate.candidates)
     assert bool((constant[:2] > 0).all())
     assert constant[2] == 0
@@ -399,10 +402,10 @@ def test_a_joint_without_variance_of_its_own_gets_no_share():
 )
 def test_gradients_pass_through_operators_of_ones_own(operator, fusion):
     problem = Problem.of(PlanarPosition(), operator)
-    regression = problem.regression(fusion=fusion, epsilon=1e-2, prior_std=2.0)
+    regression = problem.regression(fusion=form(fusion, epsilon=1e-2, prior_std=2.0))
 
     def step(joints: Tensor) -> Tensor:
-        return regression.step(NOW, regression.kinematics.state(joints), {}).joints
+        return regression.estimate(NOW, regression.kinematics.state(joints), {}).joints
 
     assert torch.autograd.gradcheck(step, Q.clone().requires_grad_())
 

@@ -122,7 +122,6 @@ def test_every_operator_has_a_tolerance_in_its_unit():
         n_components=1,
         covariance_type="diag",
         reg_covar=0.0,
-        plausibility="ignore",
     )
     exact = clone(model).set_params(
         operators=[replace(position, tolerance=0.0), replace(orientation, tolerance=0.0)]
@@ -143,8 +142,8 @@ def test_some_joints_are_learned_and_the_others_go_their_way():
     """They follow what was shown; the prior holds the rest where it starts."""
     shown = waves()
     names = JointSpace("abc")
-    some = TaskParameterizedGMM(1, [Canonical(joints=("b",))], names, blend=0)
-    every = TaskParameterizedGMM(1, [Canonical()], names, blend=0)
+    some = TaskParameterizedGMM(1, [Canonical(joints=("b",))], names)
+    every = TaskParameterizedGMM(1, [Canonical()], names)
     start = Situation.of(shown[0])
     [one], [all_of_them] = some.fit(shown).predict(start), every.fit(shown).predict(start)
     torch.testing.assert_close(one.joints[:, 1], all_of_them.joints[:, 1], rtol=0, atol=2e-3)

@@ -8,7 +8,14 @@ import torch
 
 from tests.support.mixtures import CASES, Problem, conditionals_of, random_local, times
 from tests.support.worlds import CARRIED, GRASP, OBJECT, RIGHT
-from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
+from tpgmm_torch import (
+    Canonical,
+    Frame,
+    InformationFusion,
+    RelativeOrientation,
+    RelativePosition,
+    Stack,
+)
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion import KalmanUpdate
 from tpgmm_torch.regression.regression import PART
@@ -34,7 +41,7 @@ def test_the_update_is_the_sum_of_precisions(name, batch):
     other = replace(regression, operators=summed)
     for now in (torch.tensor(0.8, dtype=torch.float64), times(*batch)):
         at = now, problem.state, problem.frames
-        assert_same(regression.step(*at), other.step(*at))
+        assert_same(regression.estimate(*at), other.estimate(*at))
     assert regression._update is not None
     assert other._update is None
 
@@ -47,7 +54,7 @@ def test_two_operators_of_the_joints_are_one_prior():
     twice = replace(plain, operators=[*plain.operators, Canonical()], conditionals=conditionals)
     summed = [Joints() if type(o) is Canonical else o for o in twice.operators]
     at = times(), problem.state, problem.frames
-    assert_same(twice.step(*at), replace(twice, operators=summed).step(*at))
+    assert_same(twice.estimate(*at), replace(twice, operators=summed).estimate(*at))
 
 
 def test_a_mixture_of_another_kind_is_left_to_the_sum():
@@ -69,7 +76,7 @@ def test_thousands_of_robots_are_parts_of_a_few(alike):
     whole = regression.estimate(now, problem.state.joints, problem.frames)
     for index in (0, PART - 1, PART, count - 1):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
-        one = regression.step(now if alike else now[index], problem.state[index], frames)
+        one = regression.estimate(now if alike else now[index], problem.state[index], frames)
         torch.testing.assert_close(whole.joints[index], one.joints, rtol=0, atol=1e-8)
         torch.testing.assert_close(whole.covariance[index], one.covariance, rtol=0, atol=1e-8)
 
@@ -101,8 +108,8 @@ def test_float32_is_float64_to_its_own_precision():
         for name, f in problem.frames.items()
     }
     state = robot.state(problem.state.joints.float())
-    expected = double.step(times(3), problem.state, problem.frames)
-    actual = single.step(times(3).float(), state, frames)
+    expected = double.estimate(times(3), problem.state, problem.frames)
+    actual = single.estimate(times(3).float(), state, frames)
     assert actual.joints.dtype == torch.float32
     torch.testing.assert_close(actual.joints.double(), expected.joints, rtol=0, atol=2e-4)
     torch.testing.assert_close(
@@ -146,7 +153,7 @@ def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators,
     )
     assert (stacked._update is None) is (form is Joints or bool(options))
     at = times(), state, frames
-    assert_same(stacked.step(*at, candidates=True), without.step(*at))
+    assert_same(stacked.estimate(*at, candidates=True), without.estimate(*at))
     # and by itself
     other = random_local(rng, 4, np.zeros(extra.dimension(None)))
     three = replace(
@@ -154,9 +161,9 @@ def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators,
         operators=[hands, extra, form()],
         conditionals=[alone, conditionals_of(other), joints],
     )
-    estimate = three.step(*at, candidates=True)
+    estimate = three.estimate(*at, candidates=True)
     if not options:  # its time marginal is its own
-        assert_same(estimate, without.step(*at))
+        assert_same(estimate, without.estimate(*at))
     assert (estimate.candidates[1].share == 0).all()
     assert torch.equal(estimate.candidates[1].mean, state.joints.expand(3, 17))
 
@@ -166,21 +173,21 @@ def test_a_task_without_variance_is_named():
     regression = problem.regression()
     regression._update.conditionals.covariance[2, :14, :14] *= -1
     with pytest.raises(DataError, match=r"covariance of the tasks .*3 of 12"):
-        regression.step(times(), problem.state, problem.frames)
+        regression.estimate(times(), problem.state, problem.frames)
 
 
 @pytest.mark.parametrize("negligible", [1e-9, 1e-2])
 def test_robots_at_their_own_times_are_each_as_if_it_were_alone(negligible):
     count = 40
     problem = Problem.of(CASES["the paper's"], 5, count)
-    wide = problem.regression(negligible=negligible)
+    wide = problem.regression(fusion=InformationFusion(negligible=negligible))
     narrow = [replace(one, time_variance=one.time_variance / 40) for one in wide.conditionals]
     regression = replace(wide, conditionals=narrow)
     together = regression.estimate(times(count), problem.state.joints, problem.frames)
     left_out = 0
     for index in range(count):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
-        alone = regression.step(times(count)[index], problem.state[index], frames)
+        alone = regression.estimate(times(count)[index], problem.state[index], frames)
         torch.testing.assert_close(together.joints[index], alone.joints, rtol=0, atol=1e-12)
         assert torch.equal(together.activation[index] == 0, alone.activation == 0)
         left_out += int((alone.activation == 0).sum())

@@ -106,18 +106,18 @@ def test_single_precision_finds_it_too():
 def test_inside_its_bounds_a_step_is_what_it_was():
     problem = Problem.of(CASES["the paper's"], 3, 2)
     now = times(2), problem.state, problem.frames
-    plain = problem.regression().step(*now)
+    plain = problem.regression().estimate(*now)
     bounds = plain.joints - 1e-9, plain.joints + 1e-9
-    assert torch.equal(problem.regression().step(*now, bounds=bounds).joints, plain.joints)
+    assert torch.equal(problem.regression().estimate(*now, bounds=bounds).joints, plain.joints)
 
 
 @pytest.mark.parametrize("width", [0.01, 0.1])
 def test_of_a_step_the_other_joints_take_over(width):
     problem = Problem.of(CASES["the paper's"], 3, 2)
     now = times(2), problem.state, problem.frames
-    plain = problem.regression().step(*now)
+    plain = problem.regression().estimate(*now)
     lower, upper = problem.state.joints - width, problem.state.joints + width
-    bounded = problem.regression().step(*now, bounds=(lower, upper)).joints
+    bounded = problem.regression().estimate(*now, bounds=(lower, upper)).joints
     assert_optimal(bounded, plain.joints, plain.covariance, lower, upper)
 
 

@@ -20,7 +20,7 @@ def limits():
 
 def searched(frame, start, ticks, time=TIME, asked=True, **options):
     """What is wanted at each tick, of a robot that is where it wants to be at once."""
-    regression, found = small_bottle().regression(), []
+    regression, found = small_bottle().skill, []
     search = regression.posture_search()
     asked = torch.full(start.shape[:-1], asked)
     for _ in range(ticks):
@@ -34,7 +34,7 @@ def searched(frame, start, ticks, time=TIME, asked=True, **options):
 
 def costs(frame, joints, time=TIME, component=None):
     """Of a component, the heaviest if none is named, for joints (N, n)."""
-    regression = small_bottle().regression()
+    regression = small_bottle().skill
     if component is None:
         component = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
     index = torch.as_tensor(component).expand(1, len(joints))
@@ -64,7 +64,7 @@ def test_the_gradient_is_that_of_the_cost(frame):
 
 
 def test_who_is_not_asked_keeps_the_estimate():
-    regression = small_bottle().regression()
+    regression = small_bottle().skill
     estimate = regression.estimate(TIME, neutral(), {"bottle": HIGH}, limits())
     wanted, search = regression.posture_search().advance(
         TIME, neutral(), {"bottle": HIGH}, estimate, limits(), torch.tensor(False)
@@ -73,7 +73,7 @@ def test_who_is_not_asked_keeps_the_estimate():
 
 
 def test_what_is_reached_is_left_to_the_regression():
-    regression, joints = small_bottle().regression(), neutral()
+    regression, joints = small_bottle().skill, neutral()
     for _ in range(30):
         joints = regression.estimate(TIME, joints, {"bottle": REACHED}, limits()).joints
     near = joints + 0.001
@@ -117,7 +117,7 @@ def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
 def test_between_two_components_what_cannot_be_reached_is_approached_too():
     frame = Frame(torch.tensor([0.3, 0.1, 0.5], dtype=torch.float64))
     times = torch.linspace(3, 5, 201, dtype=torch.float64)
-    regression = small_bottle().regression()
+    regression = small_bottle().skill
     shares = torch.stack(
         [regression.estimate(t, neutral(), {"bottle": frame}).activation for t in times]
     )
@@ -163,7 +163,7 @@ def test_a_search_that_ended_begins_anew_where_the_robot_is():
     elsewhere = start - 0.2
     one = search.ended(torch.tensor([True, False]))
     assert one.active is not None and one.active.tolist() == [False, True]
-    regression = small_bottle().regression()
+    regression = small_bottle().skill
     estimate = regression.estimate(TIME, elsewhere, {"bottle": REACHED}, limits())
     asked = torch.ones(2, dtype=torch.bool)
     steps = [

@@ -1,18 +1,29 @@
 """The prior that closes the fusion: in the unit of each joint."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from tests.support.skills import HANDS, handlings, hands, hands_model
 from tests.support.worlds import upper_body
-from tpgmm_torch import Demonstration, Frame, RelativePosition, Robot, TaskParameterizedGMM
+from tpgmm_torch import (
+    Demonstration,
+    Frame,
+    InformationFusion,
+    RelativePosition,
+    Robot,
+    TaskParameterizedGMM,
+    rollout,
+    save,
+)
 from tpgmm_torch.exceptions import (
     DataError,
-    InvalidParameterError,
     ShapeError,
     UnknownNameError,
 )
+from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.robots import Poses
 
@@ -26,7 +37,7 @@ LIFT = """<robot name="lift"><link name="base"/><link name="arm"/><link name="ha
 def widths(prior_std, robot, model=None):
     model = hands() if model is None else model
     return prior_widths(
-        prior_std, robot, model.operators_, model.weights_, model.means_, model.covariances_
+        prior_std, robot, model.operators_, model.skill.conditionals, model.weights_
     )
 
 
@@ -45,7 +56,7 @@ def tracked(unit: float) -> list[Demonstration]:
 def predicted(unit: float, **options: object) -> torch.Tensor:
     hand = Poses(["left"], orientation=False)
     operators = [RelativePosition("left", "cup")]
-    model = TaskParameterizedGMM(6, operators, hand, blend=0, **options)
+    model = TaskParameterizedGMM(6, operators, hand, **options)
     *shown, new = tracked(unit)
     [trajectory] = model.fit(shown).predict(new)
     return trajectory.joints * unit
@@ -55,8 +66,10 @@ def predicted(unit: float, **options: object) -> torch.Tensor:
 def test_the_same_motion_in_millimetres_gives_the_same_prediction():
     torch.testing.assert_close(predicted(1e-3), predicted(1.0), rtol=0, atol=1e-9)
     # what is given joint by joint is in the joint's unit
-    listed = predicted(1e-3, prior_std=[50.0, 50.0, 50.0])
-    torch.testing.assert_close(listed, predicted(1.0, prior_std=[0.05] * 3), rtol=0, atol=1e-9)
+    listed = predicted(1e-3, fusion=InformationFusion([50.0, 50.0, 50.0]))
+    torch.testing.assert_close(
+        listed, predicted(1.0, fusion=InformationFusion([0.05] * 3)), rtol=0, atol=1e-9
+    )
     assert (listed - predicted(1.0)).abs().max() > 1e-5
 
 
@@ -91,13 +104,13 @@ def test_joints_may_be_named_or_listed():
 def test_every_form_is_saved_and_serves(tmp_path):
     [shown] = handlings(1)
     for number, prior in enumerate(({"left.x": 0.5}, [2.0] * 14, np.full(14, 2.0), 4.0)):
-        model = hands_model(prior_std=prior).fit(handlings())
-        model.save(tmp_path / str(number))
-        loaded = TaskParameterizedGMM.load(tmp_path / str(number))
+        model = hands_model(fusion=InformationFusion(prior)).fit(handlings())
+        save(model, tmp_path / str(number))
+        loaded = load_model(tmp_path / str(number))
         [expected], [found] = model.predict(shown), loaded.predict(shown)
         assert torch.equal(found.joints, expected.joints)
-        model.set_params(prior_std=1e-6)  # what is prepared follows
-        assert not torch.equal(model.predict(shown)[0].joints, expected.joints)
+        [narrow] = rollout(replace(model.skill, fusion=InformationFusion(1e-6)), shown)
+        assert not torch.equal(narrow.joints, expected.joints)
 
 
 @pytest.mark.parametrize(
@@ -113,20 +126,17 @@ def test_every_form_is_saved_and_serves(tmp_path):
 )
 def test_what_is_no_width_is_refused(prior_std, error, message):
     with pytest.raises(error, match=message):
-        hands_model(prior_std=prior_std).fit(handlings())
-    model = hands_model().fit(handlings()).set_params(prior_std=prior_std)
-    with pytest.raises(error, match=message):
-        model.regression()
+        hands_model(fusion=InformationFusion(prior_std)).fit(handlings())
 
 
 def test_a_number_that_is_no_width_is_refused_at_once():
     for wrong in (0.0, -1.0, "wide"):
-        with pytest.raises(InvalidParameterError, match="prior_std"):
-            hands_model(prior_std=wrong).fit(handlings())
+        with pytest.raises((DataError, ShapeError), match="prior_std"):
+            hands_model(fusion=InformationFusion(wrong)).fit(handlings())
 
 
 def test_what_was_learned_to_be_nan_is_no_unit_of_lengths():
-    model = hands_model().fit(handlings())
-    model.means_ = [mean * torch.nan for mean in model.means_]
+    skill = hands().skill
+    lost = [replace(one, mean=one.mean * torch.nan) for one in skill.conditionals]
     with pytest.raises(DataError, match="must be positive"):
-        widths(10.0, model.kinematics_, model)
+        prior_widths(10.0, HANDS, skill.operators, lost, skill.log_weights.exp())

@@ -8,9 +8,17 @@ import torch
 
 from tests.support.mixtures import CASES, Problem
 from tests.support.skills import HANDLING, handlings, hands_model, waves
-from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM
+from tpgmm_torch import (
+    Canonical,
+    InformationFusion,
+    Situation,
+    TaskParameterizedGMM,
+    rollout,
+    save,
+)
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import information
+from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression import regression as module
 from tpgmm_torch.regression.fusion import Projection
 
@@ -44,7 +52,7 @@ def projected(regression, priorities):
 
 
 def step(regression):
-    return regression.step(NOW, PROBLEM.state, PROBLEM.frames).joints - PROBLEM.state.joints
+    return regression.estimate(NOW, PROBLEM.state, PROBLEM.frames).joints - PROBLEM.state.joints
 
 
 @pytest.mark.parametrize("priorities", [[1, 0, 0], [0, 1, 0], [2, 1, 0], [9, 9, -3]])
@@ -54,7 +62,7 @@ def test_it_is_the_projection_into_null_spaces_as_the_scale_vanishes(priorities,
     far = []
     for scale in (1e-4, 1e-6):
         monkeypatch.setattr(module, "STRICT", scale)
-        found = step(replace(plain, priorities=priorities)).numpy()
+        found = step(replace(plain, fusion=InformationFusion(priorities=priorities))).numpy()
         far.append(np.abs(found - expected).max())
     soft = np.abs(step(plain).numpy() - expected).max()
     assert far[0] < 0.05 * soft
@@ -68,7 +76,10 @@ def test_lower_operators_do_not_disturb_higher_ones():
     other = replace(soft, conditionals=[*tasks, replace(joints, mean=joints.mean + 0.3)])
     moved = {}
     for name, priorities in (("soft", None), ("strict", [1, 1, 0])):
-        difference = [step(replace(one, priorities=priorities)) for one in (soft, other)]
+        difference = [
+            step(replace(one, fusion=InformationFusion(priorities=priorities)))
+            for one in (soft, other)
+        ]
         change = difference[1] - difference[0]
         jacobians = [
             operator.linearize(PROBLEM.state, PROBLEM.frames).jacobian
@@ -81,15 +92,17 @@ def test_lower_operators_do_not_disturb_higher_ones():
 
 def test_equal_priorities_are_none():
     plain = PROBLEM.regression()
-    assert torch.equal(step(replace(plain, priorities=[5, 5, 5])), step(plain))
+    assert torch.equal(
+        step(replace(plain, fusion=InformationFusion(priorities=[5, 5, 5]))), step(plain)
+    )
 
 
 def test_what_is_said_of_one_operator_alone_stays():
     """Likelihoods and candidates are those of what was learned."""
     plain = PROBLEM.regression()
-    strict = replace(plain, priorities=[1, 0, 0])
+    strict = replace(plain, fusion=InformationFusion(priorities=[1, 0, 0]))
     at = NOW, PROBLEM.state, PROBLEM.frames
-    estimate = plain.step(*at)
+    estimate = plain.estimate(*at)
     for one, other in zip(
         plain.candidates(*at, estimate), strict.candidates(*at, estimate), strict=True
     ):
@@ -100,7 +113,7 @@ def test_the_sum_of_precisions_and_the_kalman_update_agree():
     class Joints(Canonical):
         """The same operator by another name, for which the precisions are summed."""
 
-    strict = replace(PROBLEM.regression(), priorities=[2, 1, 0])
+    strict = replace(PROBLEM.regression(), fusion=InformationFusion(priorities=[2, 1, 0]))
     summed = [Joints() if type(one) is Canonical else one for one in strict.operators]
     other = replace(strict, operators=summed)
     assert strict._update is not None and other._update is None
@@ -108,29 +121,22 @@ def test_the_sum_of_precisions_and_the_kalman_update_agree():
 
 
 def test_they_are_saved_with_the_model(tmp_path):
-    operators = [*HANDLING, Canonical()]
-    options = {"robust": False, "plausibility": "ignore", "priorities": (1, 1, 0)}
-    model = hands_model(operators=operators, **options)
-    model.fit(handlings(4)).save(tmp_path / "model")
-    again = TaskParameterizedGMM.load(tmp_path / "model")
-    assert list(again.priorities) == [1, 1, 0]
+    form = InformationFusion(priorities=(1, 1, 0))
+    model = hands_model(operators=[*HANDLING, Canonical()], fusion=form).fit(handlings(4))
+    save(model, tmp_path / "model")
+    again = load_model(tmp_path / "model")
+    assert again.fusion == form
     situation = Situation.of(handlings(5)[4])
     [one], [other] = model.predict([situation]), again.predict([situation])
     torch.testing.assert_close(one.joints, other.joints)
-    model.priorities = None
-    [soft] = model.predict([situation])
+    [soft] = rollout(replace(model.skill, fusion=InformationFusion()), [situation])
     assert float((soft.joints - one.joints).abs().max()) > 1e-6
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"priorities": [1, 0]}, "one for each of the 1 operators"),
-        ({"priorities": [0.5]}, "whole numbers"),
-        ({"priorities": [1], "fusion": "covariance"}, "need fusion='information'"),
-        ({"priorities": [1], "activation": "product"}, "activation='time'"),
-    ],
+    ("priorities", "message"),
+    [([1, 0], "for 1 operators"), ([0.5], "holds integers"), ("high", "one integer per")],
 )
-def test_what_they_cannot_be_is_refused(options, message):
+def test_other_numbers_of_priorities_are_refused(priorities, message):
     with pytest.raises(DataError, match=message):
-        TaskParameterizedGMM(2, **options).fit(waves())
+        TaskParameterizedGMM(2, fusion=InformationFusion(priorities=priorities)).fit(waves())

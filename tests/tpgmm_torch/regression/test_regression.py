@@ -17,16 +17,28 @@ from tests.support.mixtures import (
     assert_close,
     assert_equal_estimates,
     conditionals_of,
+    form,
     times,
 )
 from tests.support.worlds import LEFT, OBJECT, RIGHT, OnRobot, upper_body
-from tpgmm_torch import AbsolutePosition, Canonical, Frame, RelativePosition, Stack
+from tpgmm_torch import (
+    AbsolutePosition,
+    Canonical,
+    CovarianceFusion,
+    Frame,
+    InformationFusion,
+    RelativePosition,
+    Stack,
+)
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 
 EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
-ACTIVATIONS = pytest.mark.parametrize("activation", ["time", "product"])
+FORMS = pytest.mark.parametrize(
+    ("fusion", "activation"),
+    [("information", "time"), ("covariance", "time"), ("covariance", "product")],
+)
 FUSIONS = pytest.mark.parametrize("fusion", ["information", "covariance"])
 EPSILON, PRIOR_STD = 1e-2, 3.0
 
@@ -43,17 +55,15 @@ def options_of(case: Case, fusion: str) -> dict[str, float]:
 
 
 @EVERY_CASE
-@ACTIVATIONS
-@FUSIONS
+@FORMS
 @pytest.mark.parametrize("n_components", [1, 2, 5])
 def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion, n_components):
     problem = Problem.of(case, n_components, 2, 2)
-    regression = problem.regression(
-        activation=activation, fusion=fusion, epsilon=EPSILON, prior_std=PRIOR_STD
-    )
+    used = form(fusion, activation, EPSILON, fusion=InformationFusion(PRIOR_STD))
+    regression = problem.regression(fusion=used)
     options = {"activation": activation, **options_of(case, fusion)}
     for time in (times(), times(2, 2)):
-        estimate = regression.step(time, problem.state, problem.frames)
+        estimate = regression.estimate(time, problem.state, problem.frames)
         assert estimate.joints.shape == problem.state.joints.shape
         for index in np.ndindex(2, 2):
             now = float(time.expand(2, 2)[index])
@@ -64,8 +74,7 @@ def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion
             assert_close(estimate.covariance[index], expected.covariance)
 
 
-@ACTIVATIONS
-@FUSIONS
+@FORMS
 @pytest.mark.parametrize(
     "case",
     [
@@ -86,11 +95,11 @@ def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion
 )
 def test_joints_give_way_by_what_few_samples_leave_unknown(case, activation, fusion):
     problem = Problem.of(case, 3)
-    how = {"activation": activation, "fusion": fusion, "epsilon": EPSILON}
-    estimate = problem.regression(n_samples=3, **how).step(
+    how = {"fusion": form(fusion, activation, EPSILON)}
+    estimate = problem.regression(n_samples=3, **how).estimate(
         times(), problem.state, problem.frames
     )
-    plain = problem.regression(**how).step(times(), problem.state, problem.frames)
+    plain = problem.regression(**how).estimate(times(), problem.state, problem.frames)
     assert float((estimate.joints - plain.joints).abs().max()) > 1e-3
     wider = []
     for operator, local in zip(case.operators, problem.mixtures, strict=True):
@@ -118,7 +127,7 @@ def test_joints_give_way_by_what_few_samples_leave_unknown(case, activation, fus
 def test_joints_alone_have_nobody_to_give_way_to():
     problem = Problem.of(CASES["canonical"], 3)
     plain, few = (
-        problem.regression(n_samples=n).step(times(), problem.state, problem.frames)
+        problem.regression(n_samples=n).estimate(times(), problem.state, problem.frames)
         for n in (None, 3)
     )
     assert_equal_estimates(plain, few)
@@ -128,7 +137,7 @@ def test_joints_alone_have_nobody_to_give_way_to():
 def test_the_activations_are_different_models_of_two_operators_and_one_of_one(case):
     problem = Problem.of(case, 4)
     weights = [
-        problem.regression(activation=name, fusion="covariance").step(
+        problem.regression(activation=name, fusion=CovarianceFusion()).estimate(
             times(), problem.state, problem.frames
         )
         for name in ("time", "product")
@@ -137,24 +146,21 @@ def test_the_activations_are_different_models_of_two_operators_and_one_of_one(ca
     assert differ == (len(case.operators) > 1)
 
 
-@ACTIVATIONS
 @pytest.mark.parametrize("n_components", [1, 4])
-def test_both_forms_agree_where_every_jacobian_is_invertible(activation, n_components):
+def test_both_forms_agree_where_every_jacobian_is_invertible(n_components):
     problem = Problem.of(CASES["poses in two frames"], n_components, 3)
     now = times(3), problem.state, problem.frames
-    information = problem.regression(activation=activation).step(*now)
-    covariance = problem.regression(
-        activation=activation, fusion="covariance", epsilon=0.0
-    ).step(*now)
+    information = problem.regression().estimate(*now)
+    covariance = problem.regression(fusion=CovarianceFusion(0.0)).estimate(*now)
     assert_equal_estimates(information, covariance)
 
 
 def test_the_covariance_form_tends_to_the_information_form_as_epsilon_vanishes():
     problem = Problem.of(CASES["poses in two frames"], 3)
     now = times(), problem.state, problem.frames
-    limit = problem.regression().step(*now).joints
+    limit = problem.regression().estimate(*now).joints
     errors = [
-        (problem.regression(fusion="covariance", epsilon=eps).step(*now).joints - limit).norm()
+        (problem.regression(fusion=CovarianceFusion(eps)).estimate(*now).joints - limit).norm()
         for eps in (1e-4, 1e-5, 1e-6)
     ]
     for coarse, fine in itertools.pairwise(errors):
@@ -164,8 +170,8 @@ def test_the_covariance_form_tends_to_the_information_form_as_epsilon_vanishes()
 def test_the_forms_part_where_a_task_leaves_joints_free():
     problem = Problem.of(CASES["the paper's"], 1)
     now = times(), problem.state, problem.frames
-    information = problem.regression().step(*now).joints
-    pinned = problem.regression(fusion="covariance", epsilon=1e-9).step(*now).joints
+    information = problem.regression().estimate(*now).joints
+    pinned = problem.regression(fusion=CovarianceFusion(1e-9)).estimate(*now).joints
     assert (information - pinned).abs().max() > 1e-2
 
 
@@ -182,7 +188,7 @@ def test_twelve_by_seventeen_is_the_explicit_sum_of_the_design():
         precision += weight @ row.jacobian
         vector += weight @ (row.matrix @ mu + row.displacement + row.jacobian @ joints)
     assert problem.rows()[0].jacobian.shape == (12, 17)
-    estimate = problem.regression().step(torch.tensor(time), problem.state, problem.frames)
+    estimate = problem.regression().estimate(torch.tensor(time), problem.state, problem.frames)
     assert_close(estimate.joints, np.linalg.solve(precision, vector))
     assert_close(estimate.covariance, np.linalg.inv(precision))
 
@@ -194,12 +200,16 @@ def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
     mu = conditionals_of(problem.mixtures[0]).at(now[0])[0].numpy()
     limit = torch.from_numpy(linear @ mu + offset)
     distances = [
-        float((problem.regression(prior_std=std).step(*now).joints - limit).norm())
+        float(
+            (
+                problem.regression(fusion=InformationFusion(std)).estimate(*now).joints - limit
+            ).norm()
+        )
         for std in (10.0, 100.0, 1000.0)
     ]
     for near, nearer in itertools.pairwise(distances):
         assert nearer == pytest.approx(near / 100, rel=0.2)
-    printed = problem.regression(fusion="covariance").step(*now).joints
+    printed = problem.regression(fusion=CovarianceFusion()).estimate(*now).joints
     assert_close(printed, limit)
 
 
@@ -209,8 +219,8 @@ def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
 def test_activations_are_weights():
     problem = Problem.of(CASES["three"], 5, 3)
     for activation in ("time", "product"):
-        regression = problem.regression(activation=activation)
-        weights = regression.step(times(3), problem.state, problem.frames).activation
+        regression = problem.regression(fusion=form("covariance", activation))
+        weights = regression.estimate(times(3), problem.state, problem.frames).activation
         assert bool((weights >= 0).all())
         assert_close(weights.sum(-1), np.ones(3))
 
@@ -219,8 +229,8 @@ def test_activations_are_weights():
 def test_leaving_components_out_moves_the_mean_by_no_more_than_their_weight(threshold):
     problem = Problem.of(CASES["the paper's"], 5, seed=3)
     now = times(), problem.state, problem.frames
-    full = problem.regression(negligible=0.0).step(*now)
-    fewer = problem.regression(negligible=threshold).step(*now)
+    full = problem.regression(fusion=InformationFusion(negligible=0.0)).estimate(*now)
+    fewer = problem.regression(fusion=InformationFusion(negligible=threshold)).estimate(*now)
     dropped = fewer.activation == 0
     assert 0 < int(dropped.sum()) < 5
     assert bool((full.activation[dropped] < threshold * full.activation.max()).all())
@@ -234,8 +244,10 @@ def test_leaving_components_out_moves_the_mean_by_no_more_than_their_weight(thre
 def test_the_most_likely_component_is_never_left_out():
     problem = Problem.of(CASES["the paper's"], 5)
     now = times(), problem.state, problem.frames
-    best = problem.regression().step(*now).activation.argmax()
-    one = problem.regression(negligible=0.99).step(*now).activation
+    best = problem.regression().estimate(*now).activation.argmax()
+    one = (
+        problem.regression(fusion=InformationFusion(negligible=0.99)).estimate(*now).activation
+    )
     assert torch.equal(one, torch.eye(5, dtype=torch.float64)[best])
 
 
@@ -269,12 +281,12 @@ def flipped(local: Conditionals, starts: tuple[int, ...]) -> Conditionals:
     )
 
 
-@ACTIVATIONS
+@FORMS
 @pytest.mark.parametrize("name", ["the paper's", "three"])
-def test_signs_of_quaternions_mean_nothing(name, activation):
+def test_signs_of_quaternions_mean_nothing(name, fusion, activation):
     problem = Problem.of(CASES[name], 3, 2)
-    regression = problem.regression(activation=activation)
-    plain = regression.step(times(2), problem.state, problem.frames, candidates=True)
+    regression = problem.regression(fusion=form(fusion, activation))
+    plain = regression.estimate(times(2), problem.state, problem.frames, candidates=True)
     mixtures = [
         flipped(mixture, operator.quaternion_starts(regression.kinematics))
         for mixture, operator in zip(regression.conditionals, regression.operators, strict=True)
@@ -284,10 +296,10 @@ def test_signs_of_quaternions_mean_nothing(name, activation):
     frames = {OBJECT: Frame(pose.position, -pose.orientation)}
     other = replace(regression, conditionals=mixtures)
     for step in (
-        other.step(times(2), problem.state, problem.frames, candidates=True),
-        regression.step(times(2), state, problem.frames, candidates=True),
-        regression.step(times(2), problem.state, frames, candidates=True),
-        other.step(times(2), state, frames, candidates=True),
+        other.estimate(times(2), problem.state, problem.frames, candidates=True),
+        regression.estimate(times(2), state, problem.frames, candidates=True),
+        regression.estimate(times(2), problem.state, frames, candidates=True),
+        other.estimate(times(2), state, frames, candidates=True),
     ):
         assert_equal_estimates(step, plain)
 
@@ -295,7 +307,7 @@ def test_signs_of_quaternions_mean_nothing(name, activation):
 def test_each_component_has_its_own_sign():
     problem = Problem.of(CASES["the paper's"], 3)
     regression = problem.regression()
-    plain = regression.step(times(), problem.state, problem.frames)
+    plain = regression.estimate(times(), problem.state, problem.frames)
     first = flipped(regression.conditionals[0], BOTH_HANDS.quaternion_starts(None))
     mixed = Conditionals(
         *(
@@ -304,18 +316,18 @@ def test_each_component_has_its_own_sign():
         )
     )
     other = replace(regression, conditionals=[mixed, regression.conditionals[1]])
-    assert_equal_estimates(other.step(times(), problem.state, problem.frames), plain)
+    assert_equal_estimates(other.estimate(times(), problem.state, problem.frames), plain)
 
 
 @EVERY_CASE
-@ACTIVATIONS
-def test_a_batch_is_its_members_one_at_a_time(case, activation):
+@FORMS
+def test_a_batch_is_its_members_one_at_a_time(case, fusion, activation):
     problem = Problem.of(case, 3, 2, 3)
-    regression = problem.regression(activation=activation)
-    batch = regression.step(times(2, 3), problem.state, problem.frames, candidates=True)
+    regression = problem.regression(fusion=form(fusion, activation))
+    batch = regression.estimate(times(2, 3), problem.state, problem.frames, candidates=True)
     for index in np.ndindex(2, 3):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
-        single = regression.step(
+        single = regression.estimate(
             times(2, 3)[index], problem.state[index], frames, candidates=True
         )
         assert_close(batch.joints[index], single.joints)
@@ -330,10 +342,10 @@ def test_a_batch_is_its_members_one_at_a_time(case, activation):
 def test_many_times_and_many_frames_serve_one_state(case):
     problem = Problem.of(case, 2, 3)
     state, regression = problem.state[0], problem.regression()
-    batch = regression.step(times(3), state, problem.frames, candidates=True)
+    batch = regression.estimate(times(3), state, problem.frames, candidates=True)
     for index in range(3):
         frames = {name: frame[index] for name, frame in problem.frames.items()}
-        single = regression.step(times(3)[index], state, frames, candidates=True)
+        single = regression.estimate(times(3)[index], state, frames, candidates=True)
         assert_close(batch.joints[index], single.joints)
         for many, one in zip(batch.candidates, single.candidates, strict=True):
             assert_close(many.mean[index], one.mean)
@@ -342,21 +354,22 @@ def test_many_times_and_many_frames_serve_one_state(case):
 @EVERY_CASE
 def test_inference_mode_changes_nothing(case):
     problem = Problem.of(case, 3, 2)
-    plain = problem.regression().step(times(2), problem.state, problem.frames, candidates=True)
+    plain = problem.regression().estimate(
+        times(2), problem.state, problem.frames, candidates=True
+    )
     with torch.inference_mode():
         state = case.world.kinematics.state(problem.state.joints)
-        step = problem.regression().step(times(2), state, problem.frames, candidates=True)
+        step = problem.regression().estimate(times(2), state, problem.frames, candidates=True)
     assert_equal_estimates(step, plain, 0.0)
     assert not step.joints.requires_grad
 
 
 @pytest.mark.parametrize("name", ["the paper's", "both hands", "poses in two frames"])
-@FUSIONS
-@ACTIVATIONS
+@FORMS
 def test_single_precision_stays_single_and_near(name, fusion, activation):
     problem = Problem.of(CASES[name], 3, 2)
-    regression = problem.regression(fusion=fusion, activation=activation, epsilon=EPSILON)
-    exact = regression.step(times(2), problem.state, problem.frames, candidates=True)
+    regression = problem.regression(fusion=form(fusion, activation, EPSILON))
+    exact = regression.estimate(times(2), problem.state, problem.frames, candidates=True)
     kinematics = regression.kinematics.to(torch.float32)
     rounded = replace(
         regression,
@@ -366,7 +379,7 @@ def test_single_precision_stays_single_and_near(name, fusion, activation):
             for mixture in regression.conditionals
         ],
         log_weights=regression.log_weights.float(),
-    ).step(
+    ).estimate(
         times(2).float(),
         kinematics.state(problem.state.joints),
         {name: frame.to(torch.float32) for name, frame in problem.frames.items()},
@@ -378,11 +391,10 @@ def test_single_precision_stays_single_and_near(name, fusion, activation):
 
 
 @pytest.mark.parametrize("name", ["the paper's", "both hands", "poses in two frames"])
-@FUSIONS
-@ACTIVATIONS
+@FORMS
 def test_gradients_are_those_of_finite_differences(name, fusion, activation):
     problem = Problem.of(CASES[name], 2)
-    regression = problem.regression(fusion=fusion, activation=activation, epsilon=EPSILON)
+    regression = problem.regression(fusion=form(fusion, activation, EPSILON))
     mixture, pose = regression.conditionals[0], problem.frames[OBJECT]
     factor = torch.linalg.cholesky(mixture.covariance)
     joints = problem.state.joints.clone()
@@ -399,7 +411,7 @@ def test_gradients_are_those_of_finite_differences(name, fusion, activation):
         learned = replace(mixture, mean=mean, covariance=factor @ factor.mT)
         estimate = replace(
             regression, conditionals=[learned, *regression.conditionals[1:]]
-        ).step(
+        ).estimate(
             time,
             regression.kinematics.state(joints),
             {OBJECT: Frame(position, orientation)},
@@ -420,7 +432,9 @@ def test_a_component_without_variance_is_refused_with_advice():
         covariance=torch.zeros_like(regression.conditionals[0].covariance),
     )
     with pytest.raises(DataError, match=r"projected component .*2 of 2 .*reg_covar"):
-        replace(regression, conditionals=[flat]).step(times(), problem.state, problem.frames)
+        replace(regression, conditionals=[flat]).estimate(
+            times(), problem.state, problem.frames
+        )
 
 
 # Candidates: each operator's own estimate, and its share of each joint (fig. 6)
@@ -430,7 +444,7 @@ def test_a_component_without_variance_is_refused_with_advice():
 @FUSIONS
 def test_candidates_are_each_operators_own_projection(case, fusion):
     problem = Problem.of(case, 3, 2)
-    estimate = problem.regression(fusion=fusion).step(
+    estimate = problem.regression(fusion=form(fusion)).estimate(
         times(2), problem.state, problem.frames, candidates=True
     )
     assert len(estimate.candidates) == len(case.operators)
@@ -446,12 +460,14 @@ def test_candidates_are_each_operators_own_projection(case, fusion):
 
 def test_candidates_are_not_computed_unless_asked_for():
     problem = Problem.of(CASES["the paper's"], 2)
-    assert problem.regression().step(times(), problem.state, problem.frames).candidates == ()
+    assert (
+        problem.regression().estimate(times(), problem.state, problem.frames).candidates == ()
+    )
 
 
 def shares(case: Case, *batch: int) -> Tensor:
     problem = Problem.of(case, 3, *batch)
-    estimate = problem.regression().step(
+    estimate = problem.regression().estimate(
         times(*batch), problem.state, problem.frames, candidates=True
     )
     return torch.stack([candidate.share for candidate in estimate.candidates])
@@ -460,7 +476,7 @@ def shares(case: Case, *batch: int) -> Tensor:
 @pytest.mark.parametrize("name", ["canonical", "the paper's", "three", "poses in two frames"])
 def test_shares_are_fractions_of_the_marginal_precisions(name):
     problem = Problem.of(CASES[name], 3, 2)
-    estimate = problem.regression().step(
+    estimate = problem.regression().estimate(
         times(2), problem.state, problem.frames, candidates=True
     )
     variances = [c.covariance.diagonal(dim1=-2, dim2=-1) for c in estimate.candidates]

@@ -32,7 +32,7 @@ def recordings(spread):
 
 
 def fitted(operator, spread):
-    skill = TaskParameterizedGMM(4, [operator], HAND, robust=False, plausibility="ignore")
+    skill = TaskParameterizedGMM(4, [operator], HAND)
     return skill.fit(recordings(spread))
 
 
@@ -40,7 +40,7 @@ def fitted(operator, spread):
 @pytest.mark.parametrize("spread", [0.2, 0.5])
 def test_the_density_is_normalised_over_rotations(geometry, spread):
     """Over SO(3), whose volume is 8 pi^2, at one instant, by uniform rotations."""
-    regression = fitted(AbsoluteOrientation("hand", geometry=geometry), spread).regression()
+    regression = fitted(AbsoluteOrientation("hand", geometry=geometry), spread).skill
     rng = np.random.default_rng(0)
     count = 200_000
     q = quaternions.normalize(torch.from_numpy(rng.standard_normal((count, 4))))
@@ -68,8 +68,8 @@ def test_without_orientations_it_is_the_likelihood():
     shown = recordings(0.2)
     operator = RelativePosition("hand", "here")
     shown = [Demonstration(d.time, d.joints, {"here": Frame([0.0, 0.0, 0.0])}) for d in shown]
-    skill = TaskParameterizedGMM(3, [operator], HAND, plausibility="ignore").fit(shown)
+    skill = TaskParameterizedGMM(3, [operator], HAND).fit(shown)
     [block] = (torch.from_numpy(row) for row in skill._rows(shown[:1]))
-    regression = skill.regression()
+    regression = skill.skill
     found = rotation_log_density(regression, block[:, 0], [block[:, 1:]])
     assert torch.equal(found, regression.log_density(block[:, 0], [block[:, 1:]]))

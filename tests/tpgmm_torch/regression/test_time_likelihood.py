@@ -20,6 +20,7 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
+    InformationFusion,
     RelativePosition,
     Stack,
     TaskParameterizedGMM,
@@ -68,7 +69,7 @@ def exact(regression: Regression, times: torch.Tensor, **options) -> TimeLikelih
 def test_the_likelihood_is_the_mixtures_given_time(case: Case):
     problem = Problem.of(case, 4, 3)
     regression, joints = problem.regression(), problem.state.joints
-    likelihood = exact(regression, GRID, slack=0.0, negligible=0.0)
+    likelihood = exact(regression, GRID, slack=0.0, fusion=InformationFusion(negligible=0.0))
     got = likelihood(problem.state, problem.frames)
     assert got.shape == (3, 51)
     for robot in range(3):
@@ -80,12 +81,12 @@ def test_the_likelihood_is_the_mixtures_given_time(case: Case):
 
 def test_negligible_components_are_left_out():
     """At each time few of 8 components count; the others change nothing that is likely."""
-    regression, demonstration = small_bottle().regression(), few_bottles()[0]
+    regression, demonstration = small_bottle().skill, few_bottles()[0]
     times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 200, dtype=torch.float64)
     state = regression.kinematics.state(demonstration.joints)
     frames = dict(demonstration.frames)
     fast = regression.log_likelihood(times, state, frames).numpy()
-    every = exact(regression, times, negligible=0.0)(state, frames)
+    every = exact(regression, times, fusion=InformationFusion(negligible=0.0))(state, frames)
     likely = every > every.max(1, keepdims=True) - 10
     np.testing.assert_allclose(fast[likely], every[likely], atol=0.01)
     part = slice(20, 60)
@@ -97,14 +98,14 @@ def test_the_time_of_a_new_motion_is_found():
     """Of two tracked hands and a cup, any step of a motion never shown."""
     situation, wanted = new_handling()
     frames = {"cup": situation.frames["cup"]}
-    likelihood = hands().regression().log_likelihood(GRID, HANDS.state(wanted), frames)
+    likelihood = hands().skill.log_likelihood(GRID, HANDS.state(wanted), frames)
     found = GRID[likelihood.argmax(1)]
     assert (found - situation.time).abs().max() < 0.1
 
 
 def test_quaternions_of_the_other_sign_are_the_same_rotation():
     situation, wanted = new_handling()
-    regression, flipped = hands().regression(), wanted.clone()
+    regression, flipped = hands().skill, wanted.clone()
     flipped[:, 3:7] *= -1
     cup = situation.frames["cup"]
     one = regression.log_likelihood(GRID, HANDS.state(wanted), {"cup": cup})
@@ -116,7 +117,7 @@ def test_quaternions_of_the_other_sign_are_the_same_rotation():
 def test_operators_without_their_frames_are_left_out():
     """The right hand seen from the left one needs no cup."""
     _, wanted = new_handling()
-    regression, state = hands().regression(), HANDS.state(wanted)
+    regression, state = hands().skill, HANDS.state(wanted)
     observed = regression.observed(frozenset(HANDS.links))
     without = observed.log_likelihood(GRID, state, {}).numpy()
     alone = Regression(
@@ -138,7 +139,7 @@ def test_operators_without_their_frames_are_left_out():
 
 
 def test_observations_that_are_not_finite_leave_every_time_alike():
-    regression = small_bottle().regression()
+    regression = small_bottle().skill
     state = regression.kinematics.state(few_bottles()[0].joints[:2])
     position = torch.tensor([[0.45, 0.0, 0.15], [0.45, torch.nan, 0.15]], dtype=torch.float64)
     bottle = Frame([[0.0, 0.0, 0.0]] * 2)
@@ -162,12 +163,12 @@ def test_of_a_stack_the_observed_operators_are_kept():
     settings = {"n_components": 6, "robot": HANDS}
     model = TaskParameterizedGMM(operators=[both, Canonical()], **settings).fit(demonstrations)
     a, state = {"a": situation.frames["cup"]}, HANDS.state(wanted)
-    observed = model.regression().observed(frozenset((*HANDS.links, "a")))
-    [first, canonical] = model.regression().conditionals
+    observed = model.skill.observed(frozenset((*HANDS.links, "a")))
+    [first, canonical] = model.skill.conditionals
     columns = torch.tensor([0, 1, 2, 6, 7, 8])
     only = Stack(RelativePosition("left", "a"), RelativePosition("right", "a"))
     alone = replace(
-        model.regression(),
+        model.skill,
         operators=[only, Canonical()],
         conditionals=[first.marginal(columns), canonical],
     )
@@ -190,7 +191,7 @@ def test_robots_of_a_batch_are_what_they_are_alone(case: Case):
 
 def test_the_times_of_demonstrations_are_found():
     """Median error of the time of single postures, of all steps of four demonstrations."""
-    regression, errors = hands().regression(), []
+    regression, errors = hands().skill, []
     for demonstration in handlings():
         state = HANDS.state(demonstration.joints)
         got = regression.log_likelihood(GRID, state, dict(demonstration.frames))

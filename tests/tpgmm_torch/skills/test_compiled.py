@@ -16,6 +16,7 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
+    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Robot,
@@ -56,7 +57,7 @@ def fitted(robot: bool = True, parts: bool = False, **options: Any) -> Regressio
         operators = [[Canonical()], operators]
     settings = {"n_components": 3, "operators": operators, **options}
     model = TaskParameterizedGMM(robot=arm if robot else None, **settings)
-    return model.fit(demonstrations).regression()
+    return model.fit(demonstrations).skill
 
 
 def cup(*batch: int) -> dict[str, Frame]:
@@ -113,7 +114,7 @@ def test_other_inputs_are_given_to_the_plain_estimate(plain):
 
 
 def test_more_components_than_the_graph_takes_are_given_to_the_plain_estimate():
-    plain = fitted(negligible=1e-2)
+    plain = fitted(fusion=InformationFusion(negligible=1e-2))
     compiled = compile_skill(plain, backend="aot_eager")
     for time in (0.4, 50.0, 0.5):
         assert_same(compiled, plain, *at(time))

@@ -7,7 +7,7 @@ from sklearn.pipeline import make_pipeline
 
 from tests.support.errands import HAND, motion
 from tests.support.skills import generator
-from tpgmm_torch import Demonstration, Frame, OperatorSelection, Segmentation, Situation
+from tpgmm_torch import Demonstration, Frame, Segmentation, SelectOperators, Situation
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.events import find_boundaries, find_stops
@@ -146,7 +146,7 @@ def test_a_frame_that_is_passed_is_a_boundary():
     assert found.reasons_ == ("passing ring",)
     assert found.progress_[0] == pytest.approx(0.45, abs=0.04)
     assert Segmentation(HAND, selection=None).fit(passing()).n_parts_ == 1
-    strict = OperatorSelection(threshold=100.0)
+    strict = SelectOperators(threshold=100.0)
     assert Segmentation(HAND, selection=strict).fit(passing()).n_parts_ == 1
 
 

@@ -10,10 +10,15 @@ from tests.support.carrying import ARRIVES, HAND, HELD, LEAVES, LIFTS, PUTS, at_
 from tests.support.skills import few_bottles
 from tests.support.worlds import upper_body
 from tpgmm_torch import Demonstration, Frame, Hold, quaternions
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.operators import RelativePosition
 from tpgmm_torch.robots import Kinematics, Poses
-from tpgmm_torch.training.hold_detection import find_holds, holds_for
+from tpgmm_torch.training.hold_detection import (
+    attach_holds,
+    demonstrated_holds,
+    find_holds,
+    with_holds,
+)
 
 TIME = torch.linspace(0, 6, 121, dtype=torch.float64)
 
@@ -209,13 +214,14 @@ def test_they_are_found_given_or_none():
     seen_from_bottle, seen_from_tray = (
         [RelativePosition(HAND, name)] for name in ("bottle", "tray")
     )
-    assert holds_for("auto", demonstrations, seen_from_bottle, robot) == find_holds(
-        demonstrations, robot
-    )
-    assert holds_for("auto", demonstrations, seen_from_tray, robot) == ()
-    assert holds_for(None, demonstrations, seen_from_bottle, robot) == ()
-    assert holds_for([HELD], demonstrations, seen_from_bottle, robot) == (HELD,)
-    with pytest.raises(
-        UnknownNameError, match=r"'cup' is not in the demonstration \(hold cup@"
-    ):
-        holds_for([Hold("cup", HAND)], demonstrations, seen_from_bottle, robot)
+    held = attach_holds(demonstrations, robot)
+    assert {one.holds for one in held} == {find_holds(demonstrations, robot)}
+    assert demonstrated_holds(held, seen_from_bottle, robot) == held[0].holds
+    assert demonstrated_holds(held, seen_from_tray, robot) == ()
+    assert demonstrated_holds(with_holds(held, ()), seen_from_bottle, robot) == ()
+    with pytest.warns(PlausibilityWarning, match=r"attach_holds\(demonstrations, robot\)"):
+        assert demonstrated_holds(demonstrations, seen_from_bottle, robot) == ()
+    with pytest.raises(DataError, match="give all the same"):
+        demonstrated_holds([held[0], *demonstrations[1:]], seen_from_bottle, robot)
+    with pytest.raises(UnknownNameError, match=r"\(hold cup@"):
+        with_holds(held, [Hold("cup", HAND)])

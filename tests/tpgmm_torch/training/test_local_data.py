@@ -20,6 +20,10 @@ OPERATORS = [
 QUATERNIONS = [slice(1, 5), slice(9, 13)]
 
 
+def expected_of(motion):
+    return like([operator.local(motion, HAND) for operator in OPERATORS])
+
+
 def flipped(demonstration):
     """The same motion; every quaternion is its negative."""
     joints = demonstration.joints * torch.tensor([1.0, 1, 1, -1, -1, -1, -1])
@@ -55,7 +59,7 @@ def test_quaternions_lie_on_the_side_of_the_first_demonstration(share):
 def test_quaternions_lie_on_the_side_that_a_model_expects(sign):
     motion = turning(TIME, TIME / 2)
     [rows] = local_data([motion], OPERATORS, HAND)
-    templates = like(motion, OPERATORS, HAND)
+    templates = expected_of(motion)
     asked = []
 
     def expected(j, time):
@@ -74,7 +78,7 @@ def test_quaternions_lie_on_the_side_that_a_model_expects(sign):
 
 def test_at_equal_phase_the_ends_belong_together():
     motion = turning(TIME, TIME / 2)
-    expected = like(motion, OPERATORS, HAND)
+    expected = expected_of(motion)
     local = OPERATORS[0].local(motion, HAND)
     torch.testing.assert_close(expected(0, TIME[:14]), local[::3], rtol=0, atol=0)
     assert torch.equal(expected(1, TIME[:1])[0, :3], motion.joints[0, :3])
@@ -119,7 +123,7 @@ def test_a_demonstration_without_the_joints_of_the_robot_is_named():
     motion = turning(TIME, TIME / 2)
     for names, width in ((None, 6), (None, 8), (HAND.joint_names[:6], 6)):
         wrong = Demonstration(TIME, np.ones((40, width)), None, names)
-        with pytest.raises(ShapeError, match=f"demonstration 1 has {width} joints, .* has 7"):
+        with pytest.raises(ShapeError, match=f"a demonstration has {width} joints, .* has 7"):
             local_data([motion, wrong], OPERATORS, HAND)
     # further columns may stand beside those of the robot if their names say which are which
     wider = Demonstration(

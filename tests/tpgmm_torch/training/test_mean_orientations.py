@@ -12,16 +12,21 @@ from tests.support.worlds import LEFT, OBJECT, moved, upper_body
 from tpgmm_torch import (
     AbsoluteOrientation,
     Canonical,
+    Controller,
+    CovarianceFusion,
     Demonstration,
     Frame,
+    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Situation,
     Stack,
     TaskParameterizedGMM,
     quaternions,
+    save,
 )
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
@@ -56,7 +61,7 @@ def recordings(seed=0, count=8, spread=0.7, signs=True):
 
 
 def fitted(demonstrations, *operators, **settings):
-    settings = {"robust": False, "plausibility": "ignore", "blend": 0.0} | settings
+    settings = {"robust": False, "plausibility": "ignore"} | settings
     return TaskParameterizedGMM(5, operators, HAND, **settings).fit(demonstrations)
 
 
@@ -184,7 +189,7 @@ def one_gaussian(operator, mean, covariance, q0, precise):
     ]
     return TaskParameterizedGMM.from_parameters(
         [1.0], means, covariances, [0.0, 1.0], operators=[operator, Canonical()],
-        robot=upper_body(), keep_limits=False,
+        robot=upper_body(),
     )  # fmt: skip
 
 
@@ -225,7 +230,7 @@ def test_for_small_spread_it_agrees_with_the_quaternion_form():
 
 def test_the_density_is_normalised_over_rotations():
     """``N(y) / |J_l(y)|`` is a density on SO(3), whose volume is 8 pi^2 [rad^3]."""
-    regression = model(ABSOLUTE).regression()
+    regression = model(ABSOLUTE).skill
     rng = np.random.default_rng(0)
     q = quaternions.normalize(torch.from_numpy(rng.standard_normal((60_000, 4))))
     state = HAND.state(torch.cat((torch.zeros(60_000, 3), q), 1))
@@ -262,8 +267,8 @@ def test_gradients_are_finite_where_nothing_is_left_to_turn_and_elsewhere():
 
 def test_a_model_is_what_it_was_after_saving_it(tmp_path):
     skill = model(RELATIVE, ABSOLUTE)
-    skill.save(tmp_path / "skill")
-    again = TaskParameterizedGMM.load(tmp_path / "skill")
+    save(skill, tmp_path / "skill")
+    again = load_model(tmp_path / "skill")
     assert again.operators_ == skill.operators_
     shown = recordings(seed=3, count=2)
     np.testing.assert_array_equal(again.score_samples(shown), skill.score_samples(shown))
@@ -295,12 +300,16 @@ def test_orientations_that_never_vary_are_as_certain_as_in_four_coordinates():
 
 def test_the_time_of_a_product_is_refused():
     with pytest.raises(DataError, match="activation='time'"):
-        fitted(recordings(), ABSOLUTE, activation="product")
+        fitted(
+            recordings(),
+            ABSOLUTE,
+            fusion=CovarianceFusion(fusion=CovarianceFusion(activation="product")),
+        )
 
 
 def test_the_printed_fusion_agrees():
     start = torch.cat((torch.zeros(3).double(), mean_of(recordings())[0]))
-    printed = fitted(recordings(), ABSOLUTE, fusion="covariance", epsilon=1e-9)
+    printed = fitted(recordings(), ABSOLUTE, fusion=CovarianceFusion(1e-9))
     one, other = (reproduced(m, start, {}) for m in (printed, model(ABSOLUTE)))
     assert float(angles(one, other).max()) < 1e-3
 
@@ -320,7 +329,7 @@ def handling():
 
 
 def test_the_time_of_a_posture_is_found():
-    skill, demonstration = handling().regression(), few_bottles()[0]
+    skill, demonstration = handling().skill, few_bottles()[0]
     times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 400, dtype=torch.float64)
     state = skill.kinematics.state(demonstration.joints)
     found = times[skill.log_likelihood(times, state, dict(demonstration.frames)).argmax(1)]
@@ -329,11 +338,13 @@ def test_the_time_of_a_posture_is_found():
 
 
 def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
-    regression = model(RELATIVE, ABSOLUTE).regression()
+    regression = model(RELATIVE, ABSOLUTE).skill
     time, first = torch.linspace(0, 3, 76, dtype=torch.float64), regression.conditionals[0]
     marginals = TimeMarginals.of(regression.log_weights, first.time_mean, first.time_variance)
     parts = regression.kinematics, regression.operators, regression.conditionals, marginals
-    likelihood = TimeLikelihood(*parts, time, slack=0.0, negligible=0.0)
+    likelihood = TimeLikelihood(
+        *parts, time, slack=0.0, fusion=InformationFusion(negligible=0.0)
+    )
     shown = recordings(seed=4, count=1)[0]
     for state in (HAND.state(shown.joints[[7, 31]]), HAND.state(shown.joints[[11]])):
         got = likelihood(state, dict(shown.frames))
@@ -352,7 +363,7 @@ def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
 def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
     """Finite differences, far from what is wanted: the linearisation's Jacobian is exact."""
     skill = handling()
-    regression, time = skill.regression(), torch.tensor(4.4, dtype=torch.float64)
+    regression, time = skill.skill, torch.tensor(4.4, dtype=torch.float64)
     frame = few_bottles()[0].frames["bottle"]
     generator = torch.Generator().manual_seed(0)
     joints = few_bottles()[0].joints[:1].to(torch.float64)
@@ -373,8 +384,8 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
 def test_a_controller_and_a_batch_run_it():
     skill, shown = handling(), few_bottles()[0]
     frames = {"bottle": shown.frames["bottle"]}
-    one = skill.controller(shown.joints[0], frames, clock="even")
-    many = skill.controller(shown.joints[0].expand(3, -1), frames, clock="even")
+    one = Controller(skill.skill, shown.joints[0], frames, clock="even")
+    many = Controller(skill.skill, shown.joints[0].expand(3, -1), frames, clock="even")
     for _ in range(30):
         alone, together = one.step(0.04), many.step(0.04)
         torch.testing.assert_close(together.reference[1], alone.reference, rtol=0, atol=1e-9)
@@ -384,7 +395,7 @@ def test_a_controller_and_a_batch_run_it():
 
 def test_what_compiles_no_logarithms_says_so():
     with pytest.raises(DataError, match="geometry='quaternion'"):
-        compile_skill(handling().regression(), backend="eager")
+        compile_skill(handling().skill, backend="eager")
 
 
 def test_what_is_learned_later_lies_about_the_same_mean():

@@ -5,15 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
-from sklearn.model_selection import KFold
 
-from tests.support.skills import HANDLING, HANDS, canonical, handlings, hands_model, same, waves
+from tests.support.skills import HANDLING, HANDS, handlings, hands_model, waves
 from tpgmm_torch import Canonical, Frame
-from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
-from tpgmm_torch.model_selection import fit_folds
+from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.robots.joint_space import JointSpace
-from tpgmm_torch.training import training_rows
-from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
+from tpgmm_torch.training.outlying_demonstrations import (
+    drop_outliers,
+    outlying_demonstrations,
+)
 
 
 def misplaced(demonstration, shift=0.3):
@@ -92,76 +92,22 @@ def test_demonstrations_of_other_lengths_are_compared_at_equal_phase():
     assert episodes(shown) == [5]
 
 
-def test_they_are_left_out_with_one_warning_that_says_where():
+def test_they_are_dropped_with_one_warning_that_says_where():
     shown = some_misplaced(8, [5])
     with pytest.warns(PlausibilityWarning) as caught:
-        model = hands_model().fit(shown)
+        kept = drop_outliers(shown, HANDLING, HANDS)
     [told] = [w for w in caught if issubclass(w.category, PlausibilityWarning)]
-    assert "left out: 1 of 8 are unlike the others" in str(told.message)
+    assert "1 of 8 are unlike the others" in str(told.message)
     assert "demonstration 5 (" in str(told.message) and "@cup at " in str(told.message)
-    assert model.demonstration_weights_.tolist() == [1, 1, 1, 1, 1, 0, 1, 1]
+    assert kept == [*shown[:5], *shown[6:]]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        rest = hands_model().fit([*shown[:5], *shown[6:]])
-    same(model, rest, 1e-12)
-    assert model.summary_ == rest.summary_
+        assert len(drop_outliers(kept, HANDLING, HANDS)) == 7
 
 
-def test_all_are_learned_from_if_asked():
+def test_fit_learns_from_all_and_warns():
     shown = some_misplaced(8, [5])
-    everyone = hands_model(robust=False, plausibility="ignore").fit(shown)
-    assert everyone.demonstration_weights_.tolist() == [1] * 8
-    robust = hands_model(plausibility="ignore").fit(shown)
-    good = handlings(9)[8:]
+    with pytest.warns(PlausibilityWarning, match=r"demonstration 5 .*drop_outliers\("):
+        everyone = hands_model().fit(shown)
+    robust, good = hands_model().fit([*shown[:5], *shown[6:]]), handlings(9)[8:]
     assert robust.score(good) > everyone.score(good) + 5
-    with pytest.raises(PlausibilityError, match="demonstration 5"):
-        hands_model(plausibility="error").fit(shown)
-
-
-@pytest.mark.parametrize("wrong", [[5], [0, 6]])
-@pytest.mark.parametrize("longer", [0, 3])
-def test_batches_are_looked_at_together(wrong, longer):
-    shown = some_misplaced(8, wrong)
-    if longer:  # not on one grid: by points
-        time = torch.cat((shown[7].time, shown[7].time[-1] + shown[7].time[1 : 1 + longer]))
-        joints = torch.cat((shown[7].joints, shown[7].joints[-longer:]))
-        shown[7] = replace(shown[7], time=time, joints=joints)
-    told = [
-        rf"{len(wrong)} of 8 are unlike the others",
-        *(f"demonstration {i} " for i in wrong),
-    ]
-    with pytest.warns(PlausibilityWarning) as caught:
-        model = hands_model().fit([shown[:3], shown[3:4], shown[4:]])
-    said = str(caught.pop(PlausibilityWarning).message)
-    assert all(each in said for each in told)
-    weights = [float(i not in wrong) for i in range(8)]
-    assert model.demonstration_weights_.tolist() == weights
-    good = [one for one, weight in zip(shown, weights, strict=True) if weight]
-    rest = hands_model(robust=False, plausibility="ignore").fit([good[:4], good[4:]])
-    same(model, rest, 1e-9)
-    assert model.summary_ == rest.summary_
-
-
-def test_many_demonstrations_are_thinned_out(monkeypatch):
-    monkeypatch.setattr(training_rows, "LARGEST_TABLE", 1)
-    shown = some_misplaced(15, [3, 4, 11])
-    model = hands_model(plausibility="ignore").fit([shown[:7], shown[7:]])
-    assert (model.demonstration_weights_ == 0).nonzero()[:, 0].tolist() == [3, 4, 11]
-
-
-def test_weights_are_not_saved_with_a_model(tmp_path):
-    model = hands_model().fit(handlings(6))
-    model.save(tmp_path / "model")
-    assert type(model).load(tmp_path / "model").demonstration_weights_ is None
-
-
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_folds_leave_out_what_each_would_alone():
-    shown = some_misplaced(12, [5])
-    folds = [train for train, _ in KFold(2).split(shown)]
-    models = fit_folds(hands_model(), shown, folds)
-    for model, fold in zip(models, folds, strict=True):
-        own = [shown[index] for index in fold]
-        same(model, hands_model().fit(own), 1e-7)
-        assert model.demonstration_weights_.sum() == 6 - (5 in fold)
-    assert fit_folds(canonical(), waves(6), folds[:0]) == []

@@ -18,6 +18,7 @@ from tpgmm_datasets.checks.check import check
 from tpgmm_datasets.tables import trajectories_to_frame, write_table
 from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
 from tpgmm_tools.cli.application import explain
+from tpgmm_tools.cli.learning import prepared
 from tpgmm_tools.cli.options import ROBOTS, RobotOptions, align
 from tpgmm_tools.viewing import write_motion
 from tpgmm_torch import quaternions
@@ -26,6 +27,7 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 from tpgmm_torch.operators.text import default_operators, format_operator
+from tpgmm_torch.persistence import save
 
 __all__ = ["GENERATED", "UPLOADED", "Skill", "learn", "moved", "page", "places_of", "show"]
 
@@ -126,7 +128,8 @@ def learn(
             model = TaskParameterizedGMM(
                 int(n_components), operators, kinematics, random_state=0
             )
-            model.fit(align(read, "dtw", kinematics))
+            aligned = align(read, "dtw", kinematics)
+            model.fit(prepared(aligned, operators, kinematics))
     except Exception as error:
         return None, _refusal(error)
     seconds = [one.duration for one in read]
@@ -221,7 +224,7 @@ def show(
         return "", _refusal(error), []
     frames = situation.frames_at(trajectory.time)
     write_table(trajectories_to_frame([trajectory], [frames]), folder / "motion.csv")
-    skill.model.save(folder / "model")
+    save(skill.model, folder / "model")
     shutil.make_archive(str(folder / "model"), "zip", folder, "model")
     shutil.rmtree(folder / "model")
     line = f"{float(trajectory.time[-1] - trajectory.time[0]):.1f} s of motion."

@@ -6,21 +6,23 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import typer
 
 from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.signals import Signals
 from tpgmm_tools.cli import options
+from tpgmm_tools.cli.learning import Choices, learn, prepared
 from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.large_data.processes import joined_processes
-from tpgmm_torch.multimodal import MultimodalTaskParameterizedGMM
 from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
-from tpgmm_torch.structure.parts import parse_parts
+from tpgmm_torch.persistence import save
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
+from tpgmm_torch.training.hold_detection import with_holds
 
 __all__ = ["app"]
 
@@ -32,8 +34,7 @@ EXAMPLE = (
 )
 #: Parameters of the model that have an option below, or none.
 OTHERS = (
-    "n_components", "operators", "robot", "parts", "holds", "operator_weights", "plausibility",
-    "random_state", "warm_start", "verbose",
+    "n_components", "operators", "robot", "fusion", "random_state",
 )  # fmt: skip
 SETTINGS = options.options_of(TaskParameterizedGMM, "Learning", OTHERS)
 
@@ -55,6 +56,9 @@ def fit(
     parts: str | None = None,
     modes: Any = 1,
     random_state: int = 0,
+    fusion: Literal["information", "covariance"] = "information",
+    epsilon: float = 1e-4,
+    robust: bool = True,
     **settings: Any,
 ) -> None:
     """Learn a skill from a LeRobot data set.
@@ -101,61 +105,65 @@ def fit(
         --n-components and, with --operator auto, what matters in it: 'auto' finds and explains
         them; or when they end, as seconds and events joined by commas. See --alignment parts.
     modes : ``auto | INTEGER``
-        In how many ways the skill is done, each a model of its own; 'auto' finds it. 'tpgmm
-        reproduce' takes several as a whole, all else one of them, DIR/mode_0; a policy holds
-        them all.
+        In how many ways the skill is done, each a skill of its own; 'auto' finds it. The
+        situation decides which is gone.
     random_state : int
         Seed of what is random.
+    fusion : str
+        Form of the product of Gaussians; 'covariance' is the paper's, as printed.
+    epsilon : float >= 0
+        Regulariser of --fusion covariance, rad^2.
+    robust : bool
+        Leave out episodes that are unlike the others where these agree, with a warning.
     """
     write = model_format(format_)
-    if modes != 1 and batch_episodes is not None:
-        raise DataError("--modes compares all episodes: it goes without --batch-episodes")
+    choices = Choices(
+        operator == ["auto"], n_components == "auto", options.parse_parts(parts), modes
+    )
+    choices.check(batch_episodes)
     options.filter_plausibility(plausibility)
     robot = described.read()
-    holds = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
+    given = None if hold == ["none"] else [Hold.parse(text) for text in hold or ()]
+    holds = tuple(given or ()) if hold else None
+    operators = [parse_operator(text) for text in operator or () if text != "auto"]
     model = TaskParameterizedGMM(
-        n_components,
-        "auto" if operator == ["auto"] else [parse_operator(text) for text in operator or ()],
+        10 if choices.components else n_components,
+        operators,
         robot,
-        parts=parse_parts(parts),
-        holds=holds if hold else "auto",
-        plausibility=plausibility,
+        fusion=CovarianceFusion(epsilon) if fusion == "covariance" else InformationFusion(),
         random_state=random_state,
         **settings,
     )
     check_parameters(model)
-    given = data.arguments(robot)
+    about = data.arguments(robot)
     with joined_processes() as processes:
         episodes: Any
         if batch_episodes is None:
-            read = load_lerobot(dataset, **given)
-            aligned = options.align(read, alignment, robot)
-            frames, episodes = read[0].frames, processes.share(aligned)
+            read = load_lerobot(dataset, **about)
+            first, fitted = options.align(read, alignment, robot), None
         else:
-            first = next(iter(EpisodeBatches(dataset, batch_episodes, **given)))
-            read, aligned, frames = [], [], first[0].frames
-            batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **given)
-            episodes = Aligned(batches, options.aligner(alignment, robot), first)
-        if not model.operators:
+            read, first = [], next(iter(EpisodeBatches(dataset, batch_episodes, **about)))
+            fitted = options.aligner(alignment, robot)
+            fitted = fitted and fitted.fit(first)
+            first = fitted.transform(first) if fitted else first
+        if not operators:
             links = robot.links if robot is not None else ()
-            model.operators = default_operators(links, list(frames))
-        if modes == 1:
-            model.fit(episodes, processes=processes)
-        elif processes.count > 1:
-            raise DataError("--modes compares all episodes with each other, in one process")
-        else:
-            ways = MultimodalTaskParameterizedGMM(model, modes).fit(aligned)
-            assert ways.mode_selection_ is not None
-            typer.echo(f"{ways.mode_selection_.report()}\n")
-            model = ways if ways.n_modes_ > 1 else ways.models_[0]
+            model.operators = default_operators(links, list(first[0].frames))
+        kept = prepared(first, list(model.operators or ()), robot, robust, holds)
+        episodes = processes.share(kept)
+        if batch_episodes is not None:
+            batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **about)
+            episodes = Aligned(batches, fitted, kept[0].holds or ())
+        learned, reports = learn(model, episodes, choices, processes)
         if processes.rank > 0:
             return
     if write is None:
-        model.save(out)
+        save(learned, out)
     else:
-        write(model, out, Signals.of(dataset, **given))
-    if isinstance(model, TaskParameterizedGMM):
-        _report(model, read, aligned)
+        write(learned, out, Signals.of(dataset, **about))
+    _report(learned, read, kept)
+    for text in reports:
+        typer.echo(f"\n{text}\n")
     if processes.count > 1:
         typer.echo(f"processes        {processes.count}")
     typer.echo(f"saved            {out}")
@@ -170,21 +178,22 @@ class Aligned:
         To read.
     alignment : Alignment, Pipeline or None
         Fitted to the first of all batches.
-    first : sequence of Demonstration
-        That batch.
+    holds : tuple of Hold
+        Found in that batch.
     """
 
-    def __init__(self, batches: EpisodeBatches, alignment: Any, first: Any) -> None:
-        self.batches, self.alignment = batches, alignment and alignment.fit(first)
+    def __init__(self, batches: EpisodeBatches, alignment: Any, holds: Any) -> None:
+        self.batches, self.alignment, self.holds = batches, alignment, holds
 
     def __iter__(self) -> Iterator[Any]:
         """Read and align each."""
         for batch in self.batches:
-            yield self.alignment.transform(batch) if self.alignment else batch
+            aligned = self.alignment.transform(batch) if self.alignment else batch
+            yield with_holds(aligned, self.holds)
 
 
-def _report(model: TaskParameterizedGMM, read: Any, aligned: Any) -> None:
-    kinematics = model.kinematics_
+def _report(learned: Any, read: Any, aligned: Any) -> None:
+    skill = getattr(learned, "skill", learned)
     lines: dict[str, object] = {}
     if read:
         seconds = [one.duration for one in read]
@@ -192,30 +201,34 @@ def _report(model: TaskParameterizedGMM, read: Any, aligned: Any) -> None:
             f"{len(read)} of {min(seconds):.2f} to {max(seconds):.2f} s, "
             f"{sum(map(len, aligned))} steps after alignment"
         )
-    lines["joints"] = kinematics.n_joints
-    lines["links"] = ", ".join(kinematics.links) or "none"
-    lines["frames"] = ", ".join(model.frame_names_) or "none"
-    for number, operator in enumerate(model.operators_, start=1):
-        size = operator.dimension(kinematics)
-        lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"
-    for number, part in enumerate(model.parts_, start=1):
-        texts = ", ".join(map(format_operator, part.operators))
-        lines[f"part {number}"] = (
-            f"{part.begin:.2f} to {part.end:.2f} s, {part.n_components} components: {texts}"
-        )
-    for hold in model.holds_:
+    lines["joints"] = skill.kinematics.n_joints
+    lines["links"] = ", ".join(skill.kinematics.links) or "none"
+    lines["frames"] = ", ".join(skill.frame_names) or "none"
+    for hold in skill.holds:
         lines[f"{hold.frame} held"] = hold
-    converged = "converged" if model.converged_ else "not converged: raise --max-iter or --tol"
-    lines["components"] = f"{model.n_components_} ({model.covariance_type})"
-    lines["iterations"] = f"{model.n_iter_}, {converged}"
-    if read:
-        lines["log-likelihood"] = f"{model.score(aligned):.3f} per step"
-        lines["BIC"] = f"{model.bic(aligned):.0f}"
-    else:  # scoring would read all episodes once more
-        lines["bound of EM"] = f"{model.lower_bound_:.3f} per step"
+    for number, one in enumerate(getattr(learned, "skills", ()), start=1):
+        texts = ", ".join(map(format_operator, one.operators))
+        lines[f"{'part' if one.begin > skill.begin or number == 1 else 'way'} {number}"] = (
+            f"{one.begin:.2f} to {one.end:.2f} s, {len(one.log_weights)} components: {texts}"
+        )
+    if isinstance(learned, TaskParameterizedGMM):
+        lines |= _learning(learned, read, aligned)
     for name, text in lines.items():
         typer.echo(f"{name:<16} {text}")
-    selections = model.operator_selection_ or ()
-    found = [model.segmentation_] if model.segmentation_ is not None else []
-    for selection in [*found, *(selections if isinstance(selections, tuple) else [selections])]:
-        typer.echo(f"\n{selection.report()}\n")
+
+
+def _learning(model: TaskParameterizedGMM, read: Any, aligned: Any) -> dict[str, object]:
+    lines: dict[str, object] = {}
+    for number, operator in enumerate(model.operators_, start=1):
+        size = operator.dimension(model.kinematics_)
+        lines[f"operator {number}"] = f"{format_operator(operator)} ({size} coordinates)"
+    converged = "converged" if model.converged_ else "not converged: raise --max-iter or --tol"
+    lines["components"] = f"{len(model.weights_)} ({model.covariance_type})"
+    lines["iterations"] = f"{model.n_iter_}, {converged}"
+    if read:
+        rows = np.concatenate([one.numpy(force=True) for one in model.rows(aligned)])
+        lines["log-likelihood"] = f"{model.score(aligned):.3f} per step"
+        lines["BIC"] = f"{model.mixture_.bic(rows):.0f}"
+    else:  # scoring would read all episodes once more
+        lines["bound of EM"] = f"{model.lower_bound_:.3f} per step"
+    return lines

@@ -53,19 +53,21 @@ def plot(
         How episodes are brought onto one clock, as for 'tpgmm fit'.
     """
     from tpgmm_tools.plotting import figure, legend, plot_candidates, plot_local, save
+    from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.data.demonstrations import Situation
-    from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import UnknownNameError
     from tpgmm_torch.operators.text import format_operator
+    from tpgmm_torch.persistence import load_model
 
-    fitted = TaskParameterizedGMM.load(model, device="cpu")
+    fitted = load_model(model, device="cpu")
     kinematics = fitted.kinematics_
     for name in joint or ():
         if name not in kinematics.joint_names:
             raise UnknownNameError("joint", name, "the model", kinematics.joint_names)
     demonstrations = options.align(data.read(dataset, kinematics), alignment, kinematics)
     situation = Situation.of(demonstrations[0])
-    [trajectory] = fitted.predict([situation])
+    skill: Any = fitted.skill
+    [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
     shown: list[tuple[Any, Any, Any]] = [
         (trajectory, situation.frames_at(trajectory.time.cpu()), {})
     ]

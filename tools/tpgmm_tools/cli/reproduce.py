@@ -39,6 +39,7 @@ def reproduce(
     dataset: str | None = None,
     via: list[str] | None = None,
     fade: float = 1.0,
+    blend: float = 1.0,
 ) -> None:
     """Reproduce a skill in new situations.
 
@@ -58,30 +59,29 @@ def reproduce(
         Or a LeRobot data set: the situations of its episodes.
     via : ``VIA``
         A via-point, repeatable: TIME:OPERATOR=NUMBERS~TOLERANCE, as in
-        3.2:position:l_hand@bottle=0,0,0.1 or 3.2:canonical=l_elbow:0.4; in place of those that
-        were saved with the model.
+        3.2:position:l_hand@bottle=0,0,0.1 or 3.2:canonical=l_elbow:0.4.
     fade : float >= 0.001
         Seconds before and after a via-point that it changes.
+    blend : float >= 0
+        Seconds in which the start posture leads into the motion.
     """
+    from tpgmm_torch.control.rollout import rollout
+    from tpgmm_torch.control.situations import at_first
     from tpgmm_torch.exceptions import DataError, UnknownNameError
+    from tpgmm_torch.skills.via_points import ViaPoints
+    from tpgmm_torch.skills.ways import Ways
 
     if out.suffix not in FORMATS:
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
         raise DataError("give either --situations FILE.json or --dataset DATASET")
-    fitted = options.load(model)
-    several = hasattr(fitted, "models_")
-    if several and via:
-        raise DataError(f"--via is for one way, as {model / 'mode_0'}")
-    kinematics = (fitted.models_[0] if several else fitted).kinematics_
+    skill = options.load(model)
+    kinematics = skill.kinematics
     wanted, _ = options.wanted(situations, dataset, data, kinematics)
     if via:
-        fitted = fitted.with_via_points(via, fade)
-    choices: dict[str, Any] = {}
+        skill = ViaPoints(skill, via, fade)
     try:
-        if several:
-            choices["choices"] = fitted.choose(wanted)
-        trajectories = fitted.predict(wanted, candidates=False, **choices)
+        trajectories = rollout(skill, wanted, bounds="robot", blend=blend)
     except UnknownNameError as error:
         if error.kind != "frame" or dataset is None:
             raise
@@ -92,7 +92,9 @@ def reproduce(
     _write(trajectories, wanted, out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
-    for number, choice in enumerate(choices.get("choices", ())):
+    for number, one in enumerate(wanted if isinstance(skill, Ways) else ()):
+        situation = one.reordered(kinematics.joint_names)
+        [choice] = skill.choose(situation.joints, at_first(situation))
         typer.echo(f"{number:>4}  {choice}")
     typer.echo(f"written to {out}")
 

@@ -79,8 +79,8 @@ def view(
     import torch
 
     from tpgmm_tools.viewing import LiveView, parse_shape, write_motion, write_rerun
-    from tpgmm_torch.estimator import TaskParameterizedGMM
     from tpgmm_torch.exceptions import DataError
+    from tpgmm_torch.persistence import load_model
 
     # the matrices are small: a second thread on a busy machine only spins
     torch.set_num_threads(1)
@@ -96,7 +96,7 @@ def view(
         where, dataset = model / "model", dataset or str(model / "dataset")
     if situations is None and dataset is None:
         raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
-    fitted = TaskParameterizedGMM.load(where, device="cpu")
+    fitted = load_model(where, device="cpu")
     wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
     if (last := max(situation)) >= len(wanted) or min(situation) < 0:
         raise DataError(

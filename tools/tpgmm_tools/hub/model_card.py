@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
@@ -104,7 +105,7 @@ def _skill(model: Any) -> str:
         ("joints", ", ".join(robot.joint_names)),
         ("links", ", ".join(robot.links) or "none"),
         ("frames that it must be told", ", ".join(model.frame_names_) or "none"),
-        ("Gaussians", model.n_components_),
+        ("Gaussians", len(model.weights_)),
     ]
     rows += [("operator", f"`{format_operator(one)}`") for one in model.operators_]
     rows += [("held", str(hold)) for hold in model.holds_]
@@ -122,7 +123,8 @@ def _influence(model: Any) -> str:
         return "Not known: it depends on the situation, and what was shown is not kept."
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)
-        [trajectory] = model.predict([situation])
+        skill = model.skill
+        [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
     time = as_array(trajectory.time - trajectory.time[0])
     shares = np.stack([as_array(100 * c.share.mean(-1)) for c in trajectory.candidates], -1)
     spans = np.array_split(np.arange(len(time)), min(SPANS, len(time)))
@@ -143,7 +145,7 @@ def _influence(model: Any) -> str:
 
 def _middle(model: Any) -> Situation | None:
     """The situation amid those shown; None where they are not known."""
-    shown = model.summary_
+    shown = model.skill.summary
     if shown is None or not set(model.frame_names_) <= shown.frames.keys():
         return None
     joints = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
@@ -165,7 +167,7 @@ def _limits(model: Any) -> str:
         "limits. It does not see: it has to be told where the frames are. It knows nothing of "
         "collisions."
     )
-    shown = model.summary_
+    shown = model.skill.summary
     if shown is None:
         return f"{text} What was shown is not known."
     parts = [f"{text} `novelty` above 1 is further than any demonstration from the others."]
@@ -187,13 +189,10 @@ def _limits(model: Any) -> str:
 
 
 def _learning(model: Any) -> str:
-    weights, shown = model.demonstration_weights_, model.summary_
+    shown = model.skill.summary
     rows: list[tuple[str, object]] = []
     if shown is not None:
         rows.append(("demonstrations", shown.n_demonstrations))
-    if weights is not None and not bool(weights.all()):
-        left_out = (weights == 0).nonzero().flatten().tolist()
-        rows.append(("of these not learned from, unlike the others", left_out))
     rows.append(("iterations of EM", model.n_iter_))
     rows.append(("converged", "yes" if model.converged_ else "no"))
     if np.isfinite(model.lower_bound_):
@@ -203,10 +202,6 @@ def _learning(model: Any) -> str:
         (f"`{name}`", value)
         for name, value in model.get_params(deep=False).items()
         if name not in ELSEWHERE and str(value) != str(defaults[name].default)
-    ]
-    rows += [
-        (f"via-point at {point.time:g} s", format_operator(point.operator))
-        for point in model.via_points_
     ]
     return _table(("", ""), [*rows, ("tpgmm-torch", version("tpgmm-torch"))])
 

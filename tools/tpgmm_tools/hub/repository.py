@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from tpgmm_tools.hub.model_card import model_card
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
-from tpgmm_torch.persistence import CONFIG, TENSORS
+from tpgmm_torch.persistence import FILES, load_model, save
 
 if TYPE_CHECKING:
     from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -65,7 +66,7 @@ def push(
     """
     check_is_fitted(model)
     card = model_card(model, repo_id, measured=measured, notes=notes, license=license)
-    return upload(repo_id, model.save, card, private=private, token=token)
+    return upload(repo_id, partial(save, model), card, private=private, token=token)
 
 
 def load(
@@ -87,17 +88,15 @@ def load(
     token : str, optional
         By default the one of ``hf auth login``.
     custom, device : sequence of type, str, optional
-        As for :meth:`TaskParameterizedGMM.load`.
+        As for :func:`tpgmm_torch.load`.
 
     Raises
     ------
     ModelFileError, DependencyError
         If there is no such model, or huggingface_hub is not installed.
     """
-    from tpgmm_torch.estimator import TaskParameterizedGMM
-
-    folder = download(repo_id_or_folder, (CONFIG, TENSORS), revision=revision, token=token)
-    return TaskParameterizedGMM.load(folder, custom, device)
+    folder = download(repo_id_or_folder, FILES, revision=revision, token=token)
+    return load_model(folder, custom, device)
 
 
 def upload(

@@ -115,16 +115,10 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
         What it reproduced.
     """
     begin, end = float(model.time_[0]), float(model.time_[-1])
-    shown = {} if model.summary_ is None else model.summary_.events
+    summary = model.skill.summary
+    shown = {} if summary is None else summary.events
     events = {name: begin + share * (end - begin) for name, share in shown.items()}
-    named = []
-    for number, part in enumerate(model.parts_[1:], start=2):
-        # one that begins at an event was cut there, and is named after it
-        here = [n for n, at in events.items() if abs(at - part.begin) < SAME * (end - begin)]
-        reason = ", ".join(here) or ("" if part.reason == GIVEN else part.reason)
-        named.append((part.begin, f"part {number}: {reason}" if reason else f"part {number}"))
-        events = {name: at for name, at in events.items() if name not in here}
-    named += [(at, name) for name, at in events.items()]
+    named = [(at, name) for name, at in events.items()]
     first, last = float(trajectory.time[0]), float(trajectory.time[-1])
     return [Mark(at - first, label) for at, label in sorted(named) if first <= at <= last]
 

@@ -412,7 +412,7 @@ class LiveView:
         """Let a controller lead the robot, from the skill's start."""
         with self._lock:
             self.clock, self._posture = 0.0, self.situation.joints
-            self._controller = self._model.controller(self._posture, self._frames_now())
+            self._controller = Controller(self._model.skill, self._posture, self._frames_now())
             self._run.value = True
 
     def stop_controller(self) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tpgmm_tools.viewing.visuals import OBJECT_COLOR, OBJECT_OPACITY, Color, Shape, whole_body
 from tpgmm_torch import quaternions
+from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
@@ -172,7 +173,8 @@ class MotionScene:
 
     def draw(self, situation: Situation) -> Drawing:
         """Reproduce the skill in a ``situation``."""
-        [trajectory] = self.model.predict([situation])
+        skill = self.model.skill
+        [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
         time, joints = trajectory.time.cpu(), trajectory.joints.cpu()
         steps = _steps(time, self.fps)
         state = self._body.state(joints[steps])

@@ -11,25 +11,25 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
+from sklearn.base import BaseEstimator, clone
 
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
-from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.structure.operator_selection import candidate_operators
-from tpgmm_torch.training.hold_detection import holds_for
-from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.ways import Ways
+from tpgmm_torch.training.hold_detection import demonstrated_holds
+from tpgmm_torch.training.local_data import Motion, at_phases, local_data
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import comparable_coordinates
-from tpgmm_torch.training.training_rows import at_phases, typical_time
+from tpgmm_torch.training.training_rows import typical_time
 
-__all__ = ["ModeSelection"]
+__all__ = ["SelectWays"]
 
 #: Joints that hardly move are compared by this range [rad or m].
 SMALLEST_RANGE = 0.2
@@ -71,7 +71,7 @@ class _Split:
     stretch: int
 
 
-class ModeSelection(BaseEstimator):  # type: ignore[misc]
+class SelectWays(BaseEstimator):  # type: ignore[misc]
     """Find the ways in which demonstrations do a skill, such as left and right of an obstacle.
 
     Two ways are far apart somewhere, in units of how much demonstrations of one way differ
@@ -86,28 +86,26 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
 
     Parameters
     ----------
-    operators : sequence of Operator, optional
-        In whose coordinates; by default those that
-        :class:`~tpgmm_torch.structure.operator_selection.OperatorSelection` looks at.
-    robot : Kinematics, optional
-        What they act on.
-    n_modes : "auto" or int, default="auto"
+    model : TaskParameterizedGMM
+        Its operators' coordinates count, and each way is learned with its parameters.
+    n_ways : "auto" or int, default="auto"
         A number divides demonstrations into so many where that is plainest, whatever BIC says.
-    max_modes : int, default=4
+    max_ways : int, default=4
         At most so many at one place.
     shift : float, default=0.1
         Share of the duration by which demonstrations may be early or late.
-    holds : "auto", sequence of Hold or None, default="auto"
-        As in :class:`~tpgmm_torch.TaskParameterizedGMM`.
-    dtype : {"float64", "float32"}, default="float64"
-    device : str, default="cpu"
 
     Attributes
     ----------
-    n_modes_ : int
+    models_ : list of TaskParameterizedGMM
+        One per way, fitted.
+    skill_ : Ways, or Regression where there is one way
+        What runs.
+    best_model_ : Ways, or TaskParameterizedGMM where there is one way
+    n_ways_ : int
     labels_ : array of int, of shape (N,)
         The mode of each demonstration; mode 0 is that of the first one.
-    bic_ : array of shape (max_modes,)
+    bic_ : array of shape (max_ways,)
         Of 1, 2, ... modes where they are plainest; infinity for those that leave a mode less
         than two demonstrations.
 
@@ -123,42 +121,33 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
     ...     Demonstration(time, (side * np.sin(3 * time) + 0.02 * rng.normal())[:, None])
     ...     for side in (1, -1, 1, 1, -1, -1)
     ... ]
-    >>> selection = ModeSelection().fit(shown)
+    >>> selection = SelectWays(TaskParameterizedGMM(4)).fit(shown)
     >>> selection.labels_.tolist()
     [0, 1, 0, 0, 1, 1]
+    >>> [trajectory] = rollout(selection.skill_, [Situation([0.0])])
+    >>> bool(trajectory.joints.abs().max() > 0.9)
+    True
     """
 
     _parameter_constraints: dict[str, list[Any]] = {  # noqa: RUF012
-        "operators": ["array-like", None],
-        "robot": [Kinematics, None],
-        "n_modes": [Options("auto"), Interval(Integral, 1, None, closed="left")],
-        "max_modes": [Interval(Integral, 2, None, closed="left")],
+        "model": [TaskParameterizedGMM],
+        "n_ways": [Options("auto"), Interval(Integral, 1, None, closed="left")],
+        "max_ways": [Interval(Integral, 2, None, closed="left")],
         "shift": [Interval(Real, 0, 1, closed="left")],
-        "holds": [Options("auto"), "array-like", None],
-        "dtype": [Options("float64", "float32")],
-        "device": [str],
     }
 
     def __init__(
         self,
-        operators: Sequence[Operator] | None = None,
-        robot: Kinematics | None = None,
+        model: TaskParameterizedGMM,
+        n_ways: int | str = "auto",
         *,
-        n_modes: int | str = "auto",
-        max_modes: int = 4,
+        max_ways: int = 4,
         shift: float = 0.1,
-        holds: str | Sequence[Hold] | None = "auto",
-        dtype: str = "float64",
-        device: str = "cpu",
     ) -> None:
-        self.operators = operators
-        self.robot = robot
-        self.n_modes = n_modes
-        self.max_modes = max_modes
+        self.model = model
+        self.n_ways = n_ways
+        self.max_ways = max_ways
         self.shift = shift
-        self.holds = holds
-        self.dtype = dtype
-        self.device = device
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Find them.
@@ -178,11 +167,11 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
         ------
         DataError, ShapeError, UnknownNameError
             If demonstrations do not fit together, or with the operators and the robot, or are
-            too few for ``n_modes``.
+            too few for ``n_ways``.
         """
         check_parameters(self)
         known = check_demonstrations(X)
-        count, wanted = len(known), self.n_modes
+        count, wanted = len(known), self.n_ways
         if isinstance(wanted, Integral) and wanted > 1 and count < FEWEST * wanted:
             raise DataError(
                 f"{wanted} modes of at least {FEWEST} demonstrations each need "
@@ -190,11 +179,22 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
             )
         self._time = as_array(typical_time(known))
         self.labels_: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
-        self.bic_: Array = np.full(self.max_modes, np.inf)
+        self.bic_: Array = np.full(self.max_ways, np.inf)
         self._found: list[_Split] = []
         if count >= 2 * FEWEST and wanted != 1:
             self._divide(self._views(known))
-        self.n_modes_ = int(self.labels_.max()) + 1
+        self.n_ways_ = int(self.labels_.max()) + 1
+        members = [np.flatnonzero(self.labels_ == way) for way in range(self.n_ways_)]
+        shown = [[known[index] for index in own] for own in members]
+        self.models_ = [clone(self.model).fit(own) for own in shown]
+        self.skill_: Ways | Regression = self.models_[0].skill
+        if self.n_ways_ > 1:
+            pairs = list(zip(self.models_, shown, strict=True))
+            limits = [max(_surprise(model.skill, one) for one in own) for model, own in pairs]
+            weights = [len(own) / len(known) for own in members]
+            skills = tuple(model.skill for model in self.models_)
+            self.skill_ = Ways(skills, tuple(weights), tuple(limits))
+        self.best_model_ = self.models_[0] if self.n_ways_ == 1 else self.skill_
         return self
 
     def report(self) -> str:
@@ -205,12 +205,12 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
         NotFittedError
         """
         if not hasattr(self, "labels_"):
-            raise NotFittedError("this ModeSelection is not fitted yet: call fit(...)")
+            raise NotFittedError("this SelectWays is not fitted yet: call fit(...)")
         count = len(self.labels_)
-        if self.n_modes_ == 1:
+        if self.n_ways_ == 1:
             return f"1 way: nowhere do the {count} demonstrations differ as several ways would"
-        lines = [f"{self.n_modes_} ways:"]
-        for mode in range(self.n_modes_):
+        lines = [f"{self.n_ways_} ways:"]
+        for mode in range(self.n_ways_):
             members = np.flatnonzero(self.labels_ == mode)
             names = ", ".join(map(str, members))
             lines.append(f"  {mode}  {len(members)} of {count} demonstrations: {names}")
@@ -226,13 +226,11 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
         return "\n".join(lines)
 
     def _views(self, known: Sequence[Demonstration]) -> list[_View]:
-        given = self.operators
-        if given is None:
-            given = candidate_operators(self.robot, known[0])
-        operators = check_operators(given)
-        kinematics = kinematics_for(known, operators, self.robot, self.dtype, self.device)
-        holds = holds_for(self.holds, known, operators, kinematics)
-        operators = with_mean_orientations(operators, known, kinematics, holds)
+        operators, robot = check_operators(self.model.operators), self.model.robot
+        kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
+        holds = demonstrated_holds(known, operators, kinematics)
+        motions = [Motion.of(one, kinematics, holds) for one in known]
+        operators = with_mean_orientations(operators, motions, kinematics)
         rows = local_data(known, operators, kinematics, holds=holds)
         data = torch.stack([at_phases(row, len(self._time)) for row in rows])
         return [
@@ -244,7 +242,7 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
 
     def _divide(self, views: Sequence[_View]) -> None:
         """Divide all demonstrations, and the parts again until none falls apart."""
-        given = None if isinstance(self.n_modes, str) else int(self.n_modes)
+        given = None if isinstance(self.n_ways, str) else int(self.n_ways)
         parts, whole = [np.arange(len(self.labels_))], []
         while parts:
             members = parts.pop(0)
@@ -273,7 +271,7 @@ class ModeSelection(BaseEstimator):  # type: ignore[misc]
             for stretch in range(values.shape[1])
         ]
         cost = math.log(max(sum(len(axes) for _, _, axes in places), 1))
-        most = min(given or self.max_modes, count // FEWEST)
+        most = min(given or self.max_ways, count // FEWEST)
         splits = []
         for view, stretch, axes in places:
             for along in axes:
@@ -398,3 +396,9 @@ def _situational(split: _Split, shown: Sequence[tuple[_View, Array]]) -> bool:
         for along in _axes(view.values[:, 0])
     ]
     return max(gains) > SITUATION * split.gain
+
+
+def _surprise(skill: Regression, demonstration: Demonstration) -> float:
+    """The largest surprise of a demonstration that a skill was learned from [nats]."""
+    motion = Motion.of(demonstration, skill.kinematics, skill.holds)
+    return float(skill.surprise(motion.time, motion.state.joints, motion.frames).max())

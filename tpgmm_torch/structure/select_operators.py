@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 
-from tpgmm_torch.constraints import Interval, Options, check_parameters
+from tpgmm_torch.constraints import Interval, check_parameters
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.operators import (
@@ -30,11 +29,11 @@ from tpgmm_torch.operators import (
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.evidence import Evidence, gather_evidence
-from tpgmm_torch.training.hold_detection import holds_for
+from tpgmm_torch.training.hold_detection import demonstrated_holds
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
-__all__ = ["Judgement", "OperatorSelection", "arranged", "candidate_operators"]
+__all__ = ["Judgement", "SelectOperators", "arranged", "candidate_operators"]
 
 #: Of two, one is left to learn from, and has no variance.
 FEWEST = 3
@@ -78,7 +77,7 @@ class Judgement:
     unit: str
 
 
-class OperatorSelection(BaseEstimator):  # type: ignore[misc]
+class SelectOperators(BaseEstimator):  # type: ignore[misc]
     """Find the operators that matter among candidates, as the demonstrations tell.
 
     A candidate matters if a demonstration that was left out is more likely with it than
@@ -87,7 +86,8 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     every kind compare. From the joints' operators, the candidate that gains most is added
     until none gains ``threshold``; then what gains less, given all others, is dropped. Several
     that say the same leave one; an operator of all joints stays, as it decides what the others
-    leave free.
+    leave free. Demonstrations unlike the others as a candidate sees them do not count, and
+    objects are held as the demonstrations' ``holds`` say.
 
     Parameters
     ----------
@@ -105,13 +105,6 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         gains about ``s D log r``: three coordinates ten times more exactly, for 4 % of it.
     n_instants : int, default=50
         At how many instants the demonstrations are looked at.
-    holds : "auto", sequence of Hold or None, default="auto"
-        As in :class:`TaskParameterizedGMM`.
-    robust : bool, default=True
-        Whether to look away from demonstrations that are unlike the others as a candidate sees
-        them (``outlying_demonstrations``): one frame in a wrong place hides that it matters.
-    dtype : {"float64", "float32"}, default="float64"
-    device : str, default="cpu"
 
     Attributes
     ----------
@@ -139,7 +132,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
 
     Examples
     --------
-    >>> from tpgmm_torch import Demonstration, Frame, OperatorSelection
+    >>> from tpgmm_torch import Demonstration, Frame, SelectOperators
     >>> from tpgmm_torch.robots import Poses
     >>> time, rng = np.linspace(0, 1, 30), np.random.default_rng(0)
     >>> shown = []
@@ -147,7 +140,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     ...     cup, lamp = rng.uniform(-0.3, 0.3, (2, 3))
     ...     path = time[:, None] * cup + 0.002 * rng.normal(size=(30, 3))
     ...     shown.append(Demonstration(time, path, {"cup": Frame(cup), "lamp": Frame(lamp)}))
-    >>> found = OperatorSelection(robot=Poses(["hand"], orientation=False)).fit(shown)
+    >>> found = SelectOperators(robot=Poses(["hand"], orientation=False)).fit(shown)
     >>> [one.frame for one in found.operators_[:-1]]
     ['cup']
     """
@@ -158,10 +151,6 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         "tolerance": [Interval(Real, 0, None, closed="neither")],
         "threshold": [Interval(Real, 0, None, closed="left")],
         "n_instants": [Interval(Integral, 2, None, closed="left")],
-        "holds": [Options("auto"), "array-like", None],
-        "robust": ["boolean"],
-        "dtype": [Options("float64", "float32")],
-        "device": [str],
     }
 
     def __init__(
@@ -172,20 +161,12 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         tolerance: float = 0.005,
         threshold: float = 0.25,
         n_instants: int = 50,
-        holds: str | Sequence[Hold] | None = "auto",
-        robust: bool = True,
-        dtype: str = "float64",
-        device: str = "cpu",
     ) -> None:
         self.candidates = candidates
         self.robot = robot
         self.tolerance = tolerance
         self.threshold = threshold
         self.n_instants = n_instants
-        self.holds = holds
-        self.robust = robust
-        self.dtype = dtype
-        self.device = device
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Find which candidates matter.
@@ -215,17 +196,16 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
             )
         given = self.candidates
         if given is None:
-            given = candidate_operators(self.robot, demonstrations[0])
             # what is held is a thing of its own, to be brought to a place
-            _, holds = self._held(demonstrations, given)
-            carried = list(dict.fromkeys(hold.frame for hold in holds))
+            carried = list(dict.fromkeys(one.frame for one in demonstrations[0].holds or ()))
             given = candidate_operators(self.robot, demonstrations[0], carried)
         operators = check_operators(given)
-        kinematics, holds = self._held(demonstrations, operators)
-        if self.robust:
-            outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
-            left_out = {one.episode for one in outlying}
-            demonstrations = [d for i, d in enumerate(demonstrations) if i not in left_out]
+        kinematics = kinematics_for(demonstrations, operators, self.robot, "float64", "cpu")
+        holds = demonstrated_holds(demonstrations, operators, kinematics)
+        # one frame in a wrong place hides that it matters
+        outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
+        unlike = {one.episode for one in outlying}
+        demonstrations = [d for i, d in enumerate(demonstrations) if i not in unlike]
         evidence = gather_evidence(
             demonstrations,
             operators,
@@ -243,15 +223,6 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
         self.operators_ = arranged([operators[j] for j in chosen])
         self._judge(evidence, chosen, joints, kinematics)
         return self
-
-    def _held(
-        self, demonstrations: Sequence[Demonstration], operators: Sequence[Operator]
-    ) -> tuple[Kinematics, tuple[Hold, ...]]:
-        """What moves, and what it held."""
-        kinematics = kinematics_for(
-            demonstrations, operators, self.robot, self.dtype, self.device
-        )
-        return kinematics, holds_for(self.holds, demonstrations, operators, kinematics)
 
     def get_support(self, indices: bool = False) -> NDArray[Any]:
         """Which candidates matter, as scikit-learn's selectors say it.
@@ -377,7 +348,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
     def _check_fitted(self) -> None:
         if not hasattr(self, "support_"):
             raise NotFittedError(
-                "this OperatorSelection is not fitted yet: call fit(demonstrations)"
+                "this SelectOperators is not fitted yet: call fit(demonstrations)"
             )
 
     def __sklearn_tags__(self) -> Any:
@@ -389,7 +360,7 @@ class OperatorSelection(BaseEstimator):  # type: ignore[misc]
 def candidate_operators(
     kinematics: Kinematics | None, demonstration: Demonstration, held: Sequence[str] = ()
 ) -> list[Operator]:
-    """What :class:`OperatorSelection` chooses from where nothing is named.
+    """What :class:`SelectOperators` chooses from where nothing is named.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.support.skills import hands, small_bottle
-from tpgmm_torch import Frame, ViaPoint
+from tpgmm_torch import Frame, ViaPoint, ViaPoints
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 
@@ -57,7 +57,7 @@ def test_some_joints_go_by_name():
 )
 def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
     with pytest.raises(error, match=message):
-        small_bottle().with_via_points([ViaPoint(*arguments)])
+        ViaPoints(small_bottle().skill, [ViaPoint(*arguments)])
 
 
 @pytest.mark.parametrize(
@@ -76,6 +76,6 @@ def test_what_is_none_is_refused(arguments):
 
 
 def test_a_step_refuses_via_points():
-    model = hands().with_via_points(["1:position:left=0,0,0"])
+    model = ViaPoints(hands().skill, ["1:position:left=0,0,0"])
     with pytest.raises(DataError, match="controller"):
         model.step(0.5, torch.zeros(14))

@@ -10,7 +10,7 @@ from tests.support.skills import few_bottles
 from tests.support.two_ways import ARM, TIME, Handles, Obstacle, shown
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import upper_body
-from tpgmm_torch import Canonical, Demonstration, Frame, ModeSelection, RelativePosition
+from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, SelectWays
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.robots import Poses
@@ -37,8 +37,8 @@ def paths(offsets, seed=0, noise=0.01):
 def test_both_ways_are_found_and_who_went_which(task):
     for seed in range(2):
         demonstrations, sides = shown(task, seed)
-        selection = ModeSelection(task.operators, ARM).fit(demonstrations)
-        assert selection.n_modes_ == 2
+        selection = SelectWays(task().model()).fit(demonstrations)
+        assert selection.n_ways_ == 2
         assert same_partition(selection.labels_, sides)
         assert selection.labels_[0] == 0
         assert selection.bic_.argmin() == 1
@@ -50,30 +50,30 @@ def test_one_way_is_one_mode_for_any_number_of_demonstrations(task):
     for side in (1, -1):
         members = [one for one, s in zip(demonstrations, sides, strict=True) if s == side]
         for n in range(2, len(members) + 1):
-            assert ModeSelection(task.operators, ARM).fit(members[:n]).n_modes_ == 1
+            assert SelectWays(task().model()).fit(members[:n]).n_ways_ == 1
 
 
 def test_candidates_see_both_ways_where_no_operators_are_named():
     demonstrations, sides = shown(Obstacle)
-    selection = ModeSelection(robot=ARM).fit(demonstrations)
+    selection = SelectWays(Obstacle().model()).fit(demonstrations)
     assert same_partition(selection.labels_, sides)
 
 
 def test_the_order_of_demonstrations_does_not_matter():
     demonstrations, _ = shown(Obstacle)
     order = np.random.default_rng(0).permutation(len(demonstrations))
-    first = ModeSelection(Obstacle.operators, ARM).fit(demonstrations)
-    other = ModeSelection(Obstacle.operators, ARM).fit([demonstrations[i] for i in order])
+    first = SelectWays(Obstacle.operators, ARM).fit(demonstrations)
+    other = SelectWays(Obstacle.operators, ARM).fit([demonstrations[i] for i in order])
     assert same_partition(first.labels_[order], other.labels_)
     np.testing.assert_allclose(other.bic_, first.bic_, rtol=1e-6)
 
 
 def test_skills_of_one_way_are_one_mode():
     bottles = LinearTimeNormalization().fit_transform(few_bottles())
-    assert ModeSelection(bottle_operators(), upper_body()).fit(bottles).n_modes_ == 1
+    assert SelectWays(bottle_operators(), upper_body()).fit(bottles).n_ways_ == 1
     for seed in range(2):
         planted = PlantedTask(seed, 2).demonstrations(6)
-        assert ModeSelection(robot=HAND).fit(planted).n_modes_ == 1
+        assert SelectWays(robot=HAND).fit(planted).n_ways_ == 1
 
 
 @pytest.mark.parametrize(
@@ -81,13 +81,13 @@ def test_skills_of_one_way_are_one_mode():
 )
 def test_more_than_two_ways_are_found(offsets):
     labels = np.arange(5 * len(offsets)) % len(offsets)
-    selection = ModeSelection().fit(paths(np.array(offsets)[labels]))
+    selection = SelectWays().fit(paths(np.array(offsets)[labels]))
     assert same_partition(selection.labels_, labels)
 
 
 def test_a_way_shown_once_is_none():
-    assert ModeSelection().fit(paths([0.5] * 9 + [-0.5])).n_modes_ == 1
-    assert ModeSelection().fit(paths([0.5] * 8 + [-0.5] * 2)).n_modes_ == 2
+    assert SelectWays().fit(paths([0.5] * 9 + [-0.5])).n_ways_ == 1
+    assert SelectWays().fit(paths([0.5] * 8 + [-0.5] * 2)).n_ways_ == 2
 
 
 def test_what_differs_by_when_it_is_done_is_one_way():
@@ -96,8 +96,8 @@ def test_what_differs_by_when_it_is_done_is_one_way():
     gripper = [
         Demonstration(TIME, (TIME / TIME[-1] > when).astype(float)[:, None]) for when in closing
     ]
-    assert ModeSelection().fit(gripper).n_modes_ == 1
-    assert ModeSelection(shift=0.0).fit(gripper).n_modes_ > 1
+    assert SelectWays().fit(gripper).n_ways_ == 1
+    assert SelectWays(shift=0.0).fit(gripper).n_ways_ > 1
 
 
 def test_what_the_situation_shows_is_one_way():
@@ -107,30 +107,30 @@ def test_what_the_situation_shows_is_one_way():
     s = np.sin(np.pi / 2 * TIME / TIME[-1])[:, None]
     going = [Demonstration(TIME, s * place, {"cup": Frame(place)}) for place in places]
     operators = [RelativePosition("hand", "cup"), Canonical()]
-    assert ModeSelection(operators, POINT).fit(going).n_modes_ == 1
-    assert ModeSelection([Canonical()], POINT).fit(going).n_modes_ == 2  # who does not see it
+    assert SelectWays(operators, POINT).fit(going).n_ways_ == 1
+    assert SelectWays([Canonical()], POINT).fit(going).n_ways_ == 2  # who does not see it
 
 
 def test_a_number_of_modes_may_be_given():
     demonstrations = paths([0.5] * 3 + [-0.5] * 3)
-    assert ModeSelection(n_modes=1).fit(demonstrations).n_modes_ == 1
-    assert ModeSelection(n_modes=3).fit(demonstrations).n_modes_ == 3
-    two = ModeSelection(n_modes=2).fit(paths(np.linspace(-1, 1, 6)))
+    assert SelectWays(n_ways=1).fit(demonstrations).n_ways_ == 1
+    assert SelectWays(n_ways=3).fit(demonstrations).n_ways_ == 3
+    two = SelectWays(n_ways=2).fit(paths(np.linspace(-1, 1, 6)))
     assert two.labels_.tolist() == [0, 0, 0, 1, 1, 1]
     with pytest.raises(
         DataError, match="3 modes of at least 2 demonstrations each need 6, got 4"
     ):
-        ModeSelection(n_modes=3).fit(demonstrations[:4])
+        SelectWays(n_ways=3).fit(demonstrations[:4])
 
 
 def test_the_report_says_who_where_and_when():
-    selection = ModeSelection().fit(paths([0.5, -0.5] * 4))
+    selection = SelectWays().fit(paths([0.5, -0.5] * 4))
     lines = selection.report().splitlines()
     assert lines[0] == "2 ways:"
     assert lines[1] == "  0  4 of 8 demonstrations: 0, 2, 4, 6"
     assert lines[3].startswith("  seen by canonical, plainest from 1.")
     assert "standard deviations apart" in lines[3]
-    assert ModeSelection().fit(paths([0.5] * 4)).report().startswith("1 way: nowhere")
+    assert SelectWays().fit(paths([0.5] * 4)).report().startswith("1 way: nowhere")
     with pytest.raises(NotFittedError):
         clone(selection).report()
 
@@ -138,6 +138,6 @@ def test_the_report_says_who_where_and_when():
 def test_units_do_not_matter():
     demonstrations = paths([0.5] * 4 + [-0.5] * 4)
     large = [Demonstration(d.time, 1e3 * d.joints) for d in demonstrations]
-    first, other = (ModeSelection().fit(one) for one in (demonstrations, large))
+    first, other = (SelectWays().fit(one) for one in (demonstrations, large))
     np.testing.assert_array_equal(first.labels_, other.labels_)
     assert torch.tensor(first.bic_).argmin() == torch.tensor(other.bic_).argmin()

@@ -48,8 +48,8 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import Residual
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.regression.via_points import ViaPoint
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.via_point import ViaPoint
 
 __all__ = ["Conditioning", "covariance_between", "wendland"]
 

@@ -7,15 +7,19 @@ import torch
 
 from tests.support.skills import bottle_demonstrations, handlings, hands, small_bottle, waves
 from tpgmm_torch import (
+    Controller,
     Frame,
     Situation,
     TaskParameterizedGMM,
     ViaPoint,
+    ViaPoints,
     quaternions,
+    save,
 )
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.operators.text import parse_operator
-from tpgmm_torch.regression.conditioning import covariance_between, wendland
+from tpgmm_torch.persistence import load_model
+from tpgmm_torch.skills.conditioning import covariance_between, wendland
 
 GRID = torch.linspace(0, 5, 251, dtype=torch.float64)
 
@@ -88,7 +92,7 @@ def test_the_correlation_falls_smoothly_to_zero():
 @pytest.mark.parametrize("when", [2.0, 3.8])
 def test_a_pose_is_met_exactly_and_the_rest_is_as_it_was(when):
     pose = at_hand(when, [0.03, 0.0, 0.02], [0.1, 0.1, 0.0])
-    model = small_bottle().with_via_points([ViaPoint(when, "pose:l_hand", pose)])
+    model = ViaPoints(small_bottle().skill, [ViaPoint(when, "pose:l_hand", pose)])
     [bent] = model.predict([situation()], candidates=False)
     before, step = free(), int((when - GRID).abs().argmin())
     hand = model.kinematics_.state(bent.joints[step]).pose("l_hand")
@@ -112,7 +116,7 @@ def test_within_one_sigma_of_the_path_everything_is():
     draw = torch.ones(17, dtype=torch.float64) / math.sqrt(17)
     posture = before.joints[step] + torch.linalg.cholesky(before.covariance[step]) @ draw
     via = ViaPoint(float(GRID[step]), "canonical", posture)
-    model = small_bottle().with_via_points([via])
+    model = ViaPoints(small_bottle().skill, [via])
     [bent] = model.predict([situation()], candidates=False)
     assert float((bent.joints[step] - posture).abs().max()) < 1e-4
     assert float(whitened(bent.joints - before.joints, before.covariance).max()) < 1.05
@@ -124,7 +128,7 @@ def test_a_tolerance_is_a_compromise():
     reached = []
     for tolerance in (1e-4, 1e-2, 1.0):
         via = ViaPoint(when, "position:l_hand", position, tolerance)
-        model = small_bottle().with_via_points([via])
+        model = ViaPoints(small_bottle().skill, [via])
         [bent] = model.predict([situation()], candidates=False)
         hand = model.kinematics_.state(bent.joints[step]).pose("l_hand").position
         reached.append(float((hand - position).norm()))
@@ -146,7 +150,7 @@ def test_some_joints_and_two_hands_and_several_times():
         ViaPoint(3.0, seen, raised),
         ViaPoint(3.0, "position:r_hand", right),
     ]
-    [bent] = small_bottle().with_via_points(points).predict([situation()], candidates=False)
+    [bent] = ViaPoints(small_bottle().skill, points).predict([situation()], candidates=False)
     state = kinematics.state(bent.joints[150])
     assert float((seen.coordinates(state, frames) - raised).norm()) < 1e-4
     assert float((state.pose("r_hand").position - right).norm()) < 1e-4
@@ -155,7 +159,7 @@ def test_some_joints_and_two_hands_and_several_times():
 
 def test_robots_of_a_batch_do_not_know_of_each_other():
     pose = at_hand(3.0, [0.0, 0.0, 0.02], [0.0, 0.0, 0.0])
-    model = small_bottle().with_via_points([ViaPoint(3.0, "position:l_hand", pose.position)])
+    model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", pose.position)])
     both = model.predict([situation(2), situation(1)], candidates=False)
     [alone] = model.predict([situation(1)], candidates=False)
     assert torch.allclose(both[1].joints, alone.joints, atol=1e-7)
@@ -163,12 +167,12 @@ def test_robots_of_a_batch_do_not_know_of_each_other():
 
 def test_a_controller_that_localizes_passes_too():
     pose = at_hand(3.0, [0.0, 0.0, 0.03], [0.0, 0.0, 0.0])
-    model = small_bottle().with_via_points([ViaPoint(3.0, "position:l_hand", pose.position)])
+    model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", pose.position)])
     start = situation()
-    controller = model.controller(start.joints, start.frames)
+    controller = Controller(model.skill, start.joints, start.frames)
     robot, nearest = start.joints, math.inf
     for _ in range(250):
-        controller.step(0.02, joints=robot, frames=start.frames)
+        controller.estimate(0.02, joints=robot, frames=start.frames)
         robot = robot + 0.6 * (controller.reference - robot)
         if abs(float(controller.time) - 3.0) < 1e-9:
             hand = model.kinematics_.state(controller.reference).pose("l_hand").position
@@ -188,7 +192,7 @@ def test_tracked_poses_have_via_points():
         pose.position + torch.tensor([0.0, 0.05, 0.0]),
         quaternions.product(turn, pose.orientation),
     )
-    model = hands().with_via_points([ViaPoint(1.0, "pose:left", pose)], fade=0.5)
+    model = ViaPoints(hands().skill, [ViaPoint(1.0, "pose:left", pose)], fade=0.5)
     [bent] = model.predict([start], candidates=False)
     there = model.kinematics_.state(bent.joints[50]).pose("left")
     assert float((there.position - pose.position).norm()) < 1e-4
@@ -198,10 +202,10 @@ def test_tracked_poses_have_via_points():
 
 
 def test_what_is_out_of_reach_is_said():
-    model = small_bottle().with_via_points([ViaPoint(3.0, "position:l_hand", [3.0, 0.0, 1.0])])
+    model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", [3.0, 0.0, 1.0])])
     with pytest.warns(PlausibilityWarning, match="is missed by"):
         [bent] = model.predict([situation()], candidates=False)
-    bounds = model.motion_bounds()
+    bounds = model.skill.motion_bounds
     speed = bent.joints.diff(dim=0).abs() / GRID.diff()[:, None]
     assert bool((speed <= bounds.velocity * 1.001).all())
 
@@ -211,25 +215,25 @@ def test_via_points_are_saved_and_taken_away(tmp_path):
         ViaPoint(1.0, "canonical", {"b": 0.5}),
         ViaPoint(0.5, "canonical", [0, 1, 0], 0.01),
     ]
-    model = TaskParameterizedGMM(n_components=4, blend=0).fit(waves())
-    bent = model.with_via_points(points, fade=0.4)
+    model = TaskParameterizedGMM(n_components=4).fit(waves())
+    bent = ViaPoints(model.skill, points, fade=0.4)
     assert model.via_points_ == ()
-    bent.save(tmp_path / "model")
-    loaded = TaskParameterizedGMM.load(tmp_path / "model")
+    save(bent, tmp_path / "model")
+    loaded = load_model(tmp_path / "model")
     assert loaded.via_points_ == tuple(points) and loaded.via_fade_ == 0.4
     [one], [other] = (
         m.predict([Situation(joints=waves()[0].joints[0])]) for m in (bent, loaded)
     )
     assert torch.equal(one.joints, other.joints)
-    assert loaded.with_via_points([]).via_points_ == ()
+    assert ViaPoints(loaded.skill, []).via_points_ == ()
     assert loaded.fit(waves()).via_points_ == ()
     with pytest.raises(DataError, match="fade"):
-        model.with_via_points(points, fade=0.0)
+        ViaPoints(model.skill, points, fade=0.0)
 
 
 def test_a_new_frame_has_to_be_told():
     shelf = Frame([0.3, 0.2, 0.1])
-    model = small_bottle().with_via_points(["3:position:l_hand@shelf=0,0,0.02~0.05"])
+    model = ViaPoints(small_bottle().skill, ["3:position:l_hand@shelf=0,0,0.02~0.05"])
     assert "shelf" in model.frame_names_
     given = situation()
     model.predict([Situation(given.joints, {**given.frames, "shelf": shelf}, GRID[:20])])

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
 from tests.support.carrying import carries
@@ -17,17 +16,16 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    OperatorSelection,
     RelativePosition,
+    SelectOperators,
     Stack,
-    TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError, UnknownNameError
-from tpgmm_torch.model_selection import fit_folds
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses
-from tpgmm_torch.structure.operator_selection import candidate_operators
+from tpgmm_torch.structure.select_operators import candidate_operators
+from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 
 
 def relative(selection):
@@ -41,7 +39,7 @@ def test_what_was_planted_is_found_among_eight_frames_and_nothing_else(n_relevan
     hits = wrong = missed = 0
     for seed in range(4):
         task = PlantedTask(seed, n_relevant)
-        found = relative(OperatorSelection(robot=HAND).fit(task.demonstrations(5)))
+        found = relative(SelectOperators(robot=HAND).fit(task.demonstrations(5)))
         hits, wrong = hits + len(found & told(task)), wrong + len(found - told(task))
         missed += len(told(task) - found)
     assert 2 * hits / (2 * hits + wrong + missed) >= 0.95
@@ -60,7 +58,7 @@ def test_two_of_three_that_agree_by_chance_hide_no_frame(seed):
         home = [0, 0, 0.5] + 0.005 * rng.normal(size=3)
         path = (1 - at_cup) * home + at_cup * cup + 0.001 * rng.normal(size=(50, 3))
         shown.append(Demonstration(time, path, {"cup": Frame(cup)}, hand.joint_names))
-    found = OperatorSelection(robot=hand, robust=False).fit(shown)
+    found = SelectOperators(robot=hand).fit(shown)
     assert relative(found) == {"position:hand@cup"}
 
 
@@ -71,7 +69,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def selection(task):
-    return OperatorSelection(robot=HAND).fit(task.demonstrations(5))
+    return SelectOperators(robot=HAND).fit(task.demonstrations(5))
 
 
 def test_it_says_when_an_operator_matters(selection, task):
@@ -114,7 +112,7 @@ def test_turning_and_moving_the_world_changes_nothing(selection, task):
         frames = {name: world.compose(frame) for name, frame in one.frames.items()}
         joints = Poses.joints({"hand": world.compose(state.pose("hand"))})
         moved.append(replace(one, joints=joints, frames=frames))
-    again = OperatorSelection(robot=HAND).fit(moved)
+    again = SelectOperators(robot=HAND).fit(moved)
     np.testing.assert_array_equal(again.support_, selection.support_)
 
 
@@ -124,7 +122,7 @@ def test_the_sign_of_a_quaternion_means_nothing(selection, task):
     joints = shown[2].joints.clone()
     joints[:, 3:] *= -1
     shown[1], shown[2] = replace(shown[1], frames=frames), replace(shown[2], joints=joints)
-    again = OperatorSelection(robot=HAND).fit(shown)
+    again = SelectOperators(robot=HAND).fit(shown)
     np.testing.assert_allclose(again.relevance_, selection.relevance_, atol=1e-8)
 
 
@@ -137,7 +135,7 @@ def test_of_two_frames_that_are_one_only_one_is_kept():
         replace(one, frames={name: one.frames[name], "tray": one.frames[name].compose(on_it)})
         for one in shown
     ]
-    found = OperatorSelection(robot=HAND).fit(shown)
+    found = SelectOperators(robot=HAND).fit(shown)
     kinds = sorted(text.partition(":")[0] for text in relative(found))
     assert kinds == ["orientation", "position"]
     spare = [one for one in found.judgements_ if not one.kept and one.operator.references()]
@@ -145,7 +143,7 @@ def test_of_two_frames_that_are_one_only_one_is_kept():
 
 
 def test_one_hand_seen_from_the_other_is_found():
-    found = OperatorSelection(robot=hands_model().robot).fit(handlings(5))
+    found = SelectOperators(robot=hands_model().robot).fit(handlings(5))
     assert "position:right@left" in relative(found) or "position:left@cup" in relative(found)
     assert not found.support_[
         [format_operator(one) for one in found.candidates_].index("position:left")
@@ -154,10 +152,10 @@ def test_one_hand_seen_from_the_other_is_found():
 
 def test_what_a_hand_carries_is_found_as_a_thing():
     """However it was grasped, the bottle stands in the same place on the tray."""
-    found = OperatorSelection(robot=upper_body()).fit(list(carries(6)))
+    found = SelectOperators(robot=upper_body()).fit(attach_holds(carries(6), upper_body()))
     assert {"position:bottle@tray", "position:l_hand@bottle"} <= relative(found)
     assert "position:l_hand@tray" not in relative(found)
-    free = OperatorSelection(robot=upper_body(), holds=None).fit(list(carries(6)))
+    free = SelectOperators(robot=upper_body()).fit(with_holds(carries(6), ()))
     assert not any("bottle@tray" in format_operator(one) for one in free.candidates_)
 
 
@@ -176,7 +174,7 @@ def test_joints_that_matter_are_found_in_groups():
             )
         )
     groups = [Canonical(joints=["steady"]), Canonical(joints=["idle"])]
-    found = OperatorSelection(groups).fit(shown)
+    found = SelectOperators(groups).fit(shown)
     assert found.operators_ == (groups[0],)
 
 
@@ -199,90 +197,20 @@ def test_candidates_are_all_links_in_all_frames(task):
 
 def test_two_demonstrations_are_too_few(task):
     with pytest.raises(DataError, match="at least 3, got 2; name the operators"):
-        OperatorSelection(robot=HAND).fit(task.demonstrations(2))
+        SelectOperators(robot=HAND).fit(task.demonstrations(2))
 
 
 def test_candidates_that_do_not_fit_are_refused(task):
     candidates = [Canonical(), RelativePosition("hand", "lid")]
     with pytest.raises(UnknownNameError, match="frame 'lid' is not in the demonstration"):
-        OperatorSelection(candidates, HAND).fit(task.demonstrations(3))
+        SelectOperators(candidates, HAND).fit(task.demonstrations(3))
 
 
 def test_before_fit_there_is_nothing_to_report():
-    with pytest.raises(NotFittedError, match="this OperatorSelection is not fitted yet"):
-        OperatorSelection().report()
+    with pytest.raises(NotFittedError, match="this SelectOperators is not fitted yet"):
+        SelectOperators().report()
 
 
 def test_it_is_a_step_of_a_pipeline(task):
-    pipeline = make_pipeline(LinearTimeNormalization(), OperatorSelection(robot=HAND))
+    pipeline = make_pipeline(LinearTimeNormalization(), SelectOperators(robot=HAND))
     assert relative(pipeline.fit(task.demonstrations(5))[-1]) == told(task)
-
-
-@pytest.fixture(scope="module")
-def model(task):
-    return TaskParameterizedGMM(12, "auto", HAND).fit(task.demonstrations(5))
-
-
-class TestAuto:
-    """``operators="auto"``: found by the model itself."""
-
-    def test_the_model_has_what_was_found(self, model, selection):
-        assert model.operators_ == selection.operators_
-        np.testing.assert_array_equal(model.operator_selection_.support_, selection.support_)
-        assert model.operators == "auto"
-
-    def test_situations_need_only_the_frames_that_matter(self, model, task):
-        assert model.frame_names_ == task.relevant
-
-    def test_it_is_about_as_good_as_the_model_that_was_told(self, model, selection, task):
-        other = TaskParameterizedGMM(12, selection.operators_, HAND)
-        unseen = task.demonstrations(10, seed=1, noise=False)
-        errors = [
-            float(
-                np.mean(
-                    [
-                        (a.joints - b.joints).norm(dim=-1).mean()
-                        for a, b in zip(one.predict(unseen), unseen, strict=True)
-                    ]
-                )
-            )
-            for one in (model, other.fit(task.demonstrations(5)))
-        ]
-        assert errors[0] == pytest.approx(errors[1])
-
-    def test_it_is_saved_with_the_operators_that_were_found(self, model, tmp_path):
-        model.save(tmp_path / "model")
-        again = TaskParameterizedGMM.load(tmp_path / "model")
-        assert again.operators_ == model.operators_
-        assert again.operators == list(model.operators_)
-        assert again.operator_selection_ is None
-
-    def test_a_selection_of_ones_own_is_asked(self, task):
-        mine = OperatorSelection(threshold=1e3)
-        model = TaskParameterizedGMM(4, mine, HAND).fit(task.demonstrations(3))
-        assert len(model.operators_) == 1
-        assert not hasattr(mine, "support_")
-        assert clone(model).get_params()["operators__threshold"] == 1e3
-
-    def test_what_is_left_out_is_left_out_of_the_selection_too(self, task):
-        """A frame in a wrong place, in one demonstration."""
-        shown, name = task.demonstrations(8), task.relevant[0]
-        wrong = Frame(shown[3].frames[name].position + 0.5, shown[3].frames[name].orientation)
-        shown[3] = replace(shown[3], frames={**shown[3].frames, name: wrong})
-        with pytest.warns(UserWarning, match="1 of 8 are unlike the others"):
-            model = TaskParameterizedGMM(8, "auto", HAND).fit(shown)
-        assert model.demonstration_weights_.tolist() == [1, 1, 1, 0, 1, 1, 1, 1]
-        alone = OperatorSelection(robot=HAND).fit([*shown[:3], *shown[4:]])
-        np.testing.assert_array_equal(model.operator_selection_.relevance_, alone.relevance_)
-
-    def test_each_fold_finds_its_own(self, task):
-        shown = task.demonstrations(5)
-        model = TaskParameterizedGMM(4, "auto", HAND)
-        [fold] = fit_folds(model, shown, [[0, 1, 2, 3]])
-        assert fold.operators_ == clone(model).fit(shown[:4]).operators_
-        assert fold.operator_selection_ is not None
-
-    def test_batches_are_refused(self, task):
-        shown = task.demonstrations(4)
-        with pytest.raises(DataError, match="fit a model to some of them"):
-            TaskParameterizedGMM(4, "auto", HAND).fit([shown[:2], shown[2:]])

@@ -1,0 +1,65 @@
+"""One skill after the other."""
+
+import pytest
+import torch
+
+from tests.support.skills import canonical, handlings, hands_model, wave, waves
+from tpgmm_torch import Canonical, Controller, SelectOperators, Sequence, fit_parts, rollout
+from tpgmm_torch.exceptions import DataError, UnknownNameError
+
+
+def test_parts_reproduce_the_whole():
+    skill = fit_parts(canonical(n_components=8), waves(), [0.7, 1.4])
+    assert [len(one.log_weights) for one in skill.skills] == [3, 3, 2]
+    assert (skill.begin, skill.end) == (0.0, pytest.approx(2.0, abs=0.1))
+    [done] = rollout(skill, waves()[1:2])
+    assert float((done.joints - wave(done.time)).abs().max()) < 0.12
+    assert float(done.joints.diff(dim=0).abs().max()) < 0.4  # no jump at the seams
+
+
+def test_shares_are_weights_that_pass_from_one_to_the_next():
+    skill = fit_parts(canonical(n_components=6), waves(), [1.0])
+    shares = skill.shares(torch.linspace(0, 2, 201, dtype=torch.float64))
+    torch.testing.assert_close(shares.sum(-1), torch.ones(201, dtype=torch.float64))
+    assert shares[0].tolist() == [1, 0] and shares[-1].tolist() == [0, 1]
+    mixed = ((shares > 0) & (shares < 1)).all(-1).sum()
+    assert 15 <= int(mixed) <= 21  # 0.2 s
+    assert skill.skill_at(0.2) is skill.skills[0] and skill.skill_at(1.8) is skill.skills[1]
+
+
+def test_each_part_has_operators_of_its_own():
+    operators = [list(hands_model().operators), [Canonical()]]
+    skill = fit_parts(hands_model(), handlings(), [1.0], operators)
+    assert [len(one.operators) for one in skill.skills] == [2, 1]
+    assert skill.frame_names == ("cup",)
+    [done] = rollout(skill, handlings(5)[4:])
+    assert bool(done.joints.isfinite().all())
+    found = fit_parts(
+        hands_model(), handlings(6), [1.0], SelectOperators(robot=hands_model().robot)
+    )
+    assert len(found.skills) == 2
+
+
+def test_controllers_localise_in_it():
+    skill = fit_parts(canonical(n_components=6), waves(), [1.0])
+    start = waves()[1].joints[0]
+    running = Controller(skill, start, clock="localizing", bounds=None)
+    for _ in range(60):
+        command = running.step(0.05, joints=running.reference)
+    assert running.finished and bool(command.reference.isfinite().all())
+
+
+def test_parts_that_do_not_follow_are_refused():
+    model, shown = canonical(n_components=6), waves()
+    for cuts, message in (([1.0, 0.5], "follow on each other"), ([3.0], "is not after")):
+        with pytest.raises(DataError, match=message):
+            fit_parts(model, shown, cuts)
+    with pytest.raises(UnknownNameError, match="'grasp'"):
+        fit_parts(model, shown, ["grasp"])
+    with pytest.raises(DataError, match="need a component each"):
+        fit_parts(canonical(n_components=1), shown, [1.0])
+    with pytest.raises(DataError, match="operators for 1 parts, and 2 parts"):
+        fit_parts(model, shown, [1.0], [[Canonical()]])
+    early, late = fit_parts(model, shown, [1.0]).skills
+    with pytest.raises(DataError, match="cannot follow"):
+        Sequence((late, early))

@@ -1,0 +1,72 @@
+"""Several ways of one skill: each robot goes the one that suits its situation."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.support.two_ways import Handles, Obstacle, fitted
+from tpgmm_torch import Controller, Frame, Ways, rollout
+from tpgmm_torch.exceptions import DataError
+
+
+@pytest.mark.parametrize("task", [Obstacle, Handles])
+def test_new_situations_are_reproduced_in_a_way_that_succeeds(task):
+    selection, work = fitted(task), task()
+    situations = work.situations(10, 1)
+    done = rollout(selection.skill_, situations, bounds="robot", blend=1.0)
+    assert sum(map(work.succeeded, done, situations)) >= 9
+
+
+def test_a_choice_has_reasons_and_the_trajectory_is_that_of_the_way():
+    selection = fitted(Obstacle)
+    [situation] = Obstacle().situations(1, 2)
+    [choice] = selection.skill_.choose(situation.joints, situation.frames)
+    assert choice.way == int(choice.probabilities.argmax())
+    assert choice.probabilities.sum() == pytest.approx(1.0)
+    assert f"way {choice.way} (way 0: p = " in str(choice)
+    [whole] = rollout(selection.skill_, [situation])
+    [alone] = rollout(selection.models_[choice.way].skill, [situation])
+    assert torch.equal(whole.joints, alone.joints)
+
+
+def test_robots_of_a_batch_each_go_their_own_way():
+    selection = fitted(Handles)
+    situations = Handles().situations(6, 3)
+    starts = torch.stack([one.joints for one in situations])
+    frames = {
+        name: Frame.stack([one.frames[name] for one in situations])
+        for name in situations[0].frames
+    }
+    begun = selection.skill_.start(starts, frames)
+    choices = [selection.skill_.choose(one.joints, one.frames)[0] for one in situations]
+    assert begun.chosen.tolist() == [one.way for one in choices]
+    assert len(set(begun.chosen.tolist())) == 2
+    together = begun.estimate(torch.tensor(1.0), starts, frames).joints
+    for row, one in enumerate(situations):
+        way = selection.models_[begun.chosen[row]].skill
+        alone = way.estimate(torch.tensor(1.0), one.joints, one.frames).joints
+        torch.testing.assert_close(together[row], alone)
+
+
+def test_a_controller_runs_the_way_that_was_chosen():
+    selection = fitted(Obstacle)
+    [situation] = Obstacle().situations(1, 2)
+    [choice] = selection.skill_.choose(situation.joints, situation.frames)
+    commands = []
+    for skill in (selection.skill_, selection.models_[choice.way].skill):
+        running = Controller(skill, situation.joints, situation.frames, clock="even")
+        commands.append(torch.stack([running.step(0.05).reference for _ in range(20)]))
+    torch.testing.assert_close(*commands, rtol=0, atol=1e-6)
+
+
+def test_ways_that_do_not_fit_together_are_refused():
+    one = fitted(Obstacle).models_[0].skill
+    for weights, limits, message in (
+        ((0.5,), (), "2 ways with 1 weights"),
+        ((0.5, 0.0), (), "weights positive"),
+        ((0.5, 0.5), (np.inf, 1.0), "finite"),
+    ):
+        with pytest.raises(DataError, match=message):
+            Ways((one, one), weights, limits)
+    with pytest.raises(DataError):
+        Ways(())

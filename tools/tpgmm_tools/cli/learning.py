@@ -1,0 +1,131 @@
+"""Choices that the command line and policies leave to the demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.structure.fit_parts import fit_parts
+from tpgmm_torch.structure.segmentation import Segmentation
+from tpgmm_torch.structure.select_components import SelectComponents
+from tpgmm_torch.structure.select_operators import SelectOperators
+from tpgmm_torch.structure.select_ways import SelectWays
+from tpgmm_torch.training.hold_detection import attach_holds, with_holds
+from tpgmm_torch.training.outlying_demonstrations import drop_outliers
+
+__all__ = ["Choices", "learn", "prepared"]
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What is found in the demonstrations instead of being given.
+
+    Parameters
+    ----------
+    operators, components : bool
+        Whether they are found.
+    parts : "auto", sequence of float or str, or None
+        Where parts end.
+    modes : "auto" or int
+        In how many ways the skill is done.
+    """
+
+    operators: bool = False
+    components: bool = False
+    parts: str | Sequence[float | str] | None = None
+    modes: str | int = 1
+
+    def check(self, batch_episodes: int | None) -> None:
+        """Refuse choices that do not go together.
+
+        Raises
+        ------
+        DataError
+            If there are choices and batches, or more than one of modes, parts and components.
+        """
+        chosen = [self.components, self.parts is not None, self.modes != 1]
+        if sum(chosen) > 1:
+            raise DataError(
+                "--modes, --parts and --n-components auto go one at a time: give a number of "
+                "components with parts or modes, and one of these two"
+            )
+        if batch_episodes is not None and (any(chosen) or self.operators):
+            raise DataError(
+                "--modes, --parts and 'auto' compare all episodes with each other: they go "
+                "without --batch-episodes"
+            )
+
+
+def prepared(
+    aligned: Sequence[Demonstration],
+    operators: Sequence[Operator],
+    robot: Kinematics | None,
+    robust: bool = True,
+    holds: tuple[Hold, ...] | None = None,
+) -> list[Demonstration]:
+    """Demonstrations without outliers, and with what the robot holds.
+
+    Parameters
+    ----------
+    aligned : sequence of Demonstration
+    operators : sequence of Operator
+        In whose coordinates outliers are found.
+    robot : Kinematics or None
+    robust : bool
+        Whether to leave out outliers.
+    holds : tuple of Hold, optional
+        By default they are found.
+    """
+    shown = list(aligned) if holds is None else with_holds(aligned, holds)
+    shown = drop_outliers(shown, operators, robot) if robust else shown
+    return attach_holds(shown, robot) if holds is None else shown
+
+
+def learn(
+    model: TaskParameterizedGMM, source: Any, choices: Choices, processes: Processes = ALONE
+) -> tuple[Any, list[str]]:
+    """Fit a model, with what is to be found first.
+
+    Parameters
+    ----------
+    model : TaskParameterizedGMM
+        Unfitted.
+    source : sequence of Demonstration, or iterable of batches
+        As :func:`prepared` gives them.
+    choices : Choices
+    processes : Processes
+
+    Returns
+    -------
+    TaskParameterizedGMM or Skill
+    list of str
+        Reports of what was found, and why.
+    """
+    reports: list[str] = []
+    if choices.parts is not None:
+        cuts = choices.parts
+        if isinstance(cuts, str):
+            segmentation = Segmentation(model.robot).fit(source)
+            reports.append(segmentation.report())
+            cuts = segmentation.times()
+        select = SelectOperators(robot=model.robot) if choices.operators else None
+        return fit_parts(model, source, cuts, select), reports
+    if choices.operators:
+        selection = SelectOperators(robot=model.robot).fit(source)
+        reports.append(selection.report())
+        model.set_params(operators=selection.operators_)
+    if choices.components:
+        return SelectComponents(model).fit(source).best_model_, reports
+    if choices.modes != 1:
+        ways = SelectWays(model, choices.modes).fit(source)
+        reports.append(ways.report())
+        return ways.best_model_, reports
+    return model.fit(source, processes=processes), reports

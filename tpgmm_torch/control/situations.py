@@ -1,0 +1,157 @@
+"""Situations, completed for a skill and compared with the demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from tpgmm_torch.checks.situations import check_situations
+from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.trajectories import Trajectory
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.skills.skill import Skill
+
+__all__ = [
+    "at_first",
+    "completed_frames",
+    "completed_situations",
+    "report_start",
+    "with_novelty",
+]
+
+
+def completed_frames(
+    skill: Skill, joints: Any, frames: Mapping[str, Frame]
+) -> dict[str, Frame]:
+    """Frames, and those that are not given but follow from the start posture.
+
+    Parameters
+    ----------
+    skill : Skill
+    joints : array-like of shape (..., n_joints)
+        Start postures.
+    frames : mapping of str to Frame
+
+    Raises
+    ------
+    UnknownNameError
+        If a frame that the skill needs is missing, or has the name of a link.
+    """
+    complete, summary = dict(frames), skill.summary
+    if summary is not None:
+        start = skill.kinematics.joint_tensor(joints)
+        complete |= summary.start_frames(start, skill.kinematics, frames)
+    for name in skill.frame_names:
+        if name not in complete:
+            raise UnknownNameError("frame", name, "the situation", complete)
+    for name in complete:
+        if name in skill.kinematics.links:
+            where = "the situation alone, it is a link of the robot too: rename the frame"
+            raise UnknownNameError("frame", name, where, complete)
+    return complete
+
+
+def completed_situations(
+    skill: Skill, given: Situation | Demonstration | Iterable[Situation | Demonstration]
+) -> list[Situation]:
+    """Situations in the robot's joint order, with all frames and a time grid, and reported.
+
+    Parameters
+    ----------
+    skill : Skill
+    given : sequence of Situation or Demonstration
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError, PlausibilityError
+        If one does not fit the skill, or cannot be what it is taken for.
+    """
+    if not isinstance(given, Situation | Demonstration | Iterable):
+        raise DataError(f"situations are a list of Situation, got {type(given).__name__}")
+    several = [given] if isinstance(given, Situation | Demonstration) else list(given)
+    situations = [_completed(skill, one) for one in several]
+    if situations:
+        firsts = [at_first(one) for one in situations]
+        report = check_situations(
+            torch.stack([one.joints for one in situations]),
+            {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]},
+            torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
+            skill.kinematics,
+            skill.time,
+            skill.summary,
+        )
+        report.act()
+    return situations
+
+
+def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
+    names, like = skill.kinematics.joint_names, skill.time
+    if isinstance(given, Demonstration):
+        given = Situation.of(given)
+    if not isinstance(given, Situation):
+        raise DataError(f"situations are Situation objects, got {type(given).__name__}")
+    given = given.reordered(names)
+    if len(given.joints) != len(names):
+        raise ShapeError(
+            f"the start posture has {len(given.joints)} joints, the model has {len(names)}: "
+            f"{names}"
+        )
+    complete = completed_frames(skill, given.joints, given.frames)
+    time = like if given.time is None else given.time.to(like)
+    present = {**complete, **given.frames_at(time)}
+    frames = {name: present[name].to(like) for name in skill.frame_names}
+    return Situation(given.joints.to(like), frames, time)
+
+
+def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None:
+    """Warn of start postures and frames unlike those of the demonstrations.
+
+    Parameters
+    ----------
+    skill : Skill
+    joints : array-like of shape (..., n_joints)
+    frames : mapping of str to Frame
+
+    Raises
+    ------
+    PlausibilityError
+        If a posture cannot be in radians.
+    """
+    start = skill.kinematics.joint_tensor(joints)
+    time = skill.time
+    known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
+    check_situations(start, known, time[0], skill.kinematics, time, skill.summary).act()
+
+
+def with_novelty(
+    skill: Skill, situations: Sequence[Situation], trajectories: Sequence[Trajectory]
+) -> list[Trajectory]:
+    """Trajectories with the novelty of their situations, where the skill knows it.
+
+    Parameters
+    ----------
+    skill : Skill
+    situations, trajectories : sequence of Situation, sequence of Trajectory
+    """
+    if skill.summary is None:
+        return list(trajectories)
+    found = []
+    for one, situation in zip(trajectories, situations, strict=True):
+        novelty = skill.summary.novelty(situation.joints, at_first(situation))
+        found.append(replace(one, novelty=float(novelty)))
+    return found
+
+
+def at_first(situation: Situation) -> dict[str, Frame]:
+    """Frames where the skill begins.
+
+    Parameters
+    ----------
+    situation : Situation
+    """
+    frames = situation.frames.items()
+    return {name: frame[0] if frame.batch_shape else frame for name, frame in frames}

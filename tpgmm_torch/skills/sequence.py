@@ -1,0 +1,169 @@
+"""One skill after the other, each with operators and components of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.motion.minimum_jerk import minimum_jerk
+from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.skill import Skill
+
+__all__ = ["Sequence"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence(Skill):
+    """Skills one after the other, mixed where one ends and the next begins.
+
+    Parameters
+    ----------
+    skills : sequence of Skill
+        Of one robot, each beginning where the one before ends [s].
+    fade : float, default=0.2
+        Seconds around a seam in which the estimates of both neighbours are mixed, by a
+        minimum-jerk share.
+
+    Raises
+    ------
+    DataError
+        If there is none, they are of different robots, or leave gaps.
+    """
+
+    skills: tuple[Skill, ...]
+    fade: float = 0.2
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "skills", tuple(self.skills))
+        if not self.skills or not self.fade > 0:
+            raise DataError(f"a sequence has skills and a positive fade, got {self!r}")
+        for one, other in pairwise(self.skills):
+            if one.kinematics.joint_names != other.kinematics.joint_names:
+                raise DataError("the skills of a sequence are of different robots")
+            if abs(one.end - other.begin) > self.fade:
+                raise DataError(
+                    f"a skill that begins at {other.begin:.4g} s cannot follow one that ends "
+                    f"at {one.end:.4g} s: each begins where the one before ends"
+                )
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """See :attr:`Skill.kinematics`."""
+        return self.skills[0].kinematics
+
+    @property
+    def begin(self) -> float:
+        """See :attr:`Skill.begin`."""
+        return self.skills[0].begin
+
+    @property
+    def end(self) -> float:
+        """See :attr:`Skill.end`."""
+        return self.skills[-1].end
+
+    @cached_property
+    def time(self) -> Tensor:
+        """See :attr:`Skill.time`."""
+        return torch.cat([one.time for one in self.skills]).unique()
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.frame_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.frame_names))
+
+    @property
+    def carried_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.carried_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """See :attr:`Skill.holds`."""
+        every = dict.fromkeys(hold for one in self.skills for hold in one.holds)
+        return tuple(sorted(every, key=lambda hold: (hold.begin, hold.end)))
+
+    @cached_property
+    def peaks(self) -> tuple[Tensor, Tensor] | None:
+        """The largest accelerations and jerks of any of the demonstrations."""
+        known = [one.peaks for one in self.skills if one.peaks is not None]
+        if not known:
+            return None
+        acceleration, jerk = (reduce(torch.maximum, each) for each in zip(*known, strict=True))
+        return acceleration, jerk
+
+    @cached_property
+    def motion_bounds(self) -> MotionBounds | None:
+        """See :attr:`Skill.motion_bounds`."""
+        if all(one.motion_bounds is None for one in self.skills):
+            return None
+        return MotionBounds.of(self)
+
+    @property
+    def summary(self) -> TrainingSummary | None:
+        """See :attr:`Skill.summary`."""
+        return self.skills[0].summary
+
+    def estimate(
+        self,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """See :meth:`Skill.estimate`."""
+        shares = self.shares(time)
+        active = [k for k in range(len(self.skills)) if bool((shares[..., k] > 0).any())]
+        several = [self.skills[k].estimate(time, state, frames, bounds) for k in active]
+        if len(active) == 1:
+            return replace(several[0], activation=shares)
+        batch = gaussians.common_shape(*(one.joints.shape[:-1] for one in several))
+        weights = shares[..., active].expand(*batch, -1)
+        means = torch.stack([one.joints.expand(*batch, -1) for one in several], -2)
+        covariances = torch.stack(
+            [one.covariance.expand(*batch, *one.covariance.shape[-2:]) for one in several], -3
+        )
+        mean, covariance = gaussians.moment_match(weights, means, covariances)
+        return Estimate(mean, covariance, shares.expand(*batch, -1))
+
+    def shares(self, time: Tensor) -> Tensor:
+        """Shares (..., n_skills) of the skills at times (...); their sum is 1."""
+        seams = time.new_tensor([one.end for one in self.skills[:-1]])
+        passed = minimum_jerk((time.unsqueeze(-1) - seams) / self.fade + 0.5)
+        one = passed.new_ones(*passed.shape[:-1], 1)
+        return torch.cat((one, passed), -1) - torch.cat((passed, 0 * one), -1)
+
+    def skill_at(self, time: float) -> Skill:
+        """The skill that has the largest share at a time [s]."""
+        return self.skills[int(self.shares(self.time.new_tensor(time)).argmax())]
+
+    def log_likelihood(
+        self,
+        times: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        window: slice = slice(None),
+    ) -> Tensor:
+        """See :meth:`Skill.log_likelihood`."""
+        each = torch.stack(
+            [one.log_likelihood(times, state, frames, window) for one in self.skills], -1
+        )
+        own = self.shares(times[window]).argmax(-1)
+        return each.gather(-1, own.expand(each.shape[:-1]).unsqueeze(-1)).squeeze(-1)
+
+    def observed(self, names: frozenset[str]) -> Skill | None:
+        """See :meth:`Skill.observed`."""
+        several = [one.observed(names) for one in self.skills]
+        known = tuple(one for one in several if one is not None)
+        return Sequence(known, self.fade) if len(known) == len(several) else None

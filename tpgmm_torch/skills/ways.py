@@ -1,0 +1,279 @@
+"""A skill that is done in several ways, of which the situation decides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tpgmm_torch import gaussians
+from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.motion.motion_bounds import MotionBounds
+from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.skills.skill import Skill
+
+__all__ = ["WayChoice", "Ways"]
+
+#: Instants of a coarse reproduction that shows whether a way can be gone.
+INSTANTS = 40
+
+
+@dataclass(frozen=True)
+class WayChoice:
+    """Which way suits a situation, and why.
+
+    Parameters
+    ----------
+    way : int
+    probabilities : array of shape (n_ways,)
+        ``p_k ~ weight_k exp(-novelty_k^2 / 2 - misfit_k)``.
+    novelty : array of shape (n_ways,)
+        Of the situation to each way; 1 is that of its least usual demonstration.
+    misfit : array of shape (n_ways,)
+        By how much less likely the way's reproduction is, in its worst moment, than any of its
+        demonstrations ever was [nats]: large where the arm does not reach, or stands at its
+        limits.
+    """
+
+    way: int
+    probabilities: Array
+    novelty: Array
+    misfit: Array
+
+    def __str__(self) -> str:
+        others = ", ".join(
+            f"way {k}: p = {p:.2g}, novelty {n:.2g}, misfit {m:.2g}"
+            for k, (p, n, m) in enumerate(
+                zip(self.probabilities, self.novelty, self.misfit, strict=True)
+            )
+        )
+        return f"way {self.way} ({others})"
+
+
+@dataclass(frozen=True, eq=False)
+class Ways(Skill):
+    """Several ways of one skill; each robot goes the likeliest in its situation.
+
+    The mean of passing an obstacle on the left and on the right goes through it: each way is a
+    skill of its own. One is chosen by how often it was shown, how like the situation is to
+    those it was shown in, and whether the robot can do it there (:meth:`choose`).
+
+    Parameters
+    ----------
+    skills : sequence of Regression
+        Of one robot, with one beginning and end.
+    weights : sequence of float, optional
+        Share of the demonstrations of each; equal by default.
+    limits : sequence of float, optional
+        The largest surprise of the demonstrations of each [nats],
+        :meth:`Regression.surprise`; 0 by default.
+    chosen : Tensor of shape (...), optional
+        The way of each robot, as :meth:`start` chooses it.
+
+    Raises
+    ------
+    DataError
+        If they do not fit together.
+    """
+
+    skills: tuple[Regression, ...]
+    weights: tuple[float, ...] = ()
+    limits: tuple[float, ...] = ()
+    chosen: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        skills, count = tuple(self.skills), len(self.skills)
+        weights = tuple(map(float, self.weights)) or (1.0 / max(count, 1),) * count
+        limits = tuple(map(float, self.limits)) or (0.0,) * count
+        if not count or not count == len(weights) == len(limits):
+            raise DataError(
+                f"{count} ways with {len(weights)} weights and {len(limits)} limits: there is "
+                "one of each for every way"
+            )
+        if min(weights) <= 0 or not all(map(math.isfinite, (*weights, *limits))):
+            raise DataError(
+                f"weights and limits are finite, weights positive: got {weights} and {limits}"
+            )
+        for one in skills:
+            if one.kinematics.joint_names != skills[0].kinematics.joint_names:
+                raise DataError("the ways are of different robots")
+        for name, value in (("skills", skills), ("weights", weights), ("limits", limits)):
+            object.__setattr__(self, name, value)
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """See :attr:`Skill.kinematics`."""
+        return self.skills[0].kinematics
+
+    @property
+    def begin(self) -> float:
+        """See :attr:`Skill.begin`."""
+        return self.skills[0].begin
+
+    @property
+    def end(self) -> float:
+        """See :attr:`Skill.end`; ways that last longer or shorter are played in that time."""
+        return self.skills[0].end
+
+    @property
+    def time(self) -> Tensor:
+        """See :attr:`Skill.time`."""
+        time = self.skills[0].time
+        assert time is not None
+        return time
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.frame_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.frame_names))
+
+    @property
+    def carried_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.carried_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
+
+    @property
+    def holds(self) -> tuple[Hold, ...]:
+        """See :attr:`Skill.holds`: those of the way of all robots, or of the first."""
+        return self._first.holds
+
+    @property
+    def motion_bounds(self) -> MotionBounds | None:
+        """See :attr:`Skill.motion_bounds`."""
+        return self._first.motion_bounds
+
+    @property
+    def peaks(self) -> tuple[Tensor, Tensor] | None:
+        """Accelerations and jerks of the demonstrations."""
+        return self._first.peaks
+
+    @property
+    def summary(self) -> TrainingSummary | None:
+        """See :attr:`Skill.summary`."""
+        return None if self.chosen is None else self._first.summary
+
+    @property
+    def _first(self) -> Regression:
+        return self.skills[0 if self.chosen is None else int(self.chosen.flatten()[0])]
+
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+        """Choose the way of each robot.
+
+        Parameters
+        ----------
+        joints : Tensor of shape (..., n_joints)
+            Start postures.
+        frames : mapping of str to Frame
+            Of shapes that broadcast with the batch.
+        """
+        ways = torch.tensor([one.way for one in self.choose(joints, frames)])
+        return replace(self, chosen=ways.reshape(joints.shape[:-1]))
+
+    def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
+        """The way for each robot, and why; each way is tried on a coarse grid of time.
+
+        Parameters
+        ----------
+        joints : array-like of shape (..., n_joints)
+        frames : mapping of str to Frame
+
+        Returns
+        -------
+        list of WayChoice
+            Of all robots.
+        """
+        starts = self.kinematics.joint_tensor(joints)
+        batch = starts.shape[:-1]
+        rows = starts.reshape(-1, starts.shape[-1])
+        poses = {name: frame.to(rows) for name, frame in frames.items()}
+        here = {n: f.expand(batch).flatten() if batch else f for n, f in poses.items()}
+        with torch.inference_mode():
+            misfits = [self._misfit(k, rows, here) for k in range(len(self.skills))]
+        novelties = [_novelty(one, rows, here) for one in self.skills]
+        misfit, novelty = np.stack(misfits, -1), np.stack(novelties, -1)
+        score = np.log(self.weights) - novelty**2 / 2 - misfit
+        shares = np.exp(score - score.max(1, keepdims=True))
+        shares /= shares.sum(1, keepdims=True)
+        parts = zip(score.argmax(1).tolist(), shares, novelty, misfit, strict=True)
+        return [WayChoice(*part) for part in parts]
+
+    def _misfit(self, way: int, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
+        """How much less likely a reproduction is than demonstrations were, (B,) [nats]."""
+        skill, worst = self.skills[way], torch.zeros(len(joints), dtype=torch.float64)
+        bounds = skill.kinematics.lower, skill.kinematics.upper
+        for now in torch.linspace(skill.begin, skill.end, INSTANTS).to(joints):
+            joints = skill.estimate(now, joints, frames, bounds).joints
+            worst = worst.maximum(skill.surprise(now, joints, frames).double())
+        return as_array((worst - self.limits[way]).clamp(min=0.0))
+
+    def estimate(
+        self,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """See :meth:`Skill.estimate`: each robot's by its way."""
+        joints = state.joints if isinstance(state, RobotState) else state
+        ways = self.start(joints, frames).chosen if self.chosen is None else self.chosen
+        assert ways is not None
+        found: Estimate | None = None
+        width = max(len(one.log_weights) for one in self.skills)
+        for way in ways.unique().tolist():
+            skill = self.skills[way]
+            one = skill.estimate(self.time_of(way, time), state, frames, bounds)
+            spare = width - one.activation.shape[-1]
+            padded = torch.nn.functional.pad(one.activation, (0, spare))
+            if found is None:
+                found = Estimate(one.joints, one.covariance, padded)
+                continue
+            batch = gaussians.common_shape(one.joints.shape[:-1], ways.shape)
+            own = (ways == way).to(joints.device).expand(batch).unsqueeze(-1)
+            found = Estimate(
+                torch.where(own, one.joints, found.joints),
+                torch.where(own.unsqueeze(-1), one.covariance, found.covariance),
+                torch.where(own, padded, found.activation),
+            )
+        assert found is not None
+        return found
+
+    def time_of(self, way: int, time: Tensor) -> Tensor:
+        """A time of the skill, on the clock of one of its ways."""
+        own = self.skills[way]
+        share = (time - self.begin) / (self.end - self.begin)
+        return own.begin + share * (own.end - own.begin)
+
+    def log_likelihood(
+        self,
+        times: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        window: slice = slice(None),
+    ) -> Tensor:
+        """See :meth:`Skill.log_likelihood`: each robot's by its way."""
+        ways = torch.zeros(()) if self.chosen is None else self.chosen
+        skills: Any = self.skills
+        each = [
+            one.log_likelihood(self.time_of(k, times), state, frames, window)
+            for k, one in enumerate(skills)
+        ]
+        own = ways.flatten().long().expand(len(each[0]))
+        return torch.stack(each)[own, torch.arange(len(own))]
+
+
+def _novelty(skill: Regression, joints: Tensor, frames: Mapping[str, Frame]) -> Array:
+    """Novelty (B,) of situations to one way."""
+    if skill.summary is None:
+        return np.zeros(len(joints))
+    return np.broadcast_to(skill.summary.novelty(joints, frames), len(joints))
