@@ -300,11 +300,7 @@ def test_orientations_that_never_vary_are_as_certain_as_in_four_coordinates():
 
 def test_the_time_of_a_product_is_refused():
     with pytest.raises(DataError, match="activation='time'"):
-        fitted(
-            recordings(),
-            ABSOLUTE,
-            fusion=CovarianceFusion(fusion=CovarianceFusion(activation="product")),
-        )
+        fitted(recordings(), ABSOLUTE, fusion=CovarianceFusion(activation="product"))
 
 
 def test_the_printed_fusion_agrees():
