@@ -26,6 +26,7 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.robots import Poses
 
 # %%
 # A hand that turns, recorded by a tracker that flips signs
@@ -59,9 +60,9 @@ wanted = turning(torch.zeros(3, dtype=torch.float64))
 # Two models of the same numbers
 # ------------------------------
 # The naive model takes the four columns for joints. The other one knows that they are an
-# orientation, because :class:`~tpgmm_torch.robots.Poses` and an orientation operator say so: it makes
-# each recording continuous, brings all of them into one hemisphere, and at reproduction turns
-# each Gaussian to the side of the present orientation. (That plain numbers
+# orientation, because :class:`~tpgmm_torch.robots.Poses` and an orientation operator say so:
+# it makes each recording continuous, brings all of them into one hemisphere, and at
+# reproduction turns each Gaussian to the side of the present orientation. (That plain numbers
 # jump like these is warned of: here it is meant.)
 
 numbers = [Demonstration(time, recording) for recording in recordings]

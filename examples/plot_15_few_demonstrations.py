@@ -26,6 +26,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.robots import Poses
 
 torch.set_num_threads(1)  # the matrices are small
 

@@ -25,6 +25,7 @@ from tpgmm_torch import (
     quaternions,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.robots import Poses
 
 # %%
 # A tool that turns

@@ -16,6 +16,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.robots import Kinematics, RobotState
 
 __all__ = ["Samples", "imitation_loss", "likelihood_loss", "local_points", "regression"]
 
