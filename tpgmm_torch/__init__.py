@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.structure.select_operators import SelectOperators
     from tpgmm_torch.structure.select_ways import SelectWays
     from tpgmm_torch.training.hold_detection import attach_holds, find_holds
-    from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
     __version__: str
 
@@ -87,7 +86,6 @@ __all__ = [
     "WaitingClock",
     "Ways",
     "attach_holds",
-    "drop_outliers",
     "find_holds",
     "fit_parts",
     "load",
@@ -133,7 +131,6 @@ _HOMES = {
     "structure.select_ways": ("SelectWays",),
     "data.trajectories": ("Candidate", "Trajectory"),
     "training.hold_detection": ("attach_holds", "find_holds"),
-    "training.outlying_demonstrations": ("drop_outliers",),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

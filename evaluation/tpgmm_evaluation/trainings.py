@@ -13,7 +13,7 @@ from lerobot.utils.constants import OBS_ENV_STATE
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
-from tpgmm_datasets import describe_lerobot, load_lerobot
+from tpgmm_datasets import describe_lerobot, drop_outliers, load_lerobot
 from tpgmm_evaluation.baselines import RECIPES, Training, train
 from tpgmm_evaluation.benchmarks import Benchmark
 from tpgmm_evaluation.cells import Cell
@@ -31,7 +31,6 @@ from tpgmm_torch import (
     Demonstration,
     TaskParameterizedGMM,
     attach_holds,
-    drop_outliers,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.operators import Operator

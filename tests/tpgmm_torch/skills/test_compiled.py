@@ -38,8 +38,8 @@ URDF = """<robot name="two"><link name="base"/><link name="upper"/><link name="l
 CUP = [0.3, 0.35, 0.0]
 
 
-def fitted(robot: bool = True, parts: bool = False, **options: Any) -> Regression:
-    """Two joints that reach for a cup, or two joints and nothing else, in one part or two."""
+def fitted(robot: bool = True, **options: Any) -> Regression:
+    """Two joints that reach for a cup, or two joints and nothing else."""
     arm = Robot.from_urdf(URDF, ["hand"], tools={"hand": ("lower", [0.2, 0, 0])})
     time = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
     demonstrations = []
@@ -52,9 +52,6 @@ def fitted(robot: bool = True, parts: bool = False, **options: Any) -> Regressio
     if robot:
         task = RelativePosition("hand", OBJECT), RelativeOrientation("hand", OBJECT)
         operators = [Stack(*task), Canonical()]
-    if parts:  # the cup does not matter in the first
-        options |= {"parts": [0.5], "n_components": 4}
-        operators = [[Canonical()], operators]
     settings = {"n_components": 3, "operators": operators, **options}
     model = TaskParameterizedGMM(robot=arm if robot else None, **settings)
     return model.fit(demonstrations).skill
@@ -83,7 +80,7 @@ def plain():
     return fitted()
 
 
-@pytest.mark.parametrize("case", [{}, {"parts": True}, {"priorities": [1, 0]}])
+@pytest.mark.parametrize("case", [{}, {"fusion": InformationFusion(priorities=[1, 0])}])
 def test_estimates_are_the_same(case):
     plain = fitted(**case)
     compiled = compile_skill(plain, backend="aot_eager")
