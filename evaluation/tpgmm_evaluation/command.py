@@ -27,7 +27,7 @@ tpgmm compare --env all --demonstrations 3,10 --seeds 0,1,2 --episodes 100 --con
 tpgmm compare --demonstrations 10 --policies tpgmm --conditions all --out out/conditions
 (every condition, beside the open loop of 0.1.0, as 'make conditions')
 
-tpgmm compare --policies "tpgmm,tpgmm --policy.feedback=observation"
+tpgmm compare --policies "tpgmm,tpgmm --policy.control.feedback=observation"
 --conditions pushes,stopped-3,moved+pose-noise --out out/disturbed
 
 tpgmm compare --env aloha_state,carry_and_put --demonstrations 25 --out out/two

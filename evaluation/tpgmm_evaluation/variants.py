@@ -19,9 +19,9 @@ EVEN_CLOCK = "tpgmm-even-clock"
 #: Variants with a name of their own. A gap at the start is no reason to give up here.
 NAMED: Mapping[str, str] = MappingProxyType(
     {
-        OPEN_LOOP: "tpgmm --policy.closed_loop=false --policy.clock=even "
-        "--policy.follow_frames=false --policy.largest_start_gap=null",
-        EVEN_CLOCK: "tpgmm --policy.clock=even",
+        OPEN_LOOP: "tpgmm --policy.control.closed_loop=false --policy.control.clock=even "
+        "--policy.control.follow_frames=false --policy.control.largest_start_gap=null",
+        EVEN_CLOCK: "tpgmm --policy.control.clock=even",
     }
 )
 OPTION = "--policy."
@@ -44,7 +44,7 @@ class Variant:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read a name, or a name and settings: ``"tpgmm --policy.feedback=observation"``.
+        """Read a name, or a name and settings: ``"tpgmm --policy.control.blend=0"``.
 
         Raises
         ------
@@ -57,8 +57,8 @@ class Variant:
             name, equals, _ = option.removeprefix(OPTION).partition("=")
             if not option.startswith(OPTION) or not equals:
                 raise DataError(
-                    f"settings of a policy look like {OPTION}feedback=observation, got "
-                    f"{option!r} in {text!r}"
+                    f"settings of a policy look like {OPTION}control.feedback=observation, "
+                    f"got {option!r} in {text!r}"
                 )
             if not base.startswith("tpgmm"):
                 raise DataError(f"only tpgmm policies take settings, got {text!r}")

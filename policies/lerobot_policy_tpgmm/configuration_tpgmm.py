@@ -13,6 +13,13 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
+from lerobot_policy_tpgmm.settings import (
+    ControlConfig,
+    EMConfig,
+    FitConfig,
+    FusionConfig,
+    TrainingConfig,
+)
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
@@ -21,55 +28,29 @@ from tpgmm_torch import (
     Hold,
     Robot,
     TaskParameterizedGMM,
-    Trust,
     ViaPoint,
-    parse_clock,
 )
-from tpgmm_torch.alignment.text import METHODS
-from tpgmm_torch.checks.report import PLAUSIBILITY
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import decode, encode
-from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = [
-    "FITTED",
     "StatePolicyConfig",
     "TPGMMConfig",
     "state_features",
 ]
 
 
-#: Parameters of the estimator that go into the configuration under their own names.
-HYPERPARAMETERS = (
-    "n_components", "covariance_type", "reg_covar", "covariance_shrinkage", "tol", "max_iter",
-    "n_init", "init_params", "responsibilities", "random_state", "dtype",
-)  # fmt: skip
-
 #: Robots that come with the package: what describes each, and its hands.
 ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
     "upper_body": (upper_body_urdf, HANDS),
     "so101": (so101_urdf, ("gripper_frame_link",)),
 }
-
-CHOICES = {
-    "feedback": ("reference", "observation"),
-    "alignment": (*METHODS, "parts"),
-    "learn_from": ("measured", "commanded"),
-    "loss": ("likelihood", "imitation"),
-}
-
-
-#: Fields that a fit fills in.
-FITTED = (
-    "n_components", "operators", "n_steps", "holds", "shown", "peaks",
-)  # fmt: skip
 
 
 @dataclass
@@ -122,21 +103,8 @@ class TPGMMConfig(StatePolicyConfig):
 
     Parameters
     ----------
-    n_components, covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, \
-    init_params, responsibilities, random_state, dtype
-        As for :class:`tpgmm_torch.TaskParameterizedGMM`.
-    fusion : {"information", "covariance"}, default="information"
-        Form of the product, with the settings ``prior_std``, ``priorities`` and ``negligible``
-        of :class:`tpgmm_torch.InformationFusion`, or ``epsilon`` and ``activation`` of
-        :class:`tpgmm_torch.CovarianceFusion`.
-    blend : float, default=1.0
-        How long the difference between start posture and model fades [s].
-    keep_limits : bool, default=True
-        Whether references stay within the bounds of motion.
-    robust : bool, default=True
-        Whether training leaves out episodes that are unlike the others.
-    plausibility : {"warn", "error", "ignore"}, default="warn"
-        What training does about recordings that are unlikely to be what they are taken for.
+    n_components : int, default=10
+        Number of Gaussians.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
         :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
@@ -158,13 +126,6 @@ class TPGMMConfig(StatePolicyConfig):
         For a robot given by its path, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links of
         ``"upper_body"`` and ``"so101"`` are their hands if none are named. Joints may be
         patterns, and one text with commas: ``"left_*,waist_yaw"``.
-    n_steps : int, default=0
-        T, the length of the time grid that was learned; 0 before a fit.
-    shown : dict, optional
-        The summary of the demonstrations, :class:`tpgmm_torch.checks.TrainingSummary`, as JSON.
-    peaks : list of two lists of float, optional
-        Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
-        the bounds of what neither the robot nor the user bounds.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -180,60 +141,18 @@ class TPGMMConfig(StatePolicyConfig):
         ``observation.environment_state``, or names of entries of it or of
         ``observation.state``. By default names like ``bottle.x`` tell, else the frames follow
         one another in ``observation.environment_state``.
-    link_frames : dict of str to str, optional
-        Frames that training takes from a link at an event, ``{"bottle": "r_hand@close"}``:
-        ``LINK@EVENT`` as for :func:`tpgmm_datasets.load_lerobot`. When it runs, the policy has
-        to be told them like any frame, but for those at ``start``: they follow from the joints.
-    events : dict of str to str, optional
-        How training finds events, ``{"close": "closing:*gripper*"}``, as
-        :func:`tpgmm_datasets.events.parse_event` takes it. Others are those of the columns
-        ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
-        frame is are found by themselves, where there is no such column.
     default_environment_state : list of float, optional
         Taken where there is no observation of the frames.
-    follow_frames : bool, default=True
-        Read the frames at every step, instead of at the start of an episode alone.
-    closed_loop : bool, default=True
-        Read the joints at every step: the clock looks at them, and a robot stands whose
-        joints cannot be believed. Else a skill is played as it was at the start.
-    clock : str, default="localizing:initial=anywhere"
-        How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
-        ``"waiting"`` or ``"localizing"``, with options. By default an episode may begin in the
-        middle of the skill.
-    smoothing : float or None, default=0.5
-        Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
-    patience, frame_patience : float, default=0.2, 1.0
-        How long a robot goes on with the joints and the frames that it saw last, before it
-        stands [s].
-    velocity, acceleration, jerk : float, list of float or dict, optional
-        Bounds that are tighter than those of the robot and of the demonstrations [rad/s^n].
     fps : float, optional
         Steps per second of the demonstrations.
     control_fps : float, optional
         Actions per second; by default ``fps``.
-    feedback : {"reference", "observation"}, default="reference"
-        What q_{t-1} is: the last reference (as in the paper), or the measured posture.
-    largest_start_gap : float or None, default=1.0
-        Refuse to begin if a joint stands further from its first reference [rad]: the order
-        or the unit is wrong then, or the robot does not stand where the skill begins.
     chunk_size : int, default=50
         Number of steps of ``predict_action_chunk``.
-    alignment : {"dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"}, \
-    default="dtw"
-        How training brings episodes onto one clock; ``"events"`` anchors them at all events,
-        ``"events+dtw"`` warps them in between, too; ``"parts"`` stretches each of the parts
-        that are found.
-    alignment_features : list of str, optional
-        What time warping compares, as for
-        :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
-        of the links and the joints.
-    learn_from : {"measured", "commanded"}, default="measured"
-        Whether the joints of a demonstration are its states or its actions. Measured joints
-        lag behind commanded ones, by which a skill learned from them misses.
-    loss : {"likelihood", "imitation"}, default="likelihood"
-        What training by gradient minimises once the mixture is fitted.
-    optimizer_lr : float, default=1e-4
-        Step size of that training.
+    em, fusion, control, training : EMConfig, FusionConfig, ControlConfig, TrainingConfig
+        Settings by subject: ``--policy.control.clock=even``.
+    fit : FitConfig
+        Filled in by a fit.
     push_to_hub : bool, default=False
         Whether lerobot-train uploads the policy in the end, to ``repo_id``.
 
@@ -244,27 +163,6 @@ class TPGMMConfig(StatePolicyConfig):
     """
 
     n_components: int = 10
-    priorities: list[int] | None = None
-    covariance_type: str = "full"
-    reg_covar: float = 1e-5
-    covariance_shrinkage: float | str = "auto"
-    tol: float = 1e-3
-    max_iter: int = 100
-    n_init: int = 1
-    init_params: str = "time"
-    responsibilities: str = "auto"
-    fusion: str = "information"
-    activation: str = "time"
-    epsilon: float = 1e-4
-    prior_std: float = 10.0
-    negligible: float = 1e-9
-    blend: float = 1.0
-    keep_limits: bool = True
-    robust: bool = True
-    plausibility: str = "warn"
-    random_state: int | None = None
-    dtype: str = "float64"
-
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
     holds: list[str] | None = None
@@ -274,39 +172,22 @@ class TPGMMConfig(StatePolicyConfig):
     links: list[str] = field(default_factory=list)
     joints: list[str] | str | None = None
     coordinates: list[str] = field(default_factory=list)
-    n_steps: int = 0
-    shown: dict[str, Any] | None = None
-    peaks: list[list[float]] | None = None
 
     state_names: list[str] | None = None
     action_names: list[str] | None = None
     environment_names: list[str] | None = None
     units: dict[str, list[float] | str] | str | None = None
     frames: dict[str, list[int | str]] | None = None
-    link_frames: dict[str, str] = field(default_factory=dict)
-    events: dict[str, str] = field(default_factory=dict)
     default_environment_state: list[float] | None = None
-    follow_frames: bool = True
-    closed_loop: bool = True
-    clock: str = "localizing:initial=anywhere"
-    smoothing: float | None = 0.5
-    patience: float = 0.2
-    frame_patience: float = 1.0
-    velocity: dict[str, float] | list[float] | float | None = None
-    acceleration: dict[str, float] | list[float] | float | None = None
-    jerk: dict[str, float] | list[float] | float | None = None
-
     fps: float | None = None
     control_fps: float | None = None
-    feedback: str = "reference"
-    largest_start_gap: float | None = 1.0
     chunk_size: int = 50
 
-    alignment: str = "dtw"
-    alignment_features: list[str] | None = None
-    learn_from: str = "measured"
-    loss: str = "likelihood"
-    optimizer_lr: float = 1e-4
+    em: EMConfig = field(default_factory=EMConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -319,44 +200,33 @@ class TPGMMConfig(StatePolicyConfig):
             raise
 
     def _check(self) -> None:
-        for name, choices in CHOICES.items():
-            if getattr(self, name) not in choices:
-                raise DataError(
-                    f"{name} is one of {list(choices)}, got {getattr(self, name)!r}"
-                )
-        for name in ("fps", "control_fps", "largest_start_gap"):
-            value = getattr(self, name)
+        rates = {"fps": self.fps, "control_fps": self.control_fps}
+        rates["control.largest_start_gap"] = self.control.largest_start_gap
+        for name, value in rates.items():
             if value is not None and not 0 < value < math.inf:
                 raise DataError(f"{name} is a positive number or null, got {value}")
-        for name, least in (("n_steps", 0), ("chunk_size", 1)):
-            if getattr(self, name) < least:
-                raise DataError(f"{name} is at least {least}, got {getattr(self, name)}")
+        for name, count, least in (
+            ("fit.n_steps", self.fit.n_steps, 0),
+            ("chunk_size", self.chunk_size, 1),
+        ):
+            if count < least:
+                raise DataError(f"{name} is at least {least}, got {count}")
         if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
             raise DataError(
                 "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
                 f"got {self.normalization_mapping}"
             )
-        if (self.learn_from, self.loss) == ("commanded", "imitation"):
-            raise DataError(
-                "the imitation error is that of actions that follow measured joints: "
-                "--policy.learn_from=commanded goes with --policy.loss=likelihood"
-            )
+        self.training.check()
         self.link_poses()
-        for text in self.events.values():
+        for text in self.training.events.values():
             parse_event(text)
-        self.control()
-        if self.fusion not in ("information", "covariance"):
-            raise DataError(f"fusion is 'information' or 'covariance', got {self.fusion!r}")
-        if self.plausibility not in PLAUSIBILITY:
-            raise DataError(
-                f"plausibility is one of {list(PLAUSIBILITY)}, got {self.plausibility!r}"
-            )
+        self.control.options()
         check_parameters(self.estimator(None, ()))
 
     @property
     def fitted(self) -> bool:
         """Whether what a fit fills in is there."""
-        return bool(self.n_steps)
+        return bool(self.fit.n_steps)
 
     @property
     def rate(self) -> float:
@@ -372,23 +242,9 @@ class TPGMMConfig(StatePolicyConfig):
             raise DataError("the policy does not know its rate: set fps or control_fps")
         return rate
 
-    def control(self) -> dict[str, Any]:
-        """Options of :meth:`tpgmm_torch.TaskParameterizedGMM.controller`."""
-        limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
-        return {
-            "clock": parse_clock(self.clock),
-            "trust": Trust(joint_timeout=self.patience, frame_timeout=self.frame_patience),
-            "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
-            "feedback": "measured" if self.feedback == "observation" else "reference",
-            "bounds": None
-            if not self.keep_limits
-            else {name: limit for name, limit in limits.items() if limit is not None},
-            "blend": self.blend,
-        }
-
     def link_poses(self) -> dict[str, LinkPose]:
         """What ``link_frames`` stands for."""
-        return {name: LinkPose.parse(text) for name, text in self.link_frames.items()}
+        return {name: LinkPose.parse(text) for name, text in self.training.link_frames.items()}
 
     def kinematics(self) -> Kinematics | None:
         """The robot that ``robot`` describes, None for joints alone."""
@@ -440,14 +296,16 @@ class TPGMMConfig(StatePolicyConfig):
     def note(self, model: TaskParameterizedGMM) -> None:
         """Fill in what a fit has learned beside the mixture's numbers."""
         skill = model.skill
-        self.n_components, self.n_steps = len(model.weights_), len(model.time_)
+        self.n_components = len(model.weights_)
         # with the paths that it found
         self.operators = list(map(_description, model.operators_))
         self.holds = list(map(str, model.holds_))
-        self.shown = None if skill.summary is None else skill.summary.config()
-        self.peaks = None if skill.peaks is None else [each.tolist() for each in skill.peaks]
-        for name, value in _fusion(skill.fusion).items():
-            setattr(self, name, value)
+        self.fit = FitConfig(
+            len(model.time_),
+            None if skill.summary is None else skill.summary.config(),
+            None if skill.peaks is None else [each.tolist() for each in skill.peaks],
+        )
+        self.fusion = FusionConfig.of(skill.fusion)
 
     def skill(self, model: TaskParameterizedGMM) -> Any:
         """What an episode runs: the model's skill, through the via-points."""
@@ -461,22 +319,22 @@ class TPGMMConfig(StatePolicyConfig):
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters, for one way."""
-        settings = {name: getattr(self, name) for name in HYPERPARAMETERS}
-        fusion: Fusion = InformationFusion(self.prior_std, self.priorities, self.negligible)
-        if self.fusion == "covariance":
-            fusion = CovarianceFusion(self.epsilon, self.activation)
         return TaskParameterizedGMM(
-            operators=operators, robot=kinematics, fusion=fusion, **settings
+            self.n_components,
+            operators,
+            kinematics,
+            fusion=self.fusion.value(),
+            **vars(self.em),
         )
 
     def learned(self) -> dict[str, Any]:
         """What a fit has learned beside the mixture, for ``from_parameters``."""
         summary = None
-        if self.shown is not None:
-            summary = TrainingSummary.from_config(self.shown, self.kinematics())
+        if self.fit.shown is not None:
+            summary = TrainingSummary.from_config(self.fit.shown, self.kinematics())
         peaks = None
-        if self.peaks is not None:
-            peaks = tuple(torch.tensor(each, dtype=torch.float64) for each in self.peaks)
+        if self.fit.peaks is not None:
+            peaks = tuple(torch.tensor(each, dtype=torch.float64) for each in self.fit.peaks)
         return {
             "holds": list(map(Hold.parse, self.holds or ())),
             "n_demonstrations": None if summary is None else summary.n_demonstrations,
@@ -496,24 +354,7 @@ class TPGMMConfig(StatePolicyConfig):
 
     def get_optimizer_preset(self) -> AdamConfig:
         """Adam, without weight decay."""
-        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0)
-
-
-def _fusion(fusion: Fusion) -> dict[str, Any]:
-    """Fields of the configuration that stand for a form of fusion."""
-    if isinstance(fusion, CovarianceFusion):
-        return {
-            "fusion": "covariance",
-            "epsilon": fusion.epsilon,
-            "activation": fusion.activation,
-        }
-    priorities = None if fusion.priorities is None else list(fusion.priorities)
-    return {
-        "fusion": "information",
-        "prior_std": fusion.prior_std,
-        "priorities": priorities,
-        "negligible": fusion.negligible,
-    }
+        return AdamConfig(lr=self.training.optimizer_lr, weight_decay=0.0)
 
 
 def _description(operator: Operator) -> dict[str, Any] | str:

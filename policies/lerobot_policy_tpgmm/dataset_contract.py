@@ -74,8 +74,8 @@ def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
         told = pose.event == "start" or config.environment_names or not config.frames
         if not told and name not in (config.frames or ()):
             raise DataError(
-                f"frame {name!r} is at {config.link_frames[name]!r} in the episodes; say "
-                "where a running policy is told it, too: --policy.frames="
+                f"frame {name!r} is at {config.training.link_frames[name]!r} in the episodes; "
+                "say where a running policy is told it, too: --policy.frames="
                 f"""'{{"{name}": [0, 1, 2, 3, 4, 5, 6], ...}}'"""
             )
 
@@ -125,11 +125,11 @@ def _units(features: Mapping[str, Any]) -> dict[str, list[float] | str]:
 def _frames(config: TPGMMConfig) -> list[str]:
     """The frames that there are, for operators that nobody named."""
     if config.frames:
-        return list(dict.fromkeys((*config.frames, *config.link_frames)))
+        return list(dict.fromkeys((*config.frames, *config.training.link_frames)))
     groups = pose_groups(config.environment_names) if config.environment_names else {}
     if not groups and config.env_state_feature is not None:
         raise DataError(
             f"the names of {OBS_ENV_STATE} tell of no pose: name the frames, "
             """--policy.frames='{"bottle": [0, 1, 2, 3, 4, 5, 6]}'"""
         )
-    return list(dict.fromkeys((*groups, *config.link_frames)))
+    return list(dict.fromkeys((*groups, *config.training.link_frames)))

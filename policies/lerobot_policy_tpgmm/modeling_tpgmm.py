@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,8 +18,6 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_policy_tpgmm.configuration_tpgmm import (
-    FITTED,
-    HYPERPARAMETERS,
     TPGMMConfig,
     state_features,
 )
@@ -33,6 +31,7 @@ from lerobot_policy_tpgmm.observations import (
     poses_named,
 )
 from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
+from lerobot_policy_tpgmm.settings import EMConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
 from tpgmm_tools.hub import describe, model_card, upload
@@ -154,7 +153,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "or tpgmm fit ... --format lerobot"
             )
         config.validate_features()
-        self.kinematics = kinematics.to(getattr(torch, config.dtype))
+        self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
         required = list(frame_names([*operators, *config.via_operators()], kinematics))
         # an object that only stands where links do is told from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
@@ -180,7 +179,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self.frames = FrameFeatures(told, config.frames, *named, default, width)
         self._learner: Learner | None = None
         if dataset_meta is not None:
-            recorded = [name for name in required if name not in config.link_frames]
+            recorded = [name for name in required if name not in config.training.link_frames]
             places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
             shown = FrameFeatures(recorded, places, *named, default, width)
             self._learner = Learner(
@@ -206,9 +205,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _make_mixture(self, operators: Sequence[Operator]) -> None:
         """The mixture, once the number of time steps is known."""
-        config, dtype = self.config, getattr(torch, self.config.dtype)
+        config, dtype = self.config, getattr(torch, self.config.em.dtype)
         dimensions = [one.dimension(self.kinematics) for one in operators]
-        self.mixture = MixtureParameters(config.n_components, dimensions, config.n_steps, dtype)
+        self.mixture = MixtureParameters(
+            config.n_components, dimensions, config.fit.n_steps, dtype
+        )
 
     def _become(self, model: TaskParameterizedGMM) -> None:
         """Take over what a fitted model is."""
@@ -263,9 +264,14 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         kinematics, time = model.kinematics_, model.time_
         if fps is None and len(time) > 1:
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        settings = _settings(model)
         config = TPGMMConfig(
-            **{"device": "cpu", "push_to_hub": False, "fps": fps, **settings, **options}
+            **{
+                "device": "cpu",
+                "push_to_hub": False,
+                "fps": fps,
+                "em": _settings(model),
+                **options,
+            }
         )
         config.describe(kinematics, model.operators_)
         config.note(model)
@@ -393,7 +399,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         joints, frames = self._observed(batch), self.frames.frames(batch)
         if len(joints) == 1:  # one robot is sooner computed without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
-        return Controller(skill, joints, frames, **self.config.control())
+        return Controller(skill, joints, frames, **self.config.control.options())
 
     def _told(
         self, batch: Mapping[str, Tensor], controller: Controller
@@ -407,11 +413,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "call reset() between episodes"
             )
         first = controller.command is None
-        poses = self.frames.poses(batch) if config.follow_frames and not first else {}
+        poses = self.frames.poses(batch) if config.control.follow_frames and not first else {}
         if len(shape) == 1:
             measured = measured[0]
             poses = {n: None if pose is None else pose[0] for n, pose in poses.items()}
-        return measured if config.closed_loop else None, poses or None
+        return measured if config.control.closed_loop else None, poses or None
 
     def _step(
         self, controller: Controller, batch: Mapping[str, Tensor], passed: Any = None
@@ -432,7 +438,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _check_start(self, start: Tensor, wanted: Tensor) -> None:
         """Refuse to move robots that stand far from where the skill begins."""
-        largest, gap = self.config.largest_start_gap, (wanted - start).abs()
+        largest, gap = self.config.control.largest_start_gap, (wanted - start).abs()
         if largest is None or not bool((gap > largest).any()):
             return
         row, joint = divmod(int(gap.argmax()), gap.shape[-1])
@@ -443,7 +449,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             "order of the state's entries (--policy.state_names) or their unit "
             "(--policy.units) is wrong, or the robot has to be brought to the start first. "
             f"Further than {largest} rad is refused "
-            "(--policy.largest_start_gap, null for any)"
+            "(--policy.control.largest_start_gap, null for any)"
         )
 
     def _observed(self, batch: Mapping[str, Tensor]) -> Tensor:
@@ -577,9 +583,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return model
 
 
-def _settings(model: TaskParameterizedGMM) -> dict[str, Any]:
-    """What goes into a configuration under its own name, but what a fit fills in."""
-    settings = {name: getattr(model, name) for name in HYPERPARAMETERS if name not in FITTED}
+def _settings(model: TaskParameterizedGMM) -> EMConfig:
+    """Settings with which a model was learned; a policy has no generator of its own."""
+    settings = {each.name: getattr(model, each.name) for each in fields(EMConfig)}
     if not isinstance(settings["random_state"], int):
         settings["random_state"] = None
-    return settings
+    return EMConfig(**settings)

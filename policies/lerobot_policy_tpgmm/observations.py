@@ -248,8 +248,8 @@ def observed_frames(config: TPGMMConfig, required: Sequence[str]) -> list[str]:
     ``config`` tell of the frame.
     """
     start = {name for name, pose in config.link_poses().items() if pose.event == "start"}
-    if config.shown is not None:
-        frames = TrainingSummary.from_config(config.shown).frames
+    if config.fit.shown is not None:
+        frames = TrainingSummary.from_config(config.fit.shown).frames
         start |= {name for name, shown in frames.items() if shown.link is not None}
     placed = {*(config.frames or ()), *poses_named(config.environment_names)}
     placed |= {*poses_named(config.state_names)}

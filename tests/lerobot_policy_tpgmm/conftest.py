@@ -2,6 +2,7 @@
 
 import pytest
 
+import lerobot_env_bimanual  # noqa: F401  registers the environments
 from tests.support.policies import fitted
 
 

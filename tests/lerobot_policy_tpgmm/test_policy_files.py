@@ -2,13 +2,10 @@
 
 import json
 import os
-import re
 import shutil
 
-import numpy as np
 import pytest
 import torch
-from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.factory import make_env_config
 from lerobot.policies.factory import make_pre_post_processors
@@ -18,9 +15,7 @@ from lerobot_policy_tpgmm import policy_files
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_metadata import dataset
 from tests.support.policies import STATE, act, batch, changed, fitted, loaded
-from tests.support.skills import same, small_bottle
-from tests.support.two_ways import Handles
-from tests.support.two_ways import fitted as ways
+from tests.support.skills import small_bottle
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError, ModelFileError, ShapeError
 from tpgmm_torch.persistence import load_model
@@ -164,8 +159,8 @@ def test_a_truncated_file_is_refused(directory, keep):
     ("field", "value", "message"),
     [
         ("n_components", 9, r"mixture.logits is float64 \(8,\), expected float64 \(9,\)"),
-        ("n_steps", 5, r"mixture.time is .* expected float64 \(5,\)"),
-        ("dtype", "float32", r"expected float32"),
+        ("fit.n_steps", 5, r"mixture.time is .* expected float64 \(5,\)"),
+        ("em.dtype", "float32", r"expected float32"),
         ("operators", ["canonical"], "mixture.factors.1 is .*, expected nothing"),
         ("operators", ["shake"], "'shake' is not a term"),
         ("operators", ["auto"], "tpgmm fit --operator auto"),
@@ -177,7 +172,8 @@ def test_a_truncated_file_is_refused(directory, keep):
 )
 def test_a_configuration_of_something_else_is_refused(directory, field, value, message):
     config = PreTrainedConfig.from_pretrained(directory)
-    setattr(config, field, value)
+    group, _, name = field.rpartition(".")
+    setattr(getattr(config, group) if group else config, name, value)
     with pytest.raises((ModelFileError, DataError, KeyError), match=message):
         TPGMMPolicy.from_pretrained(directory, config=config)
 
@@ -265,7 +261,7 @@ def test_an_environment_of_other_actions_is_refused(saved):
 
 
 def test_the_data_set_of_the_fit_is_accepted(saved):
-    assert loaded(saved, ds_meta=dataset()).config.n_steps == len(small_bottle().time_)
+    assert loaded(saved, ds_meta=dataset()).config.fit.n_steps == len(small_bottle().time_)
 
 
 @pytest.mark.parametrize(
@@ -287,112 +283,3 @@ def test_the_data_set_of_the_fit_is_accepted(saved):
 def test_another_data_set_is_refused(saved, given, message):
     with pytest.raises(DataError, match=message):
         loaded(saved, ds_meta=dataset(**given))
-
-
-# Several ways
-
-
-@pytest.fixture(scope="module")
-def two_ways(tmp_path_factory):
-    """The directory of a policy of two ways; not to be changed."""
-    path = tmp_path_factory.mktemp("ways") / "saved"
-    TPGMMPolicy.from_estimator(ways(Handles)).save_pretrained(path)
-    return path
-
-
-def test_several_ways_are_one_directory_and_come_back_equal(two_ways, tmp_path):
-    assert {path.name for path in two_ways.iterdir()} == FILES
-    policy = TPGMMPolicy.from_pretrained(two_ways)
-    model, again = ways(Handles), policy.to_estimator()
-    assert policy.config.modes == 2 and policy.config.operators is None
-    for name in ("weights_", "limits_", "labels_"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(model, name))
-    for one, other in zip(again.models_, model.models_, strict=True):
-        same(one, other, 1e-12)
-    policy.save_pretrained(tmp_path / "again")
-    names = ("config.json", "model.safetensors")
-    for file in (tmp_path / "again" / name for name in names):
-        assert file.read_bytes() == (two_ways / file.name).read_bytes()
-    first = TPGMMPolicy.from_estimator(model.models_[0]).state_dict()
-    tensors = policy.state_dict()
-    assert all(torch.equal(tensors[name], value) for name, value in first.items())
-
-
-def test_a_directory_from_before_there_were_ways_loads_bit_for_bit(directory):
-    config = json.loads((directory / "config.json").read_text())
-    assert config.pop("modes") == 1 and config.pop("ways") == []
-    (directory / "config.json").write_text(json.dumps(config))
-    numbers = load_file(directory / "model.safetensors")
-    save_file(numbers, directory / "model.safetensors")
-    policy = TPGMMPolicy.from_pretrained(directory)
-    assert policy.config == fitted().config
-    tensors = policy.state_dict()
-    assert numbers.keys() <= tensors.keys()
-    assert all(torch.equal(tensors[name], value) for name, value in numbers.items())
-    assert torch.equal(act(policy, batch(), 5), act(fitted(), batch(), 5))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda t: t.pop("mixture_1.logits"), "mixture_1.logits is missing"),
-        (lambda t: t["mixture_1.fitted"].fill_(False), "saved before it was fitted"),
-        (lambda t: t["mixture_1.means.0"].fill_(torch.nan), "hold NaN or infinity"),
-        (
-            lambda t: t.update({"mixture_2.time": torch.zeros(3)}),
-            "mixture_2.time is .* nothing",
-        ),
-    ],
-    ids=["missing", "unfitted", "not finite", "too many"],
-)
-def test_numbers_of_a_way_that_do_not_belong_are_refused(two_ways, tmp_path, change, message):
-    shutil.copytree(two_ways, tmp_path / "policy")
-    rewritten(tmp_path / "policy", change)
-    with pytest.raises((ModelFileError, DataError), match=message):
-        TPGMMPolicy.from_pretrained(tmp_path / "policy")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda ways: ways.pop(), "modes=1, got 2"),
-        (lambda ways: ways[1].pop("limit"), "limit"),
-        (lambda ways: ways[1].update(code="print()"), "code"),
-        (lambda ways: ways[1].update(n_steps="many"), "n_steps"),
-        (lambda ways: ways[1].update(n_components=3), r"mixture_1.logits is float64 \(8,\)"),
-        (lambda ways: ways[1].update(operators=["shake"]), "'shake' is not a term"),
-        (lambda ways: ways[1].update(weight=-1.0), "weights positive"),
-        (lambda ways: ways[1]["episodes"].append(99), "each episode shows one of them"),
-    ],
-)
-def test_a_way_that_is_damaged_is_refused(two_ways, tmp_path, change, message, caplog):
-    path = shutil.copytree(two_ways, tmp_path / "policy")
-    rewritten(path, lambda tensors: None)  # without digests
-    config = json.loads((path / "config.json").read_text())
-    change(config["ways"])
-    (path / "config.json").write_text(json.dumps(config))
-    with pytest.raises((ModelFileError, DataError)) as caught:
-        TPGMMPolicy.from_pretrained(path)
-    # LeRobot's parser drops the words of errors: the log has them
-    assert re.search(message, f"{caught.value} {caplog.text}")
-
-
-def test_a_way_of_another_save_is_refused(two_ways, tmp_path):
-    path = shutil.copytree(two_ways, tmp_path / "policy")
-    replaced_text(path / "config.json", '"weight": 0.4', '"weight": 0.5')
-    with pytest.raises(ModelFileError, match=r"config.json is not what was saved"):
-        TPGMMPolicy.from_pretrained(path)
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("--modes=1", "modes=2, got 1"),
-        ("--modes=auto", "modes=2, got 'auto'"),
-        ("--holds=[]", "2 ways, each with its own holds"),
-    ],
-)
-def test_settings_that_are_of_each_way_are_not_for_all(two_ways, override, message, caplog):
-    with pytest.raises(ParsingError):
-        loaded(two_ways, override)
-    assert message in caplog.text

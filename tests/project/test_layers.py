@@ -53,7 +53,8 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("app",),
     ),
     "lerobot_policy_tpgmm": (
-        ("configuration_tpgmm", "control_rate", "tick_durations"),
+        ("settings", "control_rate", "tick_durations"),
+        ("configuration_tpgmm",),
         ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
         ("policy_files", "training"),
         ("modeling_tpgmm",),

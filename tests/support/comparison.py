@@ -82,5 +82,5 @@ RESULTS = [
 DISTURBED = [
     result("tpgmm", 10, 20, condition="stopped-3"),
     result("tpgmm-open-loop", 10, 2, condition="stopped-3"),
-    result("tpgmm --policy.blend=0", 10, 3, condition="stopped-3"),
+    result("tpgmm --policy.control.blend=0", 10, 3, condition="stopped-3"),
 ]

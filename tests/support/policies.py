@@ -11,6 +11,13 @@ from lerobot.policies.factory import make_policy
 from torch import Tensor
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from lerobot_policy_tpgmm.settings import (
+    ControlConfig,
+    EMConfig,
+    FitConfig,
+    FusionConfig,
+    TrainingConfig,
+)
 from tests.support.skills import bottle_demonstrations, small_bottle
 from tpgmm_torch import Demonstration, Frame, Situation
 
@@ -23,7 +30,28 @@ def fitted() -> TPGMMPolicy:
     return TPGMMPolicy.from_estimator(small_bottle())
 
 
-#: What plays a skill as it was at the start.
+GROUPS = {
+    "em": EMConfig,
+    "fusion": FusionConfig,
+    "control": ControlConfig,
+    "training": TrainingConfig,
+    "fit": FitConfig,
+}
+
+
+def grouped(**options: object) -> dict[str, object]:
+    """Options of a configuration, each in its group."""
+    found, groups = {}, {}
+    for name, value in options.items():
+        kinds = [group for group, kind in GROUPS.items() if name in kind.__annotations__]
+        for group in kinds:
+            groups.setdefault(group, {})[name] = value
+        if not kinds:
+            found[name] = value
+    return found | {group: GROUPS[group](**values) for group, values in groups.items()}
+
+
+#: Settings that play a skill as it was at the start.
 OPEN = {"closed_loop": False, "follow_frames": False, "clock": "even"}
 
 
@@ -34,7 +62,7 @@ def played() -> TPGMMPolicy:
 
 
 def policy(**options: object) -> TPGMMPolicy:
-    return TPGMMPolicy.from_estimator(small_bottle(), **options)
+    return TPGMMPolicy.from_estimator(small_bottle(), **grouped(**options))
 
 
 def pose(frame: Frame) -> Tensor:
@@ -77,7 +105,8 @@ def changed(given: TPGMMPolicy, **fields: object) -> TPGMMPolicy:
     """The same numbers under another configuration."""
     config = copy.deepcopy(given.config)
     for name, value in fields.items():
-        setattr(config, name, value)
+        owner = [group for group, kind in GROUPS.items() if name in kind.__annotations__]
+        setattr(getattr(config, owner[0]) if owner else config, name, value)
     other = TPGMMPolicy(config)
     other.load_state_dict(given.state_dict())
     return other.eval()

@@ -12,6 +12,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.policies import grouped
 from tests.support.skills import HANDLING, HANDS, handlings, wave
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration
@@ -66,7 +67,7 @@ def dataset(path: Path, episodes: Sequence[int] | None = None) -> LeRobotDataset
 
 def fresh(data: LeRobotDataset, **options: object) -> TPGMMPolicy:
     """As lerobot-train makes it: not fitted, in training mode."""
-    config = TPGMMConfig(device="cpu", push_to_hub=False, **options)
+    config = TPGMMConfig(device="cpu", push_to_hub=False, **grouped(**options))
     return make_policy(config, ds_meta=data.meta).train()
 
 
@@ -98,6 +99,6 @@ def resumed(path: Path, data: LeRobotDataset, **options: object) -> TPGMMPolicy:
     """As lerobot-train makes it from a saved one."""
     config = PreTrainedConfig.from_pretrained(path)
     config.pretrained_path = path
-    for name, value in options.items():
+    for name, value in grouped(**options).items():
         setattr(config, name, value)
     return make_policy(config, ds_meta=data.meta).train()

@@ -55,7 +55,9 @@ def test_results_come_in_natural_order(tmp_path):
 def test_settings_of_a_policy_share_a_training_and_not_a_result(tmp_path):
     plain = replace(CELL, policy="tpgmm")
     open_loop = replace(CELL, policy="tpgmm-open-loop")
-    other = replace(CELL, policy="tpgmm --policy.feedback=observation --policy.units=a/b")
+    other = replace(
+        CELL, policy="tpgmm --policy.control.feedback=observation --policy.units=a/b"
+    )
     assert plain.training == open_loop.training == other.training
     assert len({plain.key, open_loop.key, other.key}) == 3
     assert "/" not in other.key and " " not in other.key

@@ -188,7 +188,7 @@ def test_conditions_are_tried_with_the_policy_that_is_there(whole, tmp_path):
     shutil.copytree(whole, out)
     place = out / SETTINGS.env
     conditions = ["stopped-1", "moved+pose-stale"]
-    policies = ["tpgmm", OPEN_LOOP, "tpgmm --policy.follow_frames=true"]
+    policies = ["tpgmm", OPEN_LOOP, "tpgmm --policy.control.follow_frames=true"]
     said = []
     few = replace(SETTINGS, episodes=1)
     few.keep(out / "few.json")

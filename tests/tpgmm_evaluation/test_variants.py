@@ -2,8 +2,8 @@
 
 import pytest
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
+from lerobot_policy_tpgmm.settings import ControlConfig
 from tests.support.policies import fitted
 from tpgmm_evaluation.rollouts import Runner
 from tpgmm_evaluation.variants import OPEN_LOOP, Variant
@@ -16,17 +16,23 @@ def test_a_name_alone_has_no_settings():
 
 
 def test_settings_follow_the_name():
-    variant = Variant.parse("tpgmm --policy.feedback=observation --policy.blend=0.5")
-    assert variant == Variant("tpgmm", ("feedback=observation", "blend=0.5"))
-    assert variant.arguments == ["--feedback=observation", "--blend=0.5"]
+    variant = Variant.parse(
+        "tpgmm --policy.control.feedback=observation --policy.control.blend=0.5"
+    )
+    assert variant == Variant("tpgmm", ("control.feedback=observation", "control.blend=0.5"))
+    assert variant.arguments == ["--control.feedback=observation", "--control.blend=0.5"]
 
 
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ("tpgmm feedback=observation", DataError, "look like --policy.feedback=observation"),
-        ("tpgmm --policy.blend", DataError, "got '--policy.blend'"),
-        ("act --policy.blend=1", DataError, "only tpgmm policies take settings"),
+        (
+            "tpgmm feedback=observation",
+            DataError,
+            "look like --policy.control.feedback=observation",
+        ),
+        ("tpgmm --policy.control.blend", DataError, "got '--policy.control.blend'"),
+        ("act --policy.control.blend=1", DataError, "only tpgmm policies take settings"),
         ("tpgmm --policy.rain=1", UnknownNameError, "field 'rain' is not in the policy"),
     ],
 )
@@ -39,7 +45,7 @@ def test_the_open_loop_plays_by_the_clock_and_looks_once(tmp_path):
     for part in (fitted(), *make_tpgmm_pre_post_processors(fitted().config)):
         part.save_pretrained(tmp_path)
     config = Runner.load(tmp_path, Variant.parse(OPEN_LOOP).arguments).policy.config
-    assert (config.feedback, config.follow_frames) == ("reference", False)
-    assert config.largest_start_gap is None
+    assert (config.control.feedback, config.control.follow_frames) == ("reference", False)
+    assert config.control.largest_start_gap is None
     usual = Runner.load(tmp_path).policy.config
-    assert usual.largest_start_gap == TPGMMConfig.largest_start_gap
+    assert usual.control == ControlConfig()

@@ -21,6 +21,7 @@ from lerobot_env_bimanual.metaworld.hand import (
     metaworld_robot,
 )
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from lerobot_policy_tpgmm.settings import ControlConfig
 from tpgmm_evaluation.metaworld.nearness import Nearness
 from tpgmm_evaluation.metaworld.networks import NETWORKS, Network
 from tpgmm_evaluation.metaworld.perceptron import Perceptron
@@ -199,17 +200,19 @@ class TaskParameterized:
         policy = TPGMMPolicy.from_estimator(
             model,
             fps=FPS,
-            blend=0.0,
             environment_names=[f"e{i}" for i in range(7 * len(FRAMES))],
             frames=frames,
-            follow_frames=False,
-            closed_loop=self.clock is not None,
-            clock=self.clock or "even",
-            smoothing=None,
             chunk_size=round(float(model.time_[-1] - model.time_[0]) * FPS) + 1,
-            largest_start_gap=None,
-            acceleration={JOINTS[-1]: ACCELERATION},
-            jerk={JOINTS[-1]: JERK},
+            control=ControlConfig(
+                blend=0.0,
+                follow_frames=False,
+                closed_loop=self.clock is not None,
+                clock=self.clock or "even",
+                smoothing=None,
+                largest_start_gap=None,
+                acceleration={JOINTS[-1]: ACCELERATION},
+                jerk={JOINTS[-1]: JERK},
+            ),
         )
         return TaskParameterizedActor(policy, self.clock is None)
 

@@ -120,7 +120,7 @@ class Learner:
         self._dataset, flags = dataset_meta, dataset_meta.features
         self._stored = [k.removeprefix(EVENT) for k in flags if k.startswith(EVENT)]
         sources = event_sources(
-            config.events, config.link_poses(), self._stored, kinematics.joint_names
+            config.training.events, config.link_poses(), self._stored, kinematics.joint_names
         )
         self._detectors = {n: s for n, s in sources.items() if isinstance(s, Detector)}
         self._fps = float(dataset_meta.fps)
@@ -199,8 +199,8 @@ class Learner:
         config = self._config
         if config.holds:  # they do not tell where an object was last free
             return f"objects are held, {', '.join(config.holds)}"
-        if config.link_frames:  # nor where a link is at an event of the episode
-            return f"frames are at events, {', '.join(config.link_frames.values())}"
+        if config.training.link_frames:  # nor where a link is at an event of the episode
+            return f"frames are at events, {', '.join(config.training.link_frames.values())}"
         return ""
 
     def check_saveable(self) -> None:
@@ -221,7 +221,7 @@ class Learner:
 
     def _finish(self, recorder: EpochRecorder) -> None:
         """Learn from the recorded episodes; the configuration says what a warning does."""
-        action = self._config.plausibility
+        action = self._config.training.plausibility
         with warnings.catch_warnings():
             if action in ("error", "ignore"):
                 warnings.simplefilter(action, PlausibilityWarning)  # type: ignore[arg-type]
@@ -238,15 +238,17 @@ class Learner:
         )
         check(demonstrations, kinematics).act()
         aligner: Alignment | None
-        if config.alignment == "parts":
+        if config.training.alignment == "parts":
             demonstrations = Segmentation(kinematics).fit_transform(demonstrations)
             aligner = EventAlignment(["part *"], robot=kinematics)
         else:
-            aligner = parse_alignment(config.alignment, kinematics, config.alignment_features)
+            aligner = parse_alignment(
+                config.training.alignment, kinematics, config.training.alignment_features
+            )
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(numbers))
         if aligner is not None:
-            log.info("aligning them: --policy.alignment=%s", config.alignment)
+            log.info("aligning them: --policy.training.alignment=%s", config.training.alignment)
         aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
         if not mixture.fitted:
             self._fit(config.estimator(kinematics, list(self._operators)), aligned)
@@ -263,7 +265,7 @@ class Learner:
         shown = list(aligned)
         if config.holds is not None:
             shown = with_holds(shown, list(map(Hold.parse, config.holds)))
-        if config.robust:
+        if config.training.robust:
             shown = drop_outliers(shown, self._operators, model.robot)
         if config.holds is None:
             shown = attach_holds(shown, model.robot)
@@ -281,7 +283,7 @@ class Learner:
         config, mixture, operators = self._config, self._mixture, self._operators
         holds = list(map(Hold.parse, config.holds or ()))
         shown = list(aligned.values())
-        if config.robust:  # as in fit, which says so
+        if config.training.robust:  # as in fit, which says so
             outlying = outlying_demonstrations(shown, operators, kinematics, holds)
             self._left_out = {list(aligned)[one.episode] for one in outlying}
             if self._left_out:
@@ -302,11 +304,11 @@ class Learner:
                 mixture,
                 points,
                 self._regularization(rows, kinematics),
-                config.covariance_shrinkage if config.covariance_type in SHRUNK else 0.0,
+                config.em.covariance_shrinkage if config.em.covariance_type in SHRUNK else 0.0,
                 len(kept),
             )
             likelihood = likelihood_loss(mixture, points, self.prior)
-        unit = "imitation error [mrad^2]" if config.loss == "imitation" else "same"
+        unit = "imitation error [mrad^2]" if config.training.loss == "imitation" else "same"
         log.info(
             "negative log-likelihood per frame, with the prior: %.3f; further steps go on by "
             "gradient, and their loss is the %s",
@@ -320,7 +322,7 @@ class Learner:
         """Demonstrations with the events and the frames at links that are asked for."""
         config, poses, detectors = self._config, self._config.link_poses(), self._detectors
         found = list(shown.values())
-        named = config.alignment.startswith("events")
+        named = config.training.alignment.startswith("events")
         if self._stored and (poses or named):
             # LeRobot's preprocessor hands no such columns on
             log.info("reading events: %s", ", ".join(self._stored))
@@ -334,7 +336,8 @@ class Learner:
             if lost:
                 raise DataError(
                     f"event {event!r}, at which a frame is, is not found in episodes {lost}: "
-                    "say how, --policy.events='{...}', or leave them out, --dataset.episodes"
+                    "say how, --policy.training.events='{...}', or leave them out, "
+                    "--dataset.episodes"
                 )
         return [
             replace(
@@ -376,11 +379,11 @@ class Learner:
             moments,
             self._operators,
             kinematics,
-            reg_covar=config.reg_covar,
-            covariance_type=config.covariance_type,
+            reg_covar=config.em.reg_covar,
+            covariance_type=config.em.covariance_type,
         )
         widths = [mean.shape[1] for mean in self._mixture.means]
-        isotropic = config.covariance_type == "spherical"
+        isotropic = config.em.covariance_type == "spherical"
         scales = torch.cat(moments.standardization(widths, isotropic=isotropic).scales)
         added = torch.from_numpy(shares) * scales.square()
         return list(added.to(self._mixture.time).split(widths))
@@ -388,7 +391,7 @@ class Learner:
     def _demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:
         rows = {key: column.to(self._mixture.time.device) for key, column in columns.items()}
         joints = self._shown(rows).cpu()
-        follow = self._config.follow_frames
+        follow = self._config.control.follow_frames
         frames = self._frames.frames(rows if follow else {k: v[:1] for k, v in rows.items()})
         return Demonstration(
             torch.arange(len(joints), dtype=torch.float64) / self._fps,
@@ -399,14 +402,14 @@ class Learner:
 
     def _shown(self, rows: Mapping[str, Tensor]) -> Tensor:
         """The joint vectors (B, n_joints) that a demonstration is made of."""
-        if self._config.learn_from == "commanded":
+        if self._config.training.learn_from == "commanded":
             return self._joints.commanded(rows[ACTION])
         return self._joints.joints(rows[OBS_STATE])
 
     def _aligned_clock(self, aligner: Alignment | None, numbers: Sequence[int]) -> Clock:
         """Paths of the learned episodes, on the time grid of the mixture."""
         lengths = {number: len(frames) for number, frames in self._ranges.items()}
-        if self._config.alignment == "none":
+        if self._config.training.alignment == "none":
             return Clock(lengths, None, {}, self._fps)
         grid = self._mixture.time.detach().cpu().double().numpy()
         paths = {}
@@ -437,7 +440,7 @@ class Learner:
             self._kinematics = self._kinematics.to(device=mixture.time.device)
         samples = self._samples(batch, numbers, steps)
         model = regression(config, self._kinematics, self._operators, mixture)
-        if config.loss == "likelihood":
+        if config.training.loss == "likelihood":
             # held-out frames are scored, not learned
             prior = self.prior if training else None
             loss = likelihood_loss(mixture, local_points(model, samples), prior)
@@ -446,8 +449,8 @@ class Learner:
             loss = imitation_loss(model, samples, targets, self._joints.order)
         if not loss.isfinite():
             raise DataError(
-                f"the {config.loss} loss is {loss.item()}: the steps are too large, lower "
-                "--policy.optimizer_lr"
+                f"the {config.training.loss} loss is {loss.item()}: the steps are too large, "
+                "lower --policy.training.optimizer_lr"
             )
         return loss
 
@@ -469,7 +472,7 @@ class Learner:
     ) -> dict[str, Tensor]:
         """What the frames are read from: the beginning of the episode, where it has come."""
         rows = {key: batch[key] for key in (OBS_STATE, OBS_ENV_STATE) if key in batch}
-        if self._config.follow_frames:
+        if self._config.control.follow_frames:
             return rows
         for place in torch.nonzero(steps == 0).flatten().tolist():
             number = int(numbers[place])

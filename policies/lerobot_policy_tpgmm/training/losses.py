@@ -59,14 +59,14 @@ def regression(
         first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
         local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
-    shown = None if config.shown is None else config.shown["n_demonstrations"]
+    shown = None if config.fit.shown is None else config.fit.shown["n_demonstrations"]
     return Regression(
         kinematics,
         operators,
         local,
         mixture.logits.log_softmax(0),
         fusion=config.estimator(None, ()).fusion or InformationFusion(),
-        n_samples=shown if config.covariance_shrinkage == "auto" else None,
+        n_samples=shown if config.em.covariance_shrinkage == "auto" else None,
     )
 
 

@@ -6,10 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from sklearn.pipeline import make_pipeline
 
-from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
-from tests.support.errands import HAND
 from tests.support.policies import loaded
 from tests.support.skills import HANDLING, HANDS, same
 from tests.support.training import (
@@ -24,10 +21,9 @@ from tests.support.training import (
     trained,
 )
 from tpgmm_datasets import load_lerobot
-from tpgmm_torch import Canonical, RelativePosition, Segmentation, TaskParameterizedGMM
-from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment, LinearTimeNormalization
+from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
-from tpgmm_torch.persistence import encode
 from tpgmm_torch.robots.joint_space import JointSpace
 
 # What is learned
@@ -51,7 +47,7 @@ def test_an_epoch_of_batches_is_what_the_estimator_learns(waves, alignment, alig
     policy = trained(waves, alignment=alignment, **WAVES)
     same(policy.to_estimator(), model, 1e-12)
     assert torch.equal(policy.to_estimator().time_, model.time_)
-    assert policy.config.n_steps == len(model.time_) and policy.config.fps == FPS
+    assert policy.config.fit.n_steps == len(model.time_) and policy.config.fps == FPS
 
 
 def test_frames_and_quaternions_are_learned(handlings):
@@ -64,34 +60,6 @@ def test_frames_and_quaternions_are_learned(handlings):
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-6)
 
 
-def test_parts_are_found_and_learned(errand_set, caplog, tmp_path):
-    """As tpgmm fit --parts auto --alignment parts does; the mixture then stays."""
-    operators = [RelativePosition("hand", name) for name in ("cup", "tray")] + [Canonical()]
-    shown = load_lerobot(errand_set.root)
-    steps = Segmentation(HAND), EventAlignment(["part *"], robot=HAND)
-    aligned = make_pipeline(*steps).fit_transform(shown)
-    model = TaskParameterizedGMM(6, operators, HAND, parts="auto").fit(aligned)
-    assert len(model.parts_) == 2
-    policy = trained(
-        errand_set, n_components=6, robot=encode(HAND), operators=list(map(encode, operators)),
-        parts="auto", alignment="parts",
-    )  # fmt: skip
-    same(policy.to_estimator(), model, 1e-9)
-    assert float(policy.config.parts) == pytest.approx(model.parts_[0].end, abs=1e-4)
-    loss, _ = policy.train().forward(epoch(errand_set, 32)[0])
-    assert float(loss.detach()) == 0 and "they end at" in caplog.text
-    policy.save_pretrained(tmp_path)
-    same(TPGMMPolicy.from_pretrained(tmp_path).to_estimator(), model, 1e-9)
-
-
-def test_parts_can_be_given(waves):
-    aligned = LinearTimeNormalization().fit_transform(load_lerobot(waves.root))
-    model = TaskParameterizedGMM(parts=[0.5, 1.2], **WAVES).fit(aligned)
-    policy = trained(waves, alignment="linear", parts="0.5, 1.2", **WAVES)
-    same(policy.to_estimator(), model, 1e-12)
-    assert policy.config.parts == "0.5,1.2"
-
-
 def test_commanded_joints_are_learned_by_name(commanded):
     options = {**WAVES, "alignment": "linear"}
     for joints in ("measured", "commanded"):
@@ -101,7 +69,7 @@ def test_commanded_joints_are_learned_by_name(commanded):
         same(policy.to_estimator(), TaskParameterizedGMM(**WAVES).fit(aligned), 1e-9)
         loss, _ = policy.train().forward(epoch(commanded, 32)[0])
         assert loss < 0  # what was learned is likely
-    with pytest.raises(DataError, match=r"--policy\.learn_from=commanded goes with"):
+    with pytest.raises(DataError, match=r"--policy\.training\.learn_from=commanded goes with"):
         fresh(commanded, learn_from="commanded", loss="imitation", **WAVES)
 
 
@@ -189,7 +157,9 @@ def test_evaluating_and_saving_fit_too(waves, tmp_path):
             policy.forward(batch)
         end(policy)
         assert policy.mixture.fitted
-    assert type(policy).from_pretrained(tmp_path).config.n_steps == policy.config.n_steps
+    assert (
+        type(policy).from_pretrained(tmp_path).config.fit.n_steps == policy.config.fit.n_steps
+    )
 
 
 def test_optimizers_leave_a_policy_alone_that_collects(waves, tmp_path):

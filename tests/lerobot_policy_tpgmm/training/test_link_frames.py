@@ -8,6 +8,7 @@ import torch
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
+from tests.support.policies import grouped
 from tests.support.skills import same
 from tests.support.training import dataset, epoch, fresh, trained
 from tpgmm_datasets import load_lerobot, save_lerobot
@@ -146,8 +147,8 @@ def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_
 
 def test_texts_and_links_that_are_none_are_refused(grips):
     with pytest.raises(DataError, match="LINK@EVENT"):
-        TPGMMConfig(device="cpu", link_frames={"bottle": "l_hand"})
+        TPGMMConfig(device="cpu", **grouped(link_frames={"bottle": "l_hand"}))
     with pytest.raises(DataError, match="cannot be found"):
-        TPGMMConfig(device="cpu", events={"close": "l_gripper"})
+        TPGMMConfig(device="cpu", **grouped(events={"close": "l_gripper"}))
     with pytest.raises(UnknownNameError, match=r"'foot'.*l_hand"):
         fresh(grips, link_frames={"bottle": "foot@close"}, **OPTIONS)

@@ -128,7 +128,7 @@ def test_what_em_left_out_is_not_learned_by_gradient(tmp_path):
             for rows in (wrong, ~wrong)
         ]
         losses = [value(policy, part) for part in parts]
-        if policy.config.robust:
+        if policy.config.training.robust:
             assert losses[0] == 0 and value(policy, batch) == pytest.approx(losses[1])
         else:
             assert losses[0] != 0 and value(policy, batch) != pytest.approx(losses[1])
@@ -258,5 +258,5 @@ def test_frames_are_those_of_the_beginning(handlings):
     carried = {**batch, "observation.environment_state": poses}
     loss = value(policy, batch)
     assert value(policy, carried) == loss
-    policy.config.follow_frames = True
+    policy.config.control.follow_frames = True
     assert value(policy, batch) == loss != value(policy, carried)

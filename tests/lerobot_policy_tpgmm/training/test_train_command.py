@@ -10,14 +10,12 @@ import torch
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_commands import lerobot
 from tests.support.skills import same
-from tests.support.two_ways import ARM, Handles, two_ways_set
 from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import Controller, MultimodalTaskParameterizedGMM, TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
-from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.operators.text import parse_operator
 
 RATE, BATCH, K = 10, 128, 8
@@ -65,7 +63,7 @@ def log(folder, n_steps):
     """The first epoch, then as many steps by gradient; checkpoints and losses after both."""
     return train(
         folder, "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
-        f"--policy.n_components={K}", "--policy.loss=imitation", "--num_workers=0",
+        f"--policy.n_components={K}", "--policy.training.loss=imitation", "--num_workers=0",
         "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
         "--dataset.eval_split=0.2", f"--batch_size={BATCH}", f"--steps={2 * n_steps}",
         f"--save_freq={n_steps}", f"--eval_steps={n_steps}", f"--output_dir={folder / 'out'}",
@@ -80,7 +78,7 @@ def test_the_first_epoch_gives_what_the_estimator_learns(folder, log, demonstrat
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(held_out) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-5)
-    assert policy.config.n_steps == len(model.time_) and policy.config.fps == RATE
+    assert policy.config.fit.n_steps == len(model.time_) and policy.config.fps == RATE
     frames = sum(map(len, learned))
     for said in (f"{frames} frames of 4 episodes collected", f"{K} components fitted by"):
         assert said in log
@@ -104,8 +102,9 @@ def test_events_that_the_set_keeps_anchor_time_and_frames(folder, demonstrations
     steps = -(-sum(map(len, demonstrations)) // 256)
     train(
         folder, "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
-        "--policy.n_components=5", "--policy.alignment=events", "--num_workers=0",
-        f"--policy.link_frames={json.dumps(at)}", f"--policy.operators={json.dumps(operators)}",
+        "--policy.n_components=5", "--policy.training.alignment=events", "--num_workers=0",
+        f"--policy.training.link_frames={json.dumps(at)}",
+        f"--policy.operators={json.dumps(operators)}",
         "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
         "--batch_size=256", f"--steps={steps}", f"--save_freq={steps}",
         f"--output_dir={folder / 'events'}",
@@ -132,55 +131,3 @@ def test_a_run_is_resumed(folder, log, n_steps):
     assert held_out[-1] < held_out[0]
     assert "components fitted" not in resumed
     saved(folder, end)
-
-
-def test_several_ways_are_found_learned_and_taken_by_lerobots_commands(tmp_path):
-    two_ways_set(tmp_path)
-    operators = ["position:tip@object", "canonical"]
-    log = train(
-        tmp_path, "--policy.type=tpgmm", f"--policy.robot={tmp_path / 'arm.urdf'}",
-        "--policy.links=['tip']", "--policy.device=cpu", "--policy.n_components=8",
-        f"--policy.operators={json.dumps(operators)}", "--policy.modes=auto",
-        "--policy.alignment=none", "--num_workers=0", "--dataset.repo_id=local/handles",
-        f"--dataset.root={tmp_path / 'set'}", "--batch_size=600", "--steps=2", "--save_freq=1",
-        f"--output_dir={tmp_path / 'out'}",
-    )  # fmt: skip
-    for said in ("looking for several ways", "2 ways:", "the skill is done in 2 ways"):
-        assert said in log
-    read = load_lerobot(tmp_path / "set", robot=ARM)
-    model = TaskParameterizedGMM(8, list(map(parse_operator, operators)), ARM)
-    model = MultimodalTaskParameterizedGMM(model).fit(read)
-    found = [saved(tmp_path, step).to_estimator() for step in (1, 2)]
-    for one in found:
-        assert one.labels_.tolist() == model.labels_.tolist()
-        torch.testing.assert_close(one.limits_, model.limits_)
-        for way, wanted in zip(one.models_, model.models_, strict=True):
-            same(way, wanted, 1e-9)
-    train(
-        tmp_path, f"--config_path={tmp_path / LAST / 'train_config.json'}", "--resume=true",
-        "--steps=3",
-    )  # fmt: skip
-    [situation] = Handles().situations(1, 0)
-    place, names = situation.frames["object"], [f"{name}.pos" for name in ARM.joint_names]
-    at = torch.cat((situation.joints, place.position, place.orientation)).tolist()
-    at = dict(zip([*names, *(f"object.{part}.pos" for part in POSE_PARTS)], at, strict=True))
-    start, moved = tmp_path / "start.json", tmp_path / "log.json"
-    start.write_text(json.dumps(at))
-    done = lerobot(
-        "rollout", "--strategy.type=base", f"--policy.path={tmp_path / LAST}",
-        "--robot.type=bimanual", f"--robot.start={start}", f"--robot.log={moved}",
-        f"--policy.state_names={json.dumps([*at])}", "--fps=20", "--duration=2",
-        f"--policy.action_names={json.dumps(names)}",
-        "--return_to_initial_position=false", "--task=take",
-        home=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    sent = torch.tensor([[*one.values()] for one in json.loads(moved.read_text())])
-    joints, frames = situation.joints.float(), {"object": place}
-    control = saved(tmp_path, 3).config.control()
-    controller = Controller(model.skill, joints.double(), frames, **control)
-    assert len(sent) >= 12
-    for tick, action in enumerate(sent):
-        command = controller.step(0.05, joints.double(), frames if tick else None)
-        torch.testing.assert_close(action.double(), command.reference, rtol=0, atol=1e-5)
-        joints = action

@@ -36,7 +36,7 @@ def report(tmp_path_factory):
         "| nominal | tpgmm | 20/20 = 100 % (84 to 100 %) | 1.0 / 1.0 |",
         "| stopped-3 | tpgmm-open-loop | 2/20 = 10 % (3 to 30 %) | inf / inf |",
         "| pushes+noise | tpgmm | 17/20 = 85 % (64 to 95 %) | 1.0 / inf |",
-        "- **tpgmm --policy.blend=0**: tpgmm with `blend=0`",
+        "- **tpgmm --policy.control.blend=0**: tpgmm with `blend=0`",
         "played by the clock with what is seen at the start, as in 0.1.0",
         # criteria, at ten demonstrations
         "| act | 90 % | 100 % | 100 % | 100 % | 50 % |",
@@ -74,7 +74,7 @@ def test_variants_stand_behind_what_they_vary(report):
     rows = [row.split(" | ")[:2] for row in conditions.splitlines() if row.startswith("| ")]
     assert [" ".join(row).strip("| ") for row in rows if "---" not in row[0]][-4:] == [
         "stopped-3 tpgmm",
-        "stopped-3 tpgmm --policy.blend=0",
+        "stopped-3 tpgmm --policy.control.blend=0",
         "stopped-3 tpgmm-open-loop",
         "pushes+noise tpgmm",
     ]

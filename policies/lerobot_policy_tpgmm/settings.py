@@ -1,0 +1,253 @@
+"""Groups of a policy's settings: learning, fusion, control, training, and results of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from tpgmm_torch import Trust, parse_clock
+from tpgmm_torch.alignment.text import METHODS
+from tpgmm_torch.checks.report import PLAUSIBILITY
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
+from tpgmm_torch.sensing.pose_filter import OneEuro
+
+__all__ = ["ControlConfig", "EMConfig", "FitConfig", "FusionConfig", "TrainingConfig"]
+
+#: Bounds for all joints, for each, or for some by name.
+Bound = dict[str, float] | list[float] | float | None
+
+
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """Refuse a ``value`` that is not among the ``choices`` of a setting.
+
+    Raises
+    ------
+    DataError
+    """
+    if value not in choices:
+        raise DataError(f"{name} is one of {list(choices)}, got {value!r}")
+
+
+@dataclass
+class EMConfig:
+    """Learning of the mixture, ``--policy.em.tol=1e-4``.
+
+    Parameters
+    ----------
+    covariance_type, reg_covar, covariance_shrinkage, tol, max_iter, n_init, init_params, \
+    responsibilities, random_state, dtype
+        As for :class:`tpgmm_torch.TaskParameterizedGMM`.
+    """
+
+    covariance_type: str = "full"
+    reg_covar: float = 1e-5
+    covariance_shrinkage: float | str = "auto"
+    tol: float = 1e-3
+    max_iter: int = 100
+    n_init: int = 1
+    init_params: str = "time"
+    responsibilities: str = "auto"
+    random_state: int | None = None
+    dtype: str = "float64"
+
+
+@dataclass
+class FusionConfig:
+    """The product of the operators' Gaussians, ``--policy.fusion.form=covariance``.
+
+    Parameters
+    ----------
+    form : {"information", "covariance"}, default="information"
+    prior_std, priorities, negligible
+        Of :class:`tpgmm_torch.InformationFusion`.
+    epsilon, activation
+        Of :class:`tpgmm_torch.CovarianceFusion`.
+    """
+
+    form: str = "information"
+    prior_std: dict[str, float] | list[float] | float = 10.0
+    priorities: list[int] | None = None
+    negligible: float = 1e-9
+    epsilon: float = 1e-4
+    activation: str = "time"
+
+    @classmethod
+    def of(cls, fusion: Fusion) -> FusionConfig:
+        """The settings of a form of fusion."""
+        if isinstance(fusion, CovarianceFusion):
+            return cls("covariance", epsilon=fusion.epsilon, activation=fusion.activation)
+        priorities = None if fusion.priorities is None else list(fusion.priorities)
+        prior_std: Any = fusion.prior_std
+        if isinstance(prior_std, Mapping):
+            prior_std = dict(prior_std)
+        elif isinstance(prior_std, Sequence):
+            prior_std = list(prior_std)
+        return cls("information", prior_std, priorities, fusion.negligible)
+
+    def value(self) -> Fusion:
+        """The form of fusion.
+
+        Raises
+        ------
+        DataError
+            If there is no such form.
+        """
+        check_choice("fusion.form", self.form, ("information", "covariance"))
+        if self.form == "covariance":
+            return CovarianceFusion(self.epsilon, self.activation)
+        return InformationFusion(self.prior_std, self.priorities, self.negligible)
+
+
+@dataclass
+class ControlConfig:
+    """Running a skill, ``--policy.control.clock=even``.
+
+    Parameters
+    ----------
+    clock : str, default="localizing:initial=anywhere"
+        How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
+        ``"waiting"`` or ``"localizing"``, with options. By default an episode may begin in the
+        middle of the skill.
+    smoothing : float or None, default=0.5
+        Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
+    joint_timeout, frame_timeout : float, default=0.2, 1.0
+        How long a robot goes on with the last accepted joints and frames, before it stands [s].
+    velocity, acceleration, jerk : float, list of float or dict, optional
+        Bounds that are tighter than those of the robot and of the demonstrations [rad/s^n].
+    keep_limits : bool, default=True
+        Whether references stay within the bounds of motion.
+    blend : float, default=1.0
+        How long the difference between start posture and model fades [s].
+    feedback : {"reference", "observation"}, default="reference"
+        What q_{t-1} is: the last reference (as in the paper), or the measured posture.
+    largest_start_gap : float or None, default=1.0
+        Refuse to begin if a joint stands further from its first reference [rad]: the order
+        or the unit is wrong then, or the robot does not stand where the skill begins.
+    follow_frames : bool, default=True
+        Read the frames at every step, instead of at the start of an episode alone.
+    closed_loop : bool, default=True
+        Read the joints at every step: the clock uses them, and a robot stands whose joints are
+        not accepted. Else a skill is played as it was at the start.
+    """
+
+    clock: str = "localizing:initial=anywhere"
+    smoothing: float | None = 0.5
+    joint_timeout: float = 0.2
+    frame_timeout: float = 1.0
+    velocity: Bound = None
+    acceleration: Bound = None
+    jerk: Bound = None
+    keep_limits: bool = True
+    blend: float = 1.0
+    feedback: str = "reference"
+    largest_start_gap: float | None = 1.0
+    follow_frames: bool = True
+    closed_loop: bool = True
+
+    def options(self) -> dict[str, Any]:
+        """Options of :class:`tpgmm_torch.Controller`.
+
+        Raises
+        ------
+        DataError
+            If a setting is out of range.
+        """
+        check_choice("control.feedback", self.feedback, ("reference", "observation"))
+        limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
+        bounds = {name: limit for name, limit in limits.items() if limit is not None}
+        return {
+            "clock": parse_clock(self.clock),
+            "trust": Trust(joint_timeout=self.joint_timeout, frame_timeout=self.frame_timeout),
+            "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
+            "feedback": "measured" if self.feedback == "observation" else "reference",
+            "bounds": (bounds or "robot") if self.keep_limits else None,
+            "blend": self.blend,
+        }
+
+
+@dataclass
+class TrainingConfig:
+    """Training by ``lerobot-train``, ``--policy.training.alignment=linear``.
+
+    Parameters
+    ----------
+    alignment : {"dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"}, \
+    default="dtw"
+        How episodes are brought onto one clock; ``"events"`` anchors them at all events,
+        ``"events+dtw"`` warps them in between, too; ``"parts"`` stretches each of the parts
+        that are found.
+    alignment_features : list of str, optional
+        Compared by time warping, as for
+        :class:`tpgmm_torch.alignment.DynamicTimeWarping`, by default the speed and the places
+        of the links and the joints.
+    learn_from : {"measured", "commanded"}, default="measured"
+        Whether the joints of a demonstration are its states or its actions. Measured joints
+        lag behind commanded ones, by which a skill learned from them misses.
+    loss : {"likelihood", "imitation"}, default="likelihood"
+        Minimised by gradient once the mixture is fitted.
+    optimizer_lr : float, default=1e-4
+        Step size of that training.
+    robust : bool, default=True
+        Whether episodes that are unlike the others are left out.
+    plausibility : {"warn", "error", "ignore"}, default="warn"
+        For recordings that are unlikely to be what they are taken for.
+    link_frames : dict of str to str, optional
+        Frames that are taken from a link at an event, ``{"bottle": "r_hand@close"}``:
+        ``LINK@EVENT`` as for :func:`tpgmm_datasets.load_lerobot`. When it runs, the policy
+        reads them like any frame, but for those at ``start``: they follow from the joints.
+    events : dict of str to str, optional
+        How events are found, ``{"close": "closing:*gripper*"}``, as
+        :func:`tpgmm_torch.events.parse_event` takes it. Others are those of the columns
+        ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
+        frame is are found by themselves, where there is no such column.
+    """
+
+    alignment: str = "dtw"
+    alignment_features: list[str] | None = None
+    learn_from: str = "measured"
+    loss: str = "likelihood"
+    optimizer_lr: float = 1e-4
+    robust: bool = True
+    plausibility: str = "warn"
+    link_frames: dict[str, str] = field(default_factory=dict)
+    events: dict[str, str] = field(default_factory=dict)
+
+    def check(self) -> None:
+        """Refuse settings that do not exist or do not go together.
+
+        Raises
+        ------
+        DataError
+        """
+        check_choice("training.alignment", self.alignment, (*METHODS, "parts"))
+        check_choice("training.learn_from", self.learn_from, ("measured", "commanded"))
+        check_choice("training.loss", self.loss, ("likelihood", "imitation"))
+        check_choice("training.plausibility", self.plausibility, PLAUSIBILITY)
+        if (self.learn_from, self.loss) == ("commanded", "imitation"):
+            raise DataError(
+                "the imitation error is that of actions that follow measured joints: "
+                "--policy.training.learn_from=commanded goes with "
+                "--policy.training.loss=likelihood"
+            )
+
+
+@dataclass
+class FitConfig:
+    """Results of a fit beside the numbers of the mixture; empty before.
+
+    Parameters
+    ----------
+    n_steps : int, default=0
+        T, the length of the time grid that was learned; 0 before a fit.
+    shown : dict, optional
+        The summary of the demonstrations, :class:`tpgmm_torch.checks.TrainingSummary`, as JSON.
+    peaks : list of two lists of float, optional
+        Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
+        the bounds of joints that neither the robot nor the user bounds.
+    """
+
+    n_steps: int = 0
+    shown: dict[str, Any] | None = None
+    peaks: list[list[float]] | None = None
