@@ -59,24 +59,6 @@ def test_signs_are_right_and_offsets_as_good_as_they_say(seed: int) -> None:
     assert math.radians(0.5) < found.orientation_error < math.radians(1.2)
 
 
-def test_ten_exact_postures_give_it_exactly() -> None:
-    degrees, poses, signs, offsets = recorded(7, noise=0.0)
-    found = estimate_motor_map(ARM, LINK, degrees, poses, names=MOTORS, units="deg")
-    assert list(found.signs.values()) == signs[:5].int().tolist()
-    assert errors(found, offsets, MOTORS[:5]).abs().max() < 1e-6
-    # what does not move the link stays in the unit that was given
-    assert found.units["gripper.pos"] == Scale(math.pi / 180)
-    joints = torch.stack(
-        [
-            degrees[:, i] * found.units[m].factor + found.units[m].offset
-            for i, m in enumerate(MOTORS)
-        ],
-        -1,
-    )
-    reached = ARM.state(joints)
-    torch.testing.assert_close(reached.position(LINK), poses.position, rtol=0, atol=1e-9)
-
-
 def test_scales_with_a_zero_of_their_own_and_known_motors_are_kept() -> None:
     degrees, poses, signs, offsets = recorded(3, noise=0.0)
     scale = Scale(math.pi / 180, 0.4)

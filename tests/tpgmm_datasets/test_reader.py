@@ -48,13 +48,6 @@ def test_iteration_reads_an_episode_when_it_comes(root):
         next(episodes)
 
 
-def test_columns_that_only_lerobot_needs_may_be_missing(root):
-    expected = joints_of(load_lerobot(root))
-    for name in ("index", "frame_index", "task_index", "timestamp"):
-        change_table(root, DATA, lambda table, name=name: table.drop_columns([name]))
-        assert_equal(joints_of(load_lerobot(root)), expected)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

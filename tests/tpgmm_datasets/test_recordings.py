@@ -17,9 +17,7 @@ from tpgmm_datasets import (
     Scale,
     describe_lerobot,
     load_lerobot,
-    save_lerobot,
 )
-from tpgmm_datasets.tables import demonstrations_from_frame, demonstrations_to_frame
 from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import joint_rmse
@@ -99,21 +97,6 @@ def test_honeytea_is_two_hands_without_a_robot():
         assert float((norms - 1).abs().max()) < 1e-3
     state = next(c for c in describe_lerobot(DATA / "honeytea_bimanual").columns if c.names)
     assert state.names[3] == "left_qw"
-
-
-@needs_recordings
-@pytest.mark.parametrize("name", ["g1_bottle", "so101_record", "honeytea_bimanual"])
-def test_what_is_read_can_be_written_read_and_tabulated(name, tmp_path):
-    demonstrations = load_lerobot(DATA / name, units="raw", episodes=slice(3))
-    fps = int(describe_lerobot(DATA / name).fps)
-    root = save_lerobot(demonstrations, tmp_path / name, fps=fps, task="again")
-    for other in (
-        load_lerobot(root, units="raw"),
-        demonstrations_from_frame(demonstrations_to_frame(demonstrations)),
-    ):
-        for found, expected in zip(other, demonstrations, strict=True):
-            assert torch.equal(found.joints, expected.joints)
-            assert np.array_equal(found.time, expected.time)
 
 
 @pytest.fixture(scope="module")

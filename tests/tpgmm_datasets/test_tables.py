@@ -86,17 +86,6 @@ def test_the_table_is_flat():
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_files_have_every_digit(tmp_path, suffix):
-    made = [demonstration(0, 4, events={"go": 0.03}), demonstration(1, 6)]
-    path = tmp_path / "new" / f"table.{suffix}"
-    write_table(demonstrations_to_frame(made), path)
-    write_table(demonstrations_to_frame(made), path)  # in place of the one before
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
-    for found, expected in zip(demonstrations_from_frame(read_table(path)), made, strict=True):
-        assert_same(found, expected)
-
-
-@pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_trajectories_have_their_covariance(tmp_path, suffix):
     path = tmp_path / f"table.{suffix}"
     shown = handlings(2)
@@ -138,19 +127,6 @@ def test_tables_of_others_need_no_episode_and_may_have_more_columns():
     both = pd.concat([pd.DataFrame(rows).assign(take=name) for name in ("b", "a")])
     options = {"joints": ["elbow"], "time": "stamp", "episode": "take"}
     assert len(demonstrations_from_frame(both, **options)) == 2
-
-
-def test_a_frame_may_be_constant_in_one_demonstration_and_move_in_another():
-    still, moving = demonstration(0), demonstration(1)
-    other = Demonstration(
-        moving.time,
-        moving.joints,
-        {"bottle": moving.frames["hand.left"], "hand.left": moving.frames["bottle"]},
-        NAMES,
-    )
-    found = demonstrations_from_frame(demonstrations_to_frame([still, other]))
-    assert found[1].frames["bottle"].batch_shape == (6,)
-    assert found[1].frames["hand.left"].batch_shape == ()
 
 
 def without(column):
@@ -265,13 +241,6 @@ def test_what_is_no_file_of_a_table_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without_pandas)
     with pytest.raises(DependencyError, match=r"pip install 'tpgmm-torch\[data\]'"):
         demonstrations_to_frame([demonstration()])
-
-
-def test_the_table_given_is_not_changed():
-    table = demonstrations_to_frame([demonstration(0), demonstration(1, 4)])
-    copy = table.copy(deep=True)
-    demonstrations_from_frame(table)
-    pd.testing.assert_frame_equal(table, copy)
 
 
 def test_an_episode_column_that_is_asked_for_is_there():

@@ -2,9 +2,7 @@
 
 import math
 
-import numpy as np
 import pytest
-import torch
 
 from tests.support.lerobot_sets import (
     DATA,
@@ -18,16 +16,7 @@ from tests.support.lerobot_sets import (
     undeclared,
 )
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
-from tpgmm_datasets.errors import DatasetWarning
-from tpgmm_datasets.units import as_scale, convert, guess_unit, with_pose_units
-
-
-def test_degrees_become_radians(root):
-    expected = joints_of(load_lerobot(root))
-    undeclared(root, 180 / math.pi)
-    assert_equal(joints_of(load_lerobot(root, units="deg")), expected)
-    by_name = dict.fromkeys(NAMES, "deg")
-    assert_equal(joints_of(load_lerobot(root, units=by_name)), expected)
+from tpgmm_datasets.units import as_scale, guess_unit, with_pose_units
 
 
 def test_declared_units_are_believed(root):
@@ -36,15 +25,6 @@ def test_declared_units_are_believed(root):
     units = {"units": ["deg", "deg", "deg"]}
     change_info(root, lambda i: i["features"]["observation.state"].update(info=units))
     assert_equal(joints_of(load_lerobot(root)), expected)
-
-
-def test_a_unit_of_one_value_leaves_the_others(root):
-    plain = joints_of(load_lerobot(root))
-    with pytest.warns(DatasetWarning, match="declares 'gripper' in 'rad', not Scale"):
-        found = joints_of(load_lerobot(root, units={"gripper": Scale(2.0, 1.0)}))
-    for a, b in zip(found, plain, strict=True):
-        torch.testing.assert_close(a[:, :2], b[:, :2])
-        torch.testing.assert_close(a[:, 2], 2 * b[:, 2] + 1)
 
 
 def test_values_that_cannot_be_radians_are_refused_until_said_what_they_are(root):
@@ -97,17 +77,6 @@ def test_calibrated_values_are_angles_from_the_zero(zero, per_turn, stored):
         tick = low + share * (high - low) - (2000 if zero is None else zero)
         angle = 2 * math.pi * tick / per_turn
         assert scale.factor * value + scale.offset == pytest.approx(angle, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("unit", "factor"),
-    [("rad", 1), ("deg", math.pi / 180), ("m", 1), ("mm", 1e-3), ("raw", 1), ("auto", 1)],
-)
-def test_units_have_names(unit, factor):
-    assert as_scale(unit, "c") == Scale(factor)
-    stored = np.array([[0.5, -2.0]])
-    converted = convert(stored, ("a", "gripper"), (unit, Scale(3.0, 1.0)), "c")
-    assert converted == pytest.approx(np.array([[0.5 * factor, -5.0]]))
 
 
 def test_an_unknown_unit_is_refused_with_its_column():

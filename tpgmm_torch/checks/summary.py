@@ -463,9 +463,10 @@ def _problem(summary: TrainingSummary, kinematics: Kinematics | None) -> str:
     possible = {
         "joint_names": kinematics is None or names == tuple(kinematics.joint_names),
         "link": kinematics is None or linked <= {*kinematics.links},
-        "n_demonstrations": summary.n_demonstrations >= 1,
+        "n_demonstrations": type(summary.n_demonstrations) is int
+        and summary.n_demonstrations > 0,
         "limit": summary.limit > 0,
-        "compared": len({*compared} & {*range(n)}) == len(compared),
+        "compared": len({*map(repr, compared)} & {*map(repr, range(n))}) == len(compared),
         "moves": all(type(frame.moves) is bool for frame in frames.values()),
         "events": all(0 <= at <= 1 for at in summary.events.values()),
     }

@@ -35,11 +35,6 @@ def test_the_name_of_a_feature_stands_for_its_pose(root):
         assert_equal([a.frames["bottle"].position], [c.frames["flask"].position])
 
 
-def test_a_given_frame_is_taken_as_it_is(root):
-    table = Frame([0, 0, 1])
-    assert load_lerobot(root, frames={"table": table})[2].frames == {"table": table}
-
-
 def closing(demonstration):
     return float(demonstration.time[3])
 

@@ -73,18 +73,6 @@ def test_units_and_clocks_do_not_matter(scale, offset, shift):
     assert other.confidence == pytest.approx(found.confidence, abs=1e-6)
 
 
-def test_a_force_is_high_during_a_contact():
-    times, confidences = both(1 - opening(), "high")
-    assert times == pytest.approx([CLOSES, OPENS], abs=0.1)
-    assert min(confidences) > 0.7
-
-
-def test_a_gripper_that_never_opens_again_has_closed_and_not_opened():
-    (close, opened), (sure, not_at_all) = both(np.where(TIME < CLOSES, 1.0, 0.2))
-    assert close == pytest.approx(CLOSES, abs=0.05) and sure > 0.9
-    assert np.isnan(opened) and not_at_all == 0
-
-
 def test_a_gripper_that_is_closed_from_the_start_has_opened_and_not_closed():
     (close, opened), (not_at_all, sure) = both(np.where(TIME < CLOSES, 0.2, 1.0))
     assert opened == pytest.approx(CLOSES, abs=0.05) and sure > 0.9

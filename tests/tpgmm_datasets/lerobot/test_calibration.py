@@ -120,11 +120,6 @@ def test_a_calibration_is_a_file_or_several_by_prefix(arm, calibration):
         load_lerobot(arm, joints="arm", calibration=calibration)
 
 
-def test_a_prefix_that_no_motor_has_is_told(arm, file):
-    with pytest.raises(DatasetError, match=r"the motor 'lft_\w+' is none.*--units left_=FILE"):
-        load_lerobot(arm, joints="arm", calibration={"lft_": file})
-
-
 def test_values_in_degrees_and_units_for_all_are_refused(arm, file):
     change_table(arm, DATA, lambda t: set_column(t, "arm", lambda values: 1.2 * values))
     with pytest.raises(DatasetError, match=r"goes from -120 to .*use_degrees.*units='deg'"):

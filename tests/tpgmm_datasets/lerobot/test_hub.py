@@ -6,12 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.lerobot_sets import assert_refused
-from tests.support.written_sets import FPS, demonstration
 from tpgmm_datasets import (
     DatasetError,
     load_lerobot,
-    save_lerobot,
 )
 from tpgmm_torch.exceptions import DependencyError
 
@@ -62,18 +59,7 @@ def test_a_folder_that_is_not_there_is_never_looked_up_on_the_hub(path, tmp_path
     assert said == (path == "recordings/botles")
 
 
-def test_an_exchange_that_was_killed_is_undone(tmp_path):
-    root = save_lerobot([demonstration(0)], tmp_path / "set", fps=FPS, task="reach")
-    root.rename(tmp_path / ".set.abcdefgh.previous")
-    assert len(load_lerobot(root)) == 1
-
-
 @pytest.mark.parametrize("path", ["hf://someone/bottles", "s3://bucket/bottles"])
 def test_an_address_that_is_none_of_the_hub_is_refused(path):
     with pytest.raises(DatasetError, match="is neither a folder nor hf://datasets/OWNER/NAME"):
         load_lerobot(path)
-
-
-def test_a_folder_that_is_not_there_is_refused(root):
-    shutil.rmtree(root)
-    assert_refused(root, "missing")

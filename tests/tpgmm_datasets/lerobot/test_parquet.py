@@ -12,7 +12,6 @@ from tests.support.lerobot_sets import (
     assert_equal,
     assert_refused,
     change_info,
-    change_table,
     joints_of,
     set_column,
     to_v21,
@@ -50,10 +49,6 @@ def cut_file(root):
     (root / DATA).write_bytes((root / DATA).read_bytes()[:-200])
 
 
-def without(name):
-    return lambda root: change_table(root, DATA, lambda table: table.drop_columns([name]))
-
-
 def test_a_missing_file_can_be_relaxed(root, tmp_path):
     old = to_v21(root, tmp_path / "old")
     (old / "data/chunk-000/episode_000001.parquet").unlink()
@@ -89,9 +84,3 @@ def test_what_stands_in_place_of_a_file_is_told(root, place, message, file):
     with pytest.raises(DatasetError, match="no meta/info.json|" + message) as caught:
         load_lerobot(root)
     assert caught.value.check == "missing"
-
-
-@pytest.mark.parametrize("column", ["observation.state", "episode_index"])
-def test_a_column_that_is_missing_is_named(root, column):
-    without(column)(root)
-    assert_refused(root, "", DATA, column=column)

@@ -181,7 +181,7 @@ def test_a_frame_at_a_link_follows_from_the_start_posture():
 def damages(config):
     """Copies of nested dictionaries and lists, one value spoiled or left out in each."""
     for key, value in config.items() if isinstance(config, dict) else enumerate(config):
-        for wrong in (None, "x", [], -1.5, float("nan"), {}, True):
+        for wrong in (None, "x", [], -1.5, 1.0, float("nan"), {}, True):
             if wrong != value and not (key == "link" and wrong is None):
                 spoiled = copy.copy(config)
                 spoiled[key] = wrong
@@ -209,7 +209,7 @@ def test_json_gives_it_back_and_damage_is_refused():
             continue
         accepted += 1
         # another number where a number may be: it has to work as one
-        assert wrong in (-1.5, True) or path in ("events", "frames"), (path, wrong)
+        assert wrong in (-1.5, 1.0) or path in ("events", "frames"), (path, wrong)
         assert np.isfinite(again.novelty(starts, {"cup": frame})).all()
         again.findings(starts[0] + 9, {"cup": frame[0]})
         again.start_frames(starts, robot)
