@@ -9,10 +9,8 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
-__all__ = ["PLAUSIBILITY", "Finding", "Report", "listed"]
+__all__ = ["Finding", "Report", "listed"]
 
-#: What can be done about findings.
-PLAUSIBILITY = ("warn", "error", "ignore")
 #: So many examples of one finding, and so many findings, are spelled out in a message; a
 #: report has them all.
 MOST_EXAMPLES, MOST_FINDINGS = 3, 8
@@ -103,13 +101,11 @@ class Report:
         """What cannot be."""
         return tuple(finding for finding in self if finding.impossible)
 
-    def act(self, plausibility: str = "warn", packages: tuple[str, ...] = ()) -> Report:
+    def act(self, packages: tuple[str, ...] = ()) -> Report:
         """Raise an error if something cannot be, warn once of what is unlikely.
 
         Parameters
         ----------
-        plausibility : {"warn", "error", "ignore"}, default="warn"
-            "error" raises what is unlikely too; "ignore" does nothing.
         packages : tuple of str, default=()
             Folders of code, beside this package, that the warning does not point at: it names
             the line that called them.
@@ -121,22 +117,18 @@ class Report:
         Raises
         ------
         PlausibilityError
-            With all findings.
+            With all findings, if one of them cannot be.
 
         Warns
         -----
         PlausibilityWarning
             Once, with all findings.
         """
-        if self.findings and plausibility != "ignore":
-            if plausibility == "error" or self.errors():
-                raise PlausibilityError(str(self))
-            warnings.warn(
-                str(self),
-                PlausibilityWarning,
-                stacklevel=2,
-                skip_file_prefixes=(PACKAGE, *packages),
-            )
+        if self.errors():
+            raise PlausibilityError(str(self))
+        if self.findings:
+            skipped = (PACKAGE, *packages)
+            warnings.warn(str(self), PlausibilityWarning, 2, skip_file_prefixes=skipped)
         return self
 
 

@@ -317,8 +317,9 @@ def _carried(
         yield Finding(
             "holds",
             f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
-            f"Say who holds what, holds=[Hold({names[0]!r}, LINK, BEGIN, END)] "
-            f"(--hold {names[0]}@LINK:BEGIN-END), or leave such operators out; holds='auto' "
-            "finds them where poses of objects are recorded over time",
+            "Say who holds what: attach_holds(demonstrations, robot) finds it where poses of "
+            "objects are recorded over time; Demonstration(..., holds=[Hold("
+            f"{names[0]!r}, LINK, BEGIN, END)]) (--hold {names[0]}@LINK:BEGIN-END) gives it; or "
+            "leave such operators out",
             names,
         )

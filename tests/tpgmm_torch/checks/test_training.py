@@ -17,6 +17,7 @@ from tpgmm_torch import (
     RelativePosition,
     Stack,
     TaskParameterizedGMM,
+    attach_holds,
 )
 from tpgmm_torch.checks import check
 from tpgmm_torch.checks.training import summarize
@@ -123,7 +124,7 @@ def test_fit_warns_of_operators_of_objects_that_nothing_holds():
     model = TaskParameterizedGMM(4, [PUT, Canonical()], HAND, random_state=0)
     with pytest.warns(PlausibilityWarning, match=r"no link holds cup: position:cup@tray says"):
         model.fit(carrying(carried=False))
-    model.fit(carrying(carried=True))  # warnings are errors
+    model.fit(attach_holds(carrying(carried=True), HAND))  # warnings are errors
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("cup", "hand")
     assert math.isclose(hold.begin, 1, abs_tol=0.1)
