@@ -8,7 +8,6 @@ from typing import Any
 
 from tpgmm_torch import Trust, parse_clock
 from tpgmm_torch.alignment.text import METHODS
-from tpgmm_torch.checks.report import PLAUSIBILITY
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.sensing.pose_filter import OneEuro
@@ -224,7 +223,7 @@ class TrainingConfig:
         check_choice("training.alignment", self.alignment, (*METHODS, "parts"))
         check_choice("training.learn_from", self.learn_from, ("measured", "commanded"))
         check_choice("training.loss", self.loss, ("likelihood", "imitation"))
-        check_choice("training.plausibility", self.plausibility, PLAUSIBILITY)
+        check_choice("training.plausibility", self.plausibility, ("warn", "error", "ignore"))
         if (self.learn_from, self.loss) == ("commanded", "imitation"):
             raise DataError(
                 "the imitation error is that of actions that follow measured joints: "

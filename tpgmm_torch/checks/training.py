@@ -319,7 +319,7 @@ def _carried(
             f"no link holds {' and '.join(names)}: {listed(texts)} says nothing of the joints",
             "Say who holds what: attach_holds(demonstrations, robot) finds it where poses of "
             "objects are recorded over time; Demonstration(..., holds=[Hold("
-            f"{names[0]!r}, LINK, BEGIN, END)]) (--hold {names[0]}@LINK:BEGIN-END) gives it; or "
-            "leave such operators out",
+            f"{names[0]!r}, LINK, BEGIN, END)]) (--hold {names[0]}@LINK:BEGIN-END) gives it. "
+            "Or leave such operators out",
             names,
         )
