@@ -133,8 +133,12 @@ def linearize_poses(
     at = _constants(terms, state.links, len(state.carriers), like.dtype, like.device)
     places = [*(_place(name, state, frames) for name in at.places), at.base]
     batch = common_shape(state.positions.shape[:-2], *(place.batch_shape for place in places))
-    links = [state.positions.expand(*batch, -1, 3), state.orientations.expand(*batch, -1, 4)]
-    others = [(p.position.expand(*batch, 3), p.orientation.expand(*batch, 4)) for p in places]
+    own, n = (state.positions, state.orientations), len(state.links)
+    links = [_expanded(part, (*batch, n, part.shape[-1])) for part in own]
+    others = [
+        (_expanded(place.position, (*batch, 3)), _expanded(place.orientation, (*batch, 4)))
+        for place in places
+    ]
     positions, orientations = (
         torch.cat((own, *(part.unsqueeze(-2) for part in parts)), -2)
         for own, *parts in zip(links, *others, strict=True)
@@ -230,6 +234,10 @@ def _constants(
     # a constant made while inference mode is on could not serve where gradients are wanted
     with torch.inference_mode(False):
         return _Constants(terms, links, n_objects, dtype=dtype, device=device)
+
+
+def _expanded(part: Tensor, shape: tuple[int, ...]) -> Tensor:
+    return part if part.shape == shape else part.expand(shape)
 
 
 def _product(row: Tensor, matrix: Tensor) -> Tensor:
