@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -20,7 +21,7 @@ CLOCKS: Mapping[str, type[EvenClock] | type[WaitingClock]] = {
 
 
 def parse_clock(text: str | Clock) -> Clock:
-    """The clock that a text stands for.
+    """A clock from text.
 
     Parameters
     ----------
@@ -47,33 +48,37 @@ def parse_clock(text: str | Clock) -> Clock:
         raise DataError(
             f"a clock is one of {list(CLOCKS)}, as text or as an object, got {text!r}"
         )
-    kind, colon, options = text.partition(":")
+    kind, *options = re.split("[:,]", text)
     clock = CLOCKS.get(kind.strip())
     if clock is None:
         raise DataError(
             f"clock {text!r}: there is no {kind.strip()!r}; there are {list(CLOCKS)}, each "
             "with options behind a colon, as in 'waiting:tolerance=3,lag=0.05'"
         )
-    known = {field.name: field for field in fields(clock)}
+    known = {field.name: field.default for field in fields(clock)}
     settings: dict[str, Any] = {}
-    for option in options.split(",") if colon else ():
-        name, _, value = (part.strip() for part in option.partition("="))
+    for option in options:
+        name, value = map(str.strip, option.partition("=")[::2])
         if name not in known or name in settings:
             problem = "is given twice" if name in settings else "is no option"
             raise DataError(
                 f"clock {text!r}: {name!r} {problem}; {kind.strip()!r} has {list(known)}, each "
                 "written as NAME=VALUE"
             )
-        default = known[name].default
-        try:
-            if isinstance(default, tuple):
-                settings[name] = tuple(map(float, value.split("/")))
-            else:
-                settings[name] = value if isinstance(default, str) else float(value)
-        except ValueError:
-            form = "numbers joined by '/'" if isinstance(default, tuple) else "a number"
-            raise DataError(f"clock {text!r}: {name} takes {form}, got {value!r}") from None
+        settings[name] = _value(text, name, value, known[name])
     return clock(**settings)
+
+
+def _value(text: str, name: str, value: str, default: Any) -> Any:
+    """An option in the type of its default."""
+    if isinstance(default, str):
+        return value
+    several = isinstance(default, tuple)
+    try:
+        return tuple(map(float, value.split("/"))) if several else float(value)
+    except ValueError:
+        form = "numbers joined by '/'" if several else "a number"
+        raise DataError(f"clock {text!r}: {name} takes {form}, got {value!r}") from None
 
 
 def format_clock(clock: Clock) -> str:

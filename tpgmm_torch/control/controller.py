@@ -338,17 +338,7 @@ class Controller:
         ages: Mapping[str, float] | None,
     ) -> _Tick:
         """Accepted measurements, and how long this tick is for each robot."""
-        measured, halted = None, None
-        if self._inputs is None:
-            if frames is not None:
-                self._frames = self._converted(self._skill.kinematics, frames)
-            measured = self._validated(joints)
-        else:
-            known = seconds if self.command else np.maximum(seconds, 1e-3)
-            self._inputs = self._inputs.update(known, joints, frames, ages)
-            self._frames, measured = self._inputs.frames, self._inputs.measured
-            untrusted = self._inputs.untrusted()
-            halted = None if untrusted is None else torch.as_tensor(untrusted)
+        measured, halted = self._accepted(seconds, joints, frames, ages)
         if measured is not None and self._gripping is not None:
             # the objects that they hold keep gripping joints from their references
             measured = torch.where(self._gripping, torch.nan, measured)
@@ -361,6 +351,24 @@ class Controller:
             going = torch.as_tensor(passed, dtype=torch.float64)
             passed = torch.where(torch.stack(still).any(0), 0.0, going)
         return _Tick(seconds, passed, measured, halted, late)
+
+    def _accepted(
+        self,
+        seconds: Seconds,
+        joints: Any,
+        frames: Mapping[str, Any] | None,
+        ages: Mapping[str, float] | None,
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """Measured joints, and robots without accepted inputs; frames are kept."""
+        if self._inputs is None:
+            if frames is not None:
+                self._frames = self._converted(self._skill.kinematics, frames)
+            return self._validated(joints), None
+        known = seconds if self.command else np.maximum(seconds, 1e-3)
+        self._inputs = self._inputs.update(known, joints, frames, ages)
+        self._frames, untrusted = self._inputs.frames, self._inputs.untrusted()
+        halted = None if untrusted is None else torch.as_tensor(untrusted)
+        return self._inputs.measured, halted
 
     def _validated(self, joints: Any) -> Tensor | None:
         if joints is None:
@@ -393,16 +401,16 @@ class Controller:
             holding.state if holding.carries else None, displaced,
         )  # fmt: skip
         self._progress = before.advance(tick.passed, observation)
-        if measured is not None:
-            self._restart_displaced(measured, displaced)
         time = self._progress.time
         if bool((time >= self._end).any()):
             tick.ended = (time >= self._end) & (before.time >= self._end)
-        if measured is not None and self._trust is not None:
-            waits = time - before.time < WAITING_RATE * tick.passed
-            tick.waits = waits.expand(self._waiting.shape)
-            if tick.ended is not None:
-                tick.waits = tick.waits & ~tick.ended
+        if measured is None:
+            return
+        self._restart_displaced(measured, displaced)
+        waits = time - before.time < WAITING_RATE * tick.passed
+        tick.waits = waits.expand(self._waiting.shape)
+        if tick.ended is not None:
+            tick.waits = tick.waits & ~tick.ended
 
     def _restart_displaced(self, measured: Tensor, displaced: Tensor | None) -> None:
         """Robots that were displaced, and those whose place was found."""
@@ -569,9 +577,8 @@ class Controller:
 
     def _lead(self, tick: _Tick, estimate: Estimate, wanted: Tensor) -> Tensor | None:
         """Postures to which waiting robots are led; None if none waits."""
-        if tick.waits is None or tick.measured is None:
+        if tick.waits is None or tick.measured is None or self._trust is None:
             return None
-        assert self._trust is not None
         measured, waits, lead = tick.measured, tick.waits, self._trust.lead
         if bool(self._displaced.any()):
             gap = (estimate.joints - measured).abs().nan_to_num(0.0).amax(-1)

@@ -89,7 +89,7 @@ class Held:
 
     def later(self, joints: Tensor, share: Tensor | None) -> Self:
         """With postures as late as the object is seen, of which a share is new."""
-        if share is None:
+        if self.apart is None or share is None:
             return self if self.joints is None else replace(self, joints=None)
         last = joints if self.joints is None else self.joints
         last = torch.where(last.isnan(), joints, last)
@@ -204,9 +204,8 @@ class Holding:
             If a frame or link does not exist.
         """
         seen, given = frames or {}, given or {}
-        for name in given:
-            if name not in self.frames and name not in seen:
-                raise UnknownNameError("frame", name, "the situation", self.frames)
+        for name in given.keys() - self.frames.keys() - seen.keys():
+            raise UnknownNameError("frame", name, "the situation", self.frames)
         if not self.holds and not self.held and not given:
             return self if not seen else replace(self, frames={**self.frames, **seen})
         places, held = {**self.frames, **seen}, dict(self.held)
@@ -215,19 +214,15 @@ class Holding:
             if name not in places:
                 continue
             before, pose = self.held.get(name, FREE), seen.get(name)
-            if pose is not None and before.apart is not None:
+            if pose is not None:
                 before = before.later(joints, shares.get(name))
             carrier = self._carrier(name, torch.as_tensor(time), before, given, where)
             place = self.frames.get(name, places[name])
             after, places[name] = self._changed(name, before, carrier, place, pose, state_now)
-            if pose is not None and before.taken is not None and before.apart is not None:
-                live = after.is_held & (after.carrier == before.carrier)
-                live = live & ~_same(pose, before.taken)
-                if bool(live.any()):
-                    after = self._observed(after, pose, live, state_now(), dt)
+            after = self._seen(before, after, pose, state_now, dt)
             if after is not FREE:
                 held[name] = after
-        same = held.keys() == self.held.keys() and all(held[n] is self.held[n] for n in held)
+        same = all(held[name] is self.held.get(name) for name in held)
         return replace(self, frames=places, held=self.held if same else held)
 
     def free(self, name: str, like: Tensor) -> Tensor:
@@ -363,6 +358,20 @@ class Holding:
             joints=_restarted(before.joints, holds & ~held),
         )
         return after, choose(held & holds, place, now)
+
+    def _seen(
+        self,
+        before: Held,
+        held: Held,
+        seen: Frame | None,
+        state_now: Callable[[], RobotState],
+        dt: float | Tensor,
+    ) -> Held:
+        """An object after it was seen, by robots that held it before."""
+        if seen is None or before.taken is None or before.apart is None:
+            return held
+        live = held.is_held & (held.carrier == before.carrier) & ~_same(seen, before.taken)
+        return self._observed(held, seen, live, state_now(), dt) if bool(live.any()) else held
 
     def _observed(
         self, held: Held, seen: Frame, live: Tensor, state: RobotState, dt: float | Tensor
