@@ -119,19 +119,32 @@ class HoldWatch:
                 rests.pop(name, None)
                 names = names - {name}
         for name in names:
-            seen = frames[name]
+            seen, yet = frames[name], free_yet.get(name, torch.tensor(True))
             rest = rests.get(name) or Rest.at(seen, joints)
             if rest.seen is not seen:
-                rest = replace(rest, seen=seen, since=rest.since + dt)
-                yet = free_yet.get(name, torch.tensor(True))
-                rest, holding = self._taken(name, rest, joints, holding, dt, yet)
-                if rest.found and bool((due := rest.since >= LOST_PERIOD).any()):
-                    rest, holding = self._lost(name, rest, joints, holding, due, yet)
+                rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet)
             elif rest.pose is seen:  # it has not moved
                 rest = replace(rest, joints=joints)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
         return replace(self, rests=rests), holding, places
+
+    def _seen(
+        self,
+        name: str,
+        rest: Rest,
+        seen: Frame,
+        joints: Tensor,
+        holding: Holding,
+        dt: float | Tensor,
+        yet: Tensor,
+    ) -> tuple[Rest, Holding]:
+        """After a new reading of an object."""
+        rest = replace(rest, seen=seen, since=rest.since + dt)
+        rest, holding = self._taken(name, rest, joints, holding, dt, yet)
+        if rest.found and bool((due := rest.since >= LOST_PERIOD).any()):
+            rest, holding = self._lost(name, rest, joints, holding, due, yet)
+        return rest, holding
 
     def _taken(
         self,

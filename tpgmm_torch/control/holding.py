@@ -206,13 +206,12 @@ class Holding:
         seen, given = frames or {}, given or {}
         for name in given.keys() - self.frames.keys() - seen.keys():
             raise UnknownNameError("frame", name, "the situation", self.frames)
-        if not self.holds and not self.held and not given:
-            return self if not seen else replace(self, frames={**self.frames, **seen})
+        names = {hold.frame: None for hold in self.holds} | dict.fromkeys((*self.held, *given))
+        if not names and not seen:
+            return self
         places, held = {**self.frames, **seen}, dict(self.held)
         state_now = cache(lambda: self.kinematics.state(joints))
-        for name in dict.fromkeys((*(hold.frame for hold in self.holds), *held, *given)):
-            if name not in places:
-                continue
+        for name in filter(places.__contains__, names):
             before, pose = self.held.get(name, FREE), seen.get(name)
             if pose is not None:
                 before = before.later(joints, shares.get(name))
