@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance
@@ -75,50 +73,6 @@ class Command:
     reasons: Mapping[tuple[int, ...], str] = _NO_REASONS
     impedance: Impedance | None = None
     compute_novelty: Callable[[], Tensor] | None = None
-
-    @classmethod
-    def stack(cls, commands: Sequence[Self], batch: Sequence[int]) -> Self:
-        """The commands of single robots as that of a batch of them.
-
-        Parameters
-        ----------
-        commands : sequence of Command
-            In the order of the batch. Where their models have different numbers of components,
-            activations are filled up with zeros.
-        batch : sequence of int
-            Its shape.
-        """
-
-        def stacked(values: Sequence[Tensor]) -> Tensor:
-            return torch.stack([*values]).reshape(*batch, *values[0].shape)
-
-        estimates = [one.estimate for one in commands]
-        most = max(one.activation.shape[-1] for one in estimates)
-        activations = [
-            pad(one.activation, (0, most - one.activation.shape[-1])) for one in estimates
-        ]
-        robots = np.ndindex(*batch)
-        novelty = [one.compute_novelty for one in commands if one.compute_novelty is not None]
-        return cls(
-            stacked([one.reference for one in commands]),
-            stacked([one.velocity for one in commands]),
-            stacked([one.time for one in commands]),
-            Estimate(
-                stacked([one.joints for one in estimates]),
-                stacked([one.covariance for one in estimates]),
-                stacked(activations),
-            ),
-            stacked([one.codes for one in commands]),
-            {
-                robot: reason
-                for robot, one in zip(robots, commands, strict=True)
-                if (reason := one.reason())
-            },
-            commands[0].impedance,
-            (lambda: stacked([of_one() for of_one in novelty]))
-            if len(novelty) == len(commands)
-            else None,
-        )
 
     def __repr__(self) -> str:
         return (

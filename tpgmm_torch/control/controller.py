@@ -16,7 +16,7 @@ from torch import Tensor
 from tpgmm_torch.checks.situations import START
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.control.clock_text import parse_clock
-from tpgmm_torch.control.clocks import Clock, Progress
+from tpgmm_torch.control.clocks import Clock
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.displacement import Displacement
 from tpgmm_torch.control.hold_watch import HoldWatch
@@ -306,25 +306,6 @@ class Controller:
         if self._inputs is not None and passed > 0:
             other._inputs = self._inputs.update(passed, joints, frames)
             other._frames = other._inputs.frames
-        return other
-
-    def switched(self, skill: Skill, progress: Progress) -> Self:
-        """The same robots from here on with another skill, into which they are faded.
-
-        Parameters
-        ----------
-        skill : Skill
-        progress : Progress
-            Where they are in it.
-        """
-        other = self.copy()
-        other._skill, other._end, other._progress = skill, skill.end, progress
-        other._search = skill.posture_search()
-        if not self.holding.held:
-            other.holding = Holding.start(
-                skill.kinematics, skill.carried_names, skill.holds, self.holding.frames
-            )
-        other._restart_fading(torch.ones_like(self._waiting))
         return other
 
     # Sensing

@@ -1,6 +1,5 @@
 """What is sent: status and reasons of each robot, stiffness once it is asked for."""
 
-from dataclasses import replace
 
 import pytest
 import torch
@@ -58,21 +57,3 @@ def test_stiffness_and_damping_are_those_of_the_impedance():
 def test_a_command_without_impedance_says_so():
     with pytest.raises(DataError, match=r"no stiffness.*Impedance\(kinematics\)"):
         _ = command(impedance=None).stiffness
-
-
-def test_commands_of_single_robots_are_that_of_a_batch():
-    one = command(
-        codes=2, reasons={(): "joints are lost"}, compute_novelty=lambda: torch.ones(())
-    )
-    other = command(codes=0, compute_novelty=lambda: 2 * torch.ones(()))
-    longer = Estimate(other.reference + 1, other.covariance, torch.ones(3).double() / 3)
-    other = replace(other, estimate=longer)
-    both = Command.stack([one, other], (2,))
-    assert both.status == ["holding", "running"] and both.reason(0) == "joints are lost"
-    assert both.reason(1) == "" and both.novelty.tolist() == [1, 2]
-    assert torch.equal(both.estimate.joints[1], longer.joints)
-    # models have different numbers of components
-    assert both.estimate.activation[:, 1:].tolist() == [[0, 0], [1 / 3, 1 / 3]]
-    assert both.time.shape == (2,) and torch.equal(both.stiffness[0], one.stiffness)
-    assert Command.stack([one, other, command(), other], (2, 2)).reference.shape == (2, 2, 17)
-    assert Command.stack([one, command()], (2,)).novelty is None
