@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -81,7 +82,7 @@ def completed_situations(
             {name: Frame.stack([first[name] for first in firsts]) for name in firsts[0]},
             torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
             skill.kinematics,
-            skill.time,
+            _span(skill),
             skill.summary,
         )
         report.act()
@@ -89,7 +90,7 @@ def completed_situations(
 
 
 def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
-    names, like = skill.kinematics.joint_names, skill.time
+    names, like = skill.kinematics.joint_names, skill.kinematics.lower
     if isinstance(given, Demonstration):
         given = Situation.of(given)
     if not isinstance(given, Situation):
@@ -101,7 +102,7 @@ def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
             f"{names}"
         )
     complete = completed_frames(skill, given.joints, given.frames)
-    time = like if given.time is None else given.time.to(like)
+    time = skill.time if given.time is None else given.time.to(like)
     present = {**complete, **given.frames_at(time)}
     frames = {name: present[name].to(like) for name in skill.frame_names}
     return Situation(given.joints.to(like), frames, time)
@@ -122,9 +123,14 @@ def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None
         If a posture cannot be in radians.
     """
     start = skill.kinematics.joint_tensor(joints)
-    time = skill.time
+    span = _span(skill)
     known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
-    check_situations(start, known, time[0], skill.kinematics, time, skill.summary).act()
+    check_situations(start, known, span[0], skill.kinematics, span, skill.summary).act()
+
+
+def _span(skill: Skill) -> Tensor:
+    """Begin and end of a skill [s]."""
+    return torch.tensor([skill.begin, skill.end], dtype=torch.float64)
 
 
 def with_novelty(

@@ -1,6 +1,5 @@
 """What is sent: status and reasons of each robot, stiffness once it is asked for."""
 
-
 import pytest
 import torch
 

@@ -45,7 +45,7 @@ def run(regression: Regression, given: list[Situation], **options) -> list[Traje
     peaks = options.pop("peaks", None)
     keeps = options.pop("keep_limits")
     bounds = MotionBounds.of(regression.kinematics, peaks) if keeps else None
-    skill = replace(regression, begin=0.0, end=2.0)
+    skill = replace(regression, begin=0.0, end=2.0, time=grid())
     return rollout(skill, given, bounds=bounds, **options)
 
 
