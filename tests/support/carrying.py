@@ -22,6 +22,7 @@ from tpgmm_torch import (
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator
+from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 
 HAND = "l_hand"
 #: When the hand is at the bottle, when it lifts it, when it is at the tray, when it lets go.
@@ -173,7 +174,8 @@ HELD = Hold("bottle", HAND, (ARRIVES + LIFTS) / 2, (PUTS + LEAVES) / 2)
 
 
 @cache
-def carrying_model(texts: Sequence[str] = PUT, **options: object) -> TaskParameterizedGMM:
+def carrying_model(texts: Sequence[str] = PUT, holds: bool = True) -> TaskParameterizedGMM:
     """Fitted to the ten; not to be changed."""
-    settings = {"tol": 1e-2} | options
-    return TaskParameterizedGMM(15, operators(texts), upper_body(), **settings).fit(carries())
+    shown, robot = carries(), upper_body()
+    shown = attach_holds(shown, robot) if holds else with_holds(shown, ())
+    return TaskParameterizedGMM(15, operators(texts), robot, tol=1e-2).fit(shown)

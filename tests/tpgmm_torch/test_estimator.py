@@ -1137,7 +1137,7 @@ def test_batches_tell_the_same_peaks():
 
 
 def test_objects_that_are_held_are_found_and_learned_as_where_they_were_last_free():
-    found, none = carrying_model(PLACES), carrying_model(PLACES, holds=None)
+    found, none = carrying_model(PLACES), carrying_model(PLACES, holds=False)
     [hold] = found.holds_
     assert (hold.frame, hold.link, none.holds_) == ("bottle", "l_hand", ())
     same(clone(found).set_params(holds=[hold]).fit(carries()), found)

@@ -22,7 +22,7 @@ from tpgmm_torch.sensing.trust import Trust
 NAMES = ["the paper's", "poses in two frames"]
 EVERY_WORLD = pytest.mark.parametrize("case", [CASES[name] for name in NAMES], ids=NAMES)
 DT, LAST = 0.1, 1.2
-PLAIN = {"clock": EvenClock(), "trust": None, "smoothing": None, "bounds": None}
+PLAIN = {"clock": EvenClock(), "trust": None, "smoothing": None, "bounds": None, "blend": 0.0}
 
 
 def begun(problem: Problem, **options) -> Controller:

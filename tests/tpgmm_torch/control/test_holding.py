@@ -408,7 +408,7 @@ def ticks_of(model) -> tuple[int, int]:
 
 def test_what_is_carried_is_put_exactly_however_it_was_grasped():
     things, places = carrying_model(), carrying_model(PLACES)
-    live = carrying_model(PLACES, holds=None)
+    live = carrying_model(PLACES, holds=False)
     scene, rng = scenes(12, seed=9), np.random.default_rng(0)
     slips = torch.from_numpy(rng.standard_normal((12, 3)))
     slips = 0.03 * slips / slips.norm(dim=-1, keepdim=True)

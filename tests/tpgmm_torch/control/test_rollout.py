@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.support.mixtures import CASES, Case, Problem, assert_close
+from tests.support.mixtures import CASES, Case, Problem, assert_close, form
 from tests.support.worlds import OBJECT
 from tpgmm_torch import Frame, Situation, Trajectory, quaternions
 from tpgmm_torch.control.rollout import rollout
@@ -66,7 +66,7 @@ def assert_same(a: Trajectory, b: Trajectory) -> None:
 def test_each_reference_is_the_state_of_the_next_step(case: Case):
     problem = Problem.of(case, 3, 1)
     regression, kinematics = problem.regression(), case.world.kinematics
-    [trajectory] = run(regression, situations(problem, grid()))
+    [trajectory] = run(regression, situations(problem, grid()), blend=0)
     joints, frames = problem.state.joints[0], {OBJECT: problem.frames[OBJECT][0]}
     for time, reference, covariance in zip(
         grid(), trajectory.joints, trajectory.covariance, strict=True
@@ -136,12 +136,12 @@ def test_before_the_beginning_and_after_the_end_references_are_held(keep_limits)
 
 @EVERY_WORLD
 @pytest.mark.parametrize("moves", [False, True], ids=["still", "moving"])
-@pytest.mark.parametrize("activation", ["time", "product"])
-@pytest.mark.parametrize("part", [1, 7, 512])
-def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, monkeypatch):
+@pytest.mark.parametrize("fusion", [form(), form("covariance", "product")])
+@pytest.mark.parametrize("part", [7, 512])
+def test_candidates_are_those_of_each_tick(case: Case, moves, fusion, part, monkeypatch):
     monkeypatch.setattr("tpgmm_torch.control.rollout.PART", part)
     problem = Problem.of(case, 3, 2)
-    regression, time = problem.regression(activation=activation), grid()
+    regression, time = problem.regression(fusion=fusion), grid()
     given = situations(problem, time, time, moves=moves)
     trajectories = run(regression, given)
     together = {OBJECT: Frame.stack([item.frames[OBJECT] for item in given])}
@@ -149,10 +149,11 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
     for k, now in enumerate(time):
         here = {name: pose[k] if moves else pose for name, pose in together.items()}
         state = case.world.kinematics.state(joints)
-        estimate = regression.estimate(now, state, here, candidates=True)
+        estimate = regression.estimate(now, state, here)
+        candidates = regression.candidates(now, state, here, estimate)
         joints = torch.stack([trajectory.joints[k] for trajectory in trajectories])
         for row, trajectory in enumerate(trajectories):
-            for one, other in zip(trajectory.candidates, estimate.candidates, strict=True):
+            for one, other in zip(trajectory.candidates, candidates, strict=True):
                 assert_close(one.mean[k], other.mean[row])
                 assert_close(one.covariance[k], other.covariance[row])
                 assert_close(one.share[k], other.share[row])
@@ -164,7 +165,7 @@ def test_candidates_are_those_of_each_tick(case: Case, moves, activation, part, 
 def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
     problem = Problem.of(CASES["canonical"], 3, 1)  # its references do not depend on the state
     given = situations(problem, grid(41))
-    [plain] = run(problem.regression(), given)
+    [plain] = run(problem.regression(), given, blend=0)
     [blended] = run(problem.regression(), given, blend=0.8)
     fade = 1 - minimum_jerk(grid(41) / 0.8)
     gap = given[0].joints - plain.joints[0]
@@ -178,7 +179,7 @@ def test_a_blend_adds_the_gap_while_it_fades_and_nothing_afterwards():
 def test_a_gap_to_where_the_skill_begins_is_no_speed():
     problem = Problem.of(CASES["canonical"], 3, 1)
     time = grid(161)
-    [free] = run(problem.regression(), situations(problem, time))
+    [free] = run(problem.regression(), situations(problem, time), blend=0)
     kinematics = copy.copy(problem.case.world.kinematics)
     kinematics.velocity = torch.full_like(kinematics.velocity, torch.inf)
     kinematics.lower = torch.full_like(kinematics.lower, -torch.inf)
@@ -187,7 +188,7 @@ def test_a_gap_to_where_the_skill_begins_is_no_speed():
     regression = replace(problem.regression(), kinematics=kinematics)
     begin = free.joints[0] + 0.5
     given = [replace(situations(problem, time)[0], joints=begin)]
-    [bounded] = run(regression, given, keep_limits=True, peaks=peaks)
+    [bounded] = run(regression, given, blend=0, keep_limits=True, peaks=peaks)
     assert_close(bounded.joints[0], begin)
     # taken for a speed, 0.5 within a tick of 12.5 ms led 50 beyond
     assert (bounded.joints - free.joints).abs().max() <= 0.5 + 1e-9
