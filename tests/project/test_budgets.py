@@ -51,7 +51,6 @@ BUDGETS = {
 CEILINGS = {
     "lines of tpgmm_torch": 20200,
     "lines of lerobot_policy_tpgmm": 2000,
-    "lines of tpgmm_datasets": 4700,
     "lines of tpgmm_tools": 2800,
     "lines of environments and evaluation": 10500,
     "lines of tests of core, data sets, policy and tools": 26500,
