@@ -97,7 +97,9 @@ class TimeLikelihood:
         square: Array = np.zeros((1, len(self._constant)))  # of each component, and its slope
         slope = square
         for operator, part in self._parts:
-            one, other = part.exponent(np.atleast_2d(_local(operator, state, frames)))
+            one, other = part.exponent(
+                np.atleast_2d(_local(operator, part.starts, state, frames))
+            )
             square, slope = square + one.T, slope + other.T
         # -0.5 |W (x - mu(t))|^2 as a polynomial of the time since the component's mean
         index, elapsed = self._heaviest[window], self._elapsed[window]
@@ -134,15 +136,15 @@ class _Coordinates:
         factor = np.linalg.cholesky(_array(one.covariance) + np.diag(added))
         self._white: Array = np.linalg.inv(factor)  # (K, D, D)
         self._rate = (self._white @ self._gain[..., None])[..., 0]
-        self._starts = operator.quaternion_starts(kinematics)
+        self.starts = operator.quaternion_starts(kinematics)
         self.constant = -np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(1)
         self.curvature = (self._rate**2).sum(1)
 
     def exponent(self, local: Array) -> tuple[Array, Array]:
         """``|W (x - mu)|^2`` and ``(W gain)^T W (x - mu)`` of each component, (K, B)."""
-        if self._starts:  # of q and -q, which are one rotation, the one that is nearer
+        if self.starts:  # of q and -q, which are one rotation, the one that is nearer
             both = torch.from_numpy(local), torch.from_numpy(self._mean[:, None])
-            local = quaternions.match_hemisphere(*both, self._starts).numpy()
+            local = quaternions.match_hemisphere(*both, self.starts).numpy()
         white = self._white @ np.swapaxes(local - self._mean[:, None], 1, 2)  # (K, D, B)
         return (white**2).sum(1), (self._rate[:, :, None] * white).sum(1)
 
@@ -155,14 +157,18 @@ class _Coordinates:
         return -0.5 * square
 
 
-def _local(operator: Operator, state: RobotState, frames: Mapping[str, Frame]) -> Array:
+def _local(
+    operator: Operator, starts: Sequence[int], state: RobotState, frames: Mapping[str, Frame]
+) -> Array:
     """Local coordinates (..., D); those of a stack of poses are faster read from its map."""
     if isinstance(operator, Stack):
         at = operator.linearize(state, frames)
         if at.present is not None and at.matrix is not None:
-            # R^T (x - p), which is -M^T c, and the present quaternions, whose c is zero
-            moved = (at.matrix.mT @ at.displacement.unsqueeze(-1)).squeeze(-1)
-            return _array(at.present - moved)
+            # R^T (x - p), which is -M^T c, and the present quaternions
+            local = -(at.matrix.mT @ at.displacement.unsqueeze(-1)).squeeze(-1)
+            columns = [start + i for start in starts for i in range(4)]
+            local[..., columns] = at.present[..., columns].expand_as(local[..., columns])
+            return _array(local)
     return _array(operator.coordinates(state, frames))
 
 

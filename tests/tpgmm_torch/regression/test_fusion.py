@@ -124,10 +124,9 @@ SILENT = {
 }
 
 
-@pytest.mark.parametrize("options", [{}, {"activation": "product"}], ids=["time", "product"])
 @pytest.mark.parametrize("form", [Canonical, Joints], ids=["update", "sum"])
 @pytest.mark.parametrize("operators", SILENT.values(), ids=list(SILENT))
-def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators, form, options):
+def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators, form):
     paper = CASES["the paper's"]
     [hands, _] = paper.operators
     problem = Problem.of(paper, 4, 3)
@@ -145,15 +144,15 @@ def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators,
             wide, means=wide.means[:, narrow], covariances=wide.covariances[:, narrow, narrow]
         )
     )
-    plain = problem.regression(**options)
+    plain = problem.regression()
     joints = plain.conditionals[1]
     without = replace(plain, operators=[hands, form()], conditionals=[alone, joints])
     stacked = replace(
         plain, operators=[Stack(hands, extra), form()], conditionals=[both, joints]
     )
-    assert (stacked._update is None) is (form is Joints or bool(options))
+    assert (stacked._update is None) is (form is Joints)
     at = times(), state, frames
-    assert_same(stacked.estimate(*at, candidates=True), without.estimate(*at))
+    assert_same(stacked.estimate(*at), without.estimate(*at))
     # and by itself
     other = random_local(rng, 4, np.zeros(extra.dimension(None)))
     three = replace(
@@ -161,11 +160,11 @@ def test_what_no_joint_moves_adds_nothing_even_where_it_is_correlated(operators,
         operators=[hands, extra, form()],
         conditionals=[alone, conditionals_of(other), joints],
     )
-    estimate = three.estimate(*at, candidates=True)
-    if not options:  # its time marginal is its own
-        assert_same(estimate, without.estimate(*at))
-    assert (estimate.candidates[1].share == 0).all()
-    assert torch.equal(estimate.candidates[1].mean, state.joints.expand(3, 17))
+    estimate = three.estimate(*at)
+    assert_same(estimate, without.estimate(*at))
+    _, silent, _ = three.candidates(*at, estimate)
+    assert (silent.share == 0).all()
+    assert torch.equal(silent.mean, state.joints.expand(3, 17))
 
 
 def test_a_task_without_variance_is_named():

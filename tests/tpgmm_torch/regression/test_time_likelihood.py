@@ -20,7 +20,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    InformationFusion,
     RelativePosition,
     Stack,
     TaskParameterizedGMM,
@@ -69,7 +68,7 @@ def exact(regression: Regression, times: torch.Tensor, **options) -> TimeLikelih
 def test_the_likelihood_is_the_mixtures_given_time(case: Case):
     problem = Problem.of(case, 4, 3)
     regression, joints = problem.regression(), problem.state.joints
-    likelihood = exact(regression, GRID, slack=0.0, fusion=InformationFusion(negligible=0.0))
+    likelihood = exact(regression, GRID, slack=0.0, negligible=0.0)
     got = likelihood(problem.state, problem.frames)
     assert got.shape == (3, 51)
     for robot in range(3):
@@ -86,7 +85,7 @@ def test_negligible_components_are_left_out():
     state = regression.kinematics.state(demonstration.joints)
     frames = dict(demonstration.frames)
     fast = regression.log_likelihood(times, state, frames).numpy()
-    every = exact(regression, times, fusion=InformationFusion(negligible=0.0))(state, frames)
+    every = exact(regression, times, negligible=0.0)(state, frames)
     likely = every > every.max(1, keepdims=True) - 10
     np.testing.assert_allclose(fast[likely], every[likely], atol=0.01)
     part = slice(20, 60)
