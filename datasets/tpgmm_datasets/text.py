@@ -31,7 +31,7 @@ def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
         match = FRAME.fullmatch(text)
         if match is None:
             raise DataError(
-                f"frame {text!r} is none of NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
+                f"frame {text!r} is not NAME, NAME=FEATURE, NAME=FEATURE[7:14] or "
                 "NAME=LINK@EVENT"
             )
         source, event, start = match["source"], match["event"], match["start"]

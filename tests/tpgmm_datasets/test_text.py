@@ -39,7 +39,7 @@ def test_episodes_units_and_frames_are_read_from_text():
 
 @pytest.mark.parametrize("texts", [["a="], ["=b"], ["a=b[1]"], ["a=b@"], ["a@b"]])
 def test_a_frame_that_is_none_is_refused(texts):
-    with pytest.raises(DataError, match="is none of NAME, NAME=FEATURE"):
+    with pytest.raises(DataError, match="is not NAME, NAME=FEATURE"):
         parse_frames(texts)
 
 

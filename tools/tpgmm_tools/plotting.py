@@ -51,7 +51,7 @@ OPERATORS = (
     (SKY, (0, (5, 1))),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1))),
 )
-#: What matplotlib's settings are while :func:`figure` and :func:`save` are at work; for other
+#: Matplotlib's settings while :func:`figure` and :func:`save` are at work; for other
 #: pictures beside them, ``matplotlib.style.use(STYLE)``.
 STYLE: dict[str, Any] = {
     "axes.labelsize": 9,

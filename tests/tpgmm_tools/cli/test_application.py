@@ -60,7 +60,7 @@ sys.exit(f"{sorted(heavy)} are imported" if heavy else 0)
         ("fit x --out y --robot upper_body --link hand", "'hand'"),
         ("fit x --out y --robot no.urdf", "no.urdf"),
         ("fit x --out y --poses left --robot upper_body", "--poses are instead of --robot"),
-        ("fit x --out y --format onnx", "there are ['lerobot', 'tpgmm']"),
+        ("fit x --out y --format onnx", "format 'onnx' is not known here"),
         ("reproduce x --dataset y --out z.csv", "x is not a saved"),
         ("reproduce x --out z.csv", "give either --situations"),
         ("reproduce x --dataset y --out z.txt", "z.txt"),

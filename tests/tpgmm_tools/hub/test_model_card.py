@@ -22,7 +22,7 @@ def test_the_skill_and_its_limits_are_those_of_the_model():
     model = small_bottle()
     card = describe(model)
     skill = dict(row[:2] for row in rows(card, "The skill"))
-    assert skill["frames that it must be told"] == "bottle"
+    assert skill["frames that it needs"] == "bottle"
     assert skill["Gaussians"] == str(len(model.weights_))
     assert skill["joints"] == ", ".join(model.kinematics_.joint_names)
     [bottle] = [row for row in rows(card, "Where it fails") if row[0] == "bottle"]

@@ -17,9 +17,9 @@ __all__ = ["app"]
 
 app = typer.Typer(add_completion=False)
 
-#: Of what may be uploaded.
+#: Largest file that may be uploaded.
 LARGEST = "500mb"
-#: What the browser has; gradio's own would be fetched from elsewhere.
+#: Fonts of the browser; gradio's own would be fetched from elsewhere.
 FONTS = ("ui-sans-serif", "system-ui", "sans-serif")
 EXAMPLE = (
     "tpgmm app\n\n"

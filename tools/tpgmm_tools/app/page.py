@@ -71,7 +71,7 @@ def _remarks() -> Iterator[list[str]]:
 
 
 def _refusal(error: Exception) -> str:
-    """What to mend, as Markdown; an error that no user can mend goes on."""
+    """The message of an error as Markdown; an error that no user can mend is raised."""
     message = explain(error)
     if message is None:
         raise error
@@ -192,7 +192,7 @@ def moved(situation: Situation, places: Sequence[Sequence[Any]]) -> Situation:
 def show(
     skill: Skill | None, number: int, places: Sequence[Sequence[Any]]
 ) -> tuple[str, str, list[str]]:
-    """Reproduce a skill, and write what there is to look at and to take away.
+    """Reproduce a skill, and write the page, the references and the model.
 
     Parameters
     ----------

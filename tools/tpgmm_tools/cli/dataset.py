@@ -93,7 +93,7 @@ def check(
     # all problems in one go, not the first
     recording = open_recording(path, **data.arguments(described.read()), relax=CHECKS)
     try:
-        with warnings.catch_warnings(record=True) as told:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
             report = recording.check()
     except UnknownUnitsError as error:  # no fault of the set
@@ -102,7 +102,7 @@ def check(
     except DatasetError as error:
         typer.echo(f"error: {error}")
         raise typer.Exit(1) from error
-    bad = [str(one.message) for one in told if issubclass(one.category, DatasetWarning)]
+    bad = [str(one.message) for one in caught if issubclass(one.category, DatasetWarning)]
     for problem in bad:
         typer.echo(f"error: {problem}")
     for finding in report:
@@ -306,7 +306,7 @@ def _summary(description: DatasetInfo) -> dict[str, object]:
     return {
         "path": description.path,
         "layout": description.version,
-        "robot": description.robot_type or "not told",
+        "robot": description.robot_type or "not given",
         "rate": f"{description.fps:g} rows per second",
         "episodes": f"{len(lengths)}, {description.duration:.1f} s in all{longest}",
         "tasks": ", ".join(description.tasks) or "none",

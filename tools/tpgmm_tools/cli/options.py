@@ -58,7 +58,7 @@ class DataOptions:
     joint_name : ``STORED=JOINT``
         The robot's name of a stored joint, repeatable, where the names differ.
     rate : float >= 0.001
-        Resample to so many steps per second.
+        Resample to this number of steps per second.
     """
 
     frame: list[str] | None = None

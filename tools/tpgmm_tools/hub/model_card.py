@@ -50,15 +50,15 @@ def model_card(
     repo_id : str
         ``"owner/name"``, its title and in the lines that load it.
     measured : mapping of str to object, optional
-        What was measured, and how much it was: ``{"grasp error, 50 situations": "0.2 mm"}``.
+        Measures and their values: ``{"grasp error, 50 situations": "0.2 mm"}``.
     notes : str, optional
-        What else a reader should know, as Markdown.
+        More for a reader, as Markdown.
     license : str, optional
         As the hub names them: ``"apache-2.0"``.
     use : str, optional
         How to load it, as Markdown; ``{repo_id}`` is replaced.
     library : str, default="tpgmm-torch"
-        What loads it, as the hub names them.
+        The library that loads it, as the hub names them.
     """
     head = ["---", f"library_name: {library}", "pipeline_tag: robotics"]
     head += [f"license: {license}"] if license else []
@@ -104,7 +104,7 @@ def _skill(model: Any) -> str:
         ("duration", f"{seconds:.2f} s, {steps} steps"),
         ("joints", ", ".join(robot.joint_names)),
         ("links", ", ".join(robot.links) or "none"),
-        ("frames that it must be told", ", ".join(model.frame_names_) or "none"),
+        ("frames that it needs", ", ".join(model.frame_names_) or "none"),
         ("Gaussians", len(model.weights_)),
     ]
     rows += [("operator", f"`{format_operator(one)}`") for one in model.operators_]
@@ -117,7 +117,7 @@ def _skill(model: Any) -> str:
 
 
 def _influence(model: Any) -> str:
-    """Shares of the operators over time, in the middle of what was shown."""
+    """Shares of the operators over time, in the middle of the demonstrated situations."""
     situation = _middle(model)
     if situation is None:
         return "Not known: it depends on the situation, and what was shown is not kept."
@@ -163,8 +163,8 @@ def _middle(model: Any) -> Situation | None:
 
 def _limits(model: Any) -> str:
     text = (
-        "It extrapolates beyond what was shown, where it may do anything within the robot's "
-        "limits. It does not see: it has to be told where the frames are. It knows nothing of "
+        "Beyond its demonstrations it extrapolates, and may do anything within the robot's "
+        "limits. It has no camera: frames are given to it. It knows nothing of "
         "collisions."
     )
     shown = model.skill.summary

@@ -1,7 +1,4 @@
-"""Curves beside the scene: how stiff the joints are asked to be, and which operator decides.
-
-And the marks in them: where parts begin, and events.
-"""
+"""Curves over time beside a scene: stiffness, shares of the operators, holds; and marks."""
 
 from __future__ import annotations
 
@@ -112,7 +109,7 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
     model : TaskParameterizedGMM
         Fitted. The events are those that all of its demonstrations name.
     trajectory : Trajectory
-        What it reproduced.
+        A reproduction by this model.
     """
     begin, end = float(model.time_[0]), float(model.time_[-1])
     summary = model.skill.summary
@@ -131,7 +128,7 @@ def motion_panels(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[P
     model : TaskParameterizedGMM
         Fitted.
     trajectory : Trajectory
-        What it reproduced, with candidates.
+        A reproduction by this model, with candidates.
 
     Returns
     -------

@@ -319,9 +319,9 @@ class LiveView:
     Attributes
     ----------
     url : str
-        What to open.
+        Address of the page.
     drawing : Drawing
-        What is shown.
+        The motion that is shown.
     situation : Situation
         With the objects where they are now.
     command : Command or None
@@ -382,7 +382,7 @@ class LiveView:
         self._reproduce(replace(self.situation, frames=frames))
 
     def run(self, seconds: float = math.inf) -> None:
-        """Play the motion again and again, for so many ``seconds``."""
+        """Play the motion in a loop, for a number of ``seconds``."""
         last = time.monotonic()
         end = last + seconds
         while last < end:
@@ -393,7 +393,7 @@ class LiveView:
             last = now
 
     def step(self, seconds: float) -> None:
-        """Go on by so many ``seconds``, along the time line or with the controller."""
+        """Advance by a number of ``seconds``, along the time line or with the controller."""
         with self._lock:
             if self._controller is None:
                 self._move_to(self.clock + seconds)

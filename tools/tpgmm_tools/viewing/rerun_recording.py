@@ -35,7 +35,9 @@ def write_rerun(
     title: str = "tpgmm",
     **how: Any,
 ) -> Trajectory:
-    """Write what :func:`~tpgmm_tools.viewing.write_motion` shows as a ``.rrd`` file.
+    """Write a reproduction as a Rerun recording, a ``.rrd`` file.
+
+    It shows the same as :func:`~tpgmm_tools.viewing.write_motion`.
 
     Parameters
     ----------

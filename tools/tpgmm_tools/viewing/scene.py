@@ -1,4 +1,4 @@
-"""What is drawn of a motion, as numbers: poses over time, solids, paths, ellipsoids."""
+"""A motion as numbers to draw: poses over time, solids, paths, ellipsoids."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Drawing:
 
 @dataclass(eq=False)
 class MotionScene:
-    """Draws what a model does in situations.
+    """Draw a model's reproductions.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class MotionScene:
     demonstrations : sequence of Demonstration, default=()
         Whose paths and frames are drawn.
     objects : mapping of str to Shape, optional
-        What the objects look like, by the name of their frame; a small box stands for others.
+        Shapes of the objects, by the name of their frame; a small box stands for others.
     meshes : Path, optional
         Folder with the files of the robot's meshes.
     fps : float, default=25.0

@@ -39,7 +39,7 @@ class Shape:
     Parameters
     ----------
     kind : {"box", "cylinder", "sphere", "mesh"}
-        What it is.
+        Kind of solid.
     size : tuple of float
         Edges of a box; radius and length (along z) of a cylinder; radius of a sphere [m];
         scale of a mesh.
@@ -77,7 +77,7 @@ def parse_shape(text: str) -> Shape:
     Raises
     ------
     DataError
-        If it is none of these.
+        If the text has another form.
 
     Examples
     --------
