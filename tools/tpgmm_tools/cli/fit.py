@@ -85,8 +85,8 @@ def fit(
         average, by stretching time, by stretching it between events, by warping it between
         events, by stretching each of the parts that are found, or not at all.
     batch_episodes : int >= 1
-        For sets larger than memory: read this number of episodes at a time. The first decide on the
-        common clock. Default: all at once.
+        For sets larger than memory: read this number of episodes at a time. The first decide on
+        the common clock. Default: all at once.
     operator : str
         What is learned together, repeatable: 'canonical' (the joints), 'position:LINK@FRAME',
         'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), without @FRAME in the base frame;
