@@ -146,7 +146,7 @@ def _shape(
     pose = np.eye(4)
     if origin is not None:
         xyz, rpy = (_numbers(origin, key, 3, link, "0 0 0") for key in ("xyz", "rpy"))
-        pose = placement(np.array(xyz), np.array(rpy))
+        pose = placement(xyz, rpy)
     color, opacity = _color(visual, link, materials)
     if solid.tag == "mesh":
         if meshes is None:
