@@ -51,7 +51,7 @@ BUDGETS = {
 CEILINGS = {
     "lines of tpgmm_torch": 20200,
     "lines of lerobot_policy_tpgmm": 2000,
-    "lines of tpgmm_tools": 2800,
+    "lines of tpgmm_tools": 2840,
     "lines of environments and evaluation": 10500,
     "lines of tests of core, data sets, policy and tools": 26500,
     "functions of the core above complexity 10": 93,
