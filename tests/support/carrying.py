@@ -174,6 +174,12 @@ HELD = Hold("bottle", HAND, (ARRIVES + LIFTS) / 2, (PUTS + LEAVES) / 2)
 
 
 @cache
+def held_carries() -> list[Demonstration]:
+    """The demonstrations with the holds that are found in them."""
+    return attach_holds(carries(), upper_body())
+
+
+@cache
 def carrying_model(texts: Sequence[str] = PUT, holds: bool = True) -> TaskParameterizedGMM:
     """Fitted to the ten; not to be changed."""
     shown, robot = carries(), upper_body()
