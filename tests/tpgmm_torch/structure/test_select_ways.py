@@ -7,15 +7,26 @@ from sklearn.base import clone
 
 from tests.support.planted import HAND, PlantedTask
 from tests.support.skills import few_bottles
-from tests.support.two_ways import ARM, TIME, Handles, Obstacle, shown
+from tests.support.two_ways import TIME, Handles, Obstacle, shown
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import upper_body
-from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, SelectWays
+from tpgmm_torch import (
+    Canonical,
+    Demonstration,
+    Frame,
+    RelativePosition,
+    SelectWays,
+    TaskParameterizedGMM,
+)
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.robots import Poses
 
 POINT = Poses(["hand"], orientation=False)
+
+
+def learner(operators=None, robot=None):
+    return TaskParameterizedGMM(3, operators, robot, tol=1e-1)
 
 
 def same_partition(one, other):
@@ -62,18 +73,18 @@ def test_candidates_see_both_ways_where_no_operators_are_named():
 def test_the_order_of_demonstrations_does_not_matter():
     demonstrations, _ = shown(Obstacle)
     order = np.random.default_rng(0).permutation(len(demonstrations))
-    first = SelectWays(Obstacle.operators, ARM).fit(demonstrations)
-    other = SelectWays(Obstacle.operators, ARM).fit([demonstrations[i] for i in order])
+    first = SelectWays(Obstacle().model()).fit(demonstrations)
+    other = SelectWays(Obstacle().model()).fit([demonstrations[i] for i in order])
     assert same_partition(first.labels_[order], other.labels_)
     np.testing.assert_allclose(other.bic_, first.bic_, rtol=1e-6)
 
 
 def test_skills_of_one_way_are_one_mode():
     bottles = LinearTimeNormalization().fit_transform(few_bottles())
-    assert SelectWays(bottle_operators(), upper_body()).fit(bottles).n_ways_ == 1
+    assert SelectWays(learner(bottle_operators(), upper_body())).fit(bottles).n_ways_ == 1
     for seed in range(2):
         planted = PlantedTask(seed, 2).demonstrations(6)
-        assert SelectWays(robot=HAND).fit(planted).n_ways_ == 1
+        assert SelectWays(learner(None, HAND)).fit(planted).n_ways_ == 1
 
 
 @pytest.mark.parametrize(
@@ -81,13 +92,13 @@ def test_skills_of_one_way_are_one_mode():
 )
 def test_more_than_two_ways_are_found(offsets):
     labels = np.arange(5 * len(offsets)) % len(offsets)
-    selection = SelectWays().fit(paths(np.array(offsets)[labels]))
+    selection = SelectWays(learner()).fit(paths(np.array(offsets)[labels]))
     assert same_partition(selection.labels_, labels)
 
 
 def test_a_way_shown_once_is_none():
-    assert SelectWays().fit(paths([0.5] * 9 + [-0.5])).n_ways_ == 1
-    assert SelectWays().fit(paths([0.5] * 8 + [-0.5] * 2)).n_ways_ == 2
+    assert SelectWays(learner()).fit(paths([0.5] * 9 + [-0.5])).n_ways_ == 1
+    assert SelectWays(learner()).fit(paths([0.5] * 8 + [-0.5] * 2)).n_ways_ == 2
 
 
 def test_what_differs_by_when_it_is_done_is_one_way():
@@ -96,8 +107,8 @@ def test_what_differs_by_when_it_is_done_is_one_way():
     gripper = [
         Demonstration(TIME, (TIME / TIME[-1] > when).astype(float)[:, None]) for when in closing
     ]
-    assert SelectWays().fit(gripper).n_ways_ == 1
-    assert SelectWays(shift=0.0).fit(gripper).n_ways_ > 1
+    assert SelectWays(learner()).fit(gripper).n_ways_ == 1
+    assert SelectWays(learner(), shift=0.0).fit(gripper).n_ways_ > 1
 
 
 def test_what_the_situation_shows_is_one_way():
@@ -107,30 +118,32 @@ def test_what_the_situation_shows_is_one_way():
     s = np.sin(np.pi / 2 * TIME / TIME[-1])[:, None]
     going = [Demonstration(TIME, s * place, {"cup": Frame(place)}) for place in places]
     operators = [RelativePosition("hand", "cup"), Canonical()]
-    assert SelectWays(operators, POINT).fit(going).n_ways_ == 1
-    assert SelectWays([Canonical()], POINT).fit(going).n_ways_ == 2  # who does not see it
+    assert SelectWays(learner(operators, POINT)).fit(going).n_ways_ == 1
+    assert (
+        SelectWays(learner([Canonical()], POINT)).fit(going).n_ways_ == 2
+    )  # who does not see it
 
 
 def test_a_number_of_modes_may_be_given():
     demonstrations = paths([0.5] * 3 + [-0.5] * 3)
-    assert SelectWays(n_ways=1).fit(demonstrations).n_ways_ == 1
-    assert SelectWays(n_ways=3).fit(demonstrations).n_ways_ == 3
-    two = SelectWays(n_ways=2).fit(paths(np.linspace(-1, 1, 6)))
+    assert SelectWays(learner(), n_ways=1).fit(demonstrations).n_ways_ == 1
+    assert SelectWays(learner(), n_ways=3).fit(demonstrations).n_ways_ == 3
+    two = SelectWays(learner(), n_ways=2).fit(paths(np.linspace(-1, 1, 6)))
     assert two.labels_.tolist() == [0, 0, 0, 1, 1, 1]
     with pytest.raises(
         DataError, match="3 modes of at least 2 demonstrations each need 6, got 4"
     ):
-        SelectWays(n_ways=3).fit(demonstrations[:4])
+        SelectWays(learner(), n_ways=3).fit(demonstrations[:4])
 
 
 def test_the_report_says_who_where_and_when():
-    selection = SelectWays().fit(paths([0.5, -0.5] * 4))
+    selection = SelectWays(learner()).fit(paths([0.5, -0.5] * 4))
     lines = selection.report().splitlines()
     assert lines[0] == "2 ways:"
     assert lines[1] == "  0  4 of 8 demonstrations: 0, 2, 4, 6"
     assert lines[3].startswith("  seen by canonical, plainest from 1.")
     assert "standard deviations apart" in lines[3]
-    assert SelectWays().fit(paths([0.5] * 4)).report().startswith("1 way: nowhere")
+    assert SelectWays(learner()).fit(paths([0.5] * 4)).report().startswith("1 way: nowhere")
     with pytest.raises(NotFittedError):
         clone(selection).report()
 
@@ -138,6 +151,6 @@ def test_the_report_says_who_where_and_when():
 def test_units_do_not_matter():
     demonstrations = paths([0.5] * 4 + [-0.5] * 4)
     large = [Demonstration(d.time, 1e3 * d.joints) for d in demonstrations]
-    first, other = (SelectWays().fit(one) for one in (demonstrations, large))
+    first, other = (SelectWays(learner()).fit(one) for one in (demonstrations, large))
     np.testing.assert_array_equal(first.labels_, other.labels_)
     assert torch.tensor(first.bic_).argmin() == torch.tensor(other.bic_).argmin()

@@ -32,11 +32,13 @@ from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
+from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 
 HAND = Poses(("hand",))
 TIME = torch.linspace(0, 3, 60, dtype=torch.float64)
 ABSOLUTE = AbsoluteOrientation("hand", geometry="tangent")
+pytestmark = pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 RELATIVE = RelativeOrientation("hand", OBJECT, geometry="tangent")
 
 
@@ -60,8 +62,12 @@ def recordings(seed=0, count=8, spread=0.7, signs=True):
     return shown
 
 
+def completed(operators, demonstrations):
+    motions = [Motion.of(one, HAND, ()) for one in demonstrations]
+    return with_mean_orientations(operators, motions, HAND)
+
+
 def fitted(demonstrations, *operators, **settings):
-    settings = {"robust": False, "plausibility": "ignore"} | settings
     return TaskParameterizedGMM(5, operators, HAND, **settings).fit(demonstrations)
 
 
@@ -77,7 +83,7 @@ def angles(a, b):
 
 
 def reproduced(skill, start, frames):
-    [found] = skill.predict([Situation(start, frames)], candidates=False)
+    [found] = skill.predict([Situation(start, frames)])
     return quaternions.normalize(found.joints[:, 3:])
 
 
@@ -91,20 +97,20 @@ def mean_of(demonstrations):
 
 def test_the_path_is_the_karcher_mean_at_each_instant():
     shown = recordings()
-    [found] = with_mean_orientations([ABSOLUTE], shown, HAND)
+    [found] = completed([ABSOLUTE], shown)
     local = torch.stack([found.local(one, HAND) for one in shown])
     assert float(local.mean(0).abs().max()) < 1e-12
-    together = with_mean_orientations(
-        [Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown, HAND
+    together = completed(
+        [Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown
     )
     assert together[0].operators[1].path is not None
-    assert with_mean_orientations(together, shown[:2], HAND) == together
+    assert completed(together, shown[:2]) == together
 
 
 def test_a_demonstration_that_is_over_counts_with_its_last_orientation():
     one, other = recordings(count=2)
     short = Demonstration(TIME[:30], other.joints[:30], other.frames)
-    [found] = with_mean_orientations([ABSOLUTE], [one, short], HAND)
+    [found] = completed([ABSOLUTE], [one, short])
     last = torch.stack((one.joints[-1, 3:], other.joints[29, 3:]))
     row = torch.tensor(found.path[-1][1:], dtype=torch.float64)
     assert float(angles(row, quaternions.mean(last))) < 1e-9
@@ -279,7 +285,7 @@ def test_a_model_is_what_it_was_after_saving_it(tmp_path):
 def test_batches_lie_about_the_mean_of_the_first():
     shown = recordings()
     streamed = fitted([shown[:5], shown[5:]], ABSOLUTE)
-    assert streamed.operators_ == with_mean_orientations([ABSOLUTE], shown[:5], HAND)
+    assert streamed.operators_ == completed([ABSOLUTE], shown[:5])
     wanted = mean_of(shown)
     start = torch.cat((torch.zeros(3).double(), wanted[0]))
     assert float(angles(reproduced(streamed, start, {}), wanted).mean()) < 0.1
