@@ -228,10 +228,13 @@ def read_rows(
             rows.append(local_rows(motion.time, x, *known))
         _write(file, following, rows, spans)
         following = next(walk, None)
-    return _gathered(
-        file, spans, all(processes.gather(aligned)), responsibilities, kinematics,
-        TrainingRows(file, 1, grid, 0, completed, holds, processes, (), file),
-    )  # fmt: skip
+    data = TrainingRows(file, 1, grid, 0, completed, holds, processes, (), file)
+    same = all(processes.gather(aligned))
+    try:
+        return _gathered(file, spans, same, responsibilities, kinematics, data)
+    except DataError:
+        data.close()
+        raise
 
 
 def _write(

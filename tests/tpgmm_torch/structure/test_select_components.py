@@ -59,6 +59,7 @@ def test_a_rhythm_asks_for_more_than_a_reach():
     assert found[0] <= 3 < 10 <= found[1]
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.ConvergenceWarning")
 def test_frames_and_quaternions_are_served():
     found = SelectComponents(hands_model(), (2, 4, 6)).fit(handlings(5))
     assert np.isfinite(found.scores_).all() and found.best_model_.frame_names_ == ("cup",)

@@ -96,6 +96,7 @@ def test_more_than_two_ways_are_found(offsets):
     assert same_partition(selection.labels_, labels)
 
 
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_a_way_shown_once_is_none():
     assert SelectWays(learner()).fit(paths([0.5] * 9 + [-0.5])).n_ways_ == 1
     assert SelectWays(learner()).fit(paths([0.5] * 8 + [-0.5] * 2)).n_ways_ == 2

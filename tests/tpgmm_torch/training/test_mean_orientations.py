@@ -16,7 +16,6 @@ from tpgmm_torch import (
     CovarianceFusion,
     Demonstration,
     Frame,
-    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Situation,
@@ -344,9 +343,7 @@ def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
     time, first = torch.linspace(0, 3, 76, dtype=torch.float64), regression.conditionals[0]
     marginals = TimeMarginals.of(regression.log_weights, first.time_mean, first.time_variance)
     parts = regression.kinematics, regression.operators, regression.conditionals, marginals
-    likelihood = TimeLikelihood(
-        *parts, time, slack=0.0, fusion=InformationFusion(negligible=0.0)
-    )
+    likelihood = TimeLikelihood(*parts, time, slack=0.0, negligible=0.0)
     shown = recordings(seed=4, count=1)[0]
     for state in (HAND.state(shown.joints[[7, 31]]), HAND.state(shown.joints[[11]])):
         got = likelihood(state, dict(shown.frames))
@@ -398,16 +395,3 @@ def test_a_controller_and_a_batch_run_it():
 def test_what_compiles_no_logarithms_says_so():
     with pytest.raises(DataError, match="geometry='quaternion'"):
         compile_skill(handling().skill, backend="eager")
-
-
-def test_what_is_learned_later_lies_about_the_same_mean():
-    shown = recordings()
-    skill = fitted(shown[:6], ABSOLUTE)
-    before = skill.operators_
-    skill.partial_fit(shown[6:])
-    assert skill.operators_ == before
-    wanted = mean_of(shown)
-    start = torch.cat((torch.zeros(3).double(), wanted[0]))
-    near = angles(reproduced(skill, start, {}), wanted).mean()
-    # the mean of all in the tangent space of the mean of six
-    assert float(near) < 0.5 * float(angles(mean_of(shown[:6]), wanted).mean())
