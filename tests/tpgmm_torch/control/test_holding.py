@@ -23,7 +23,6 @@ from tpgmm_torch import (
     Hold,
     RelativeOrientation,
     RelativePosition,
-    TaskParameterizedGMM,
     quaternions,
 )
 from tpgmm_torch.control.holding import Holding
