@@ -344,7 +344,7 @@ def test_a_null_space_operator_fuses_in_covariance_form(activation, batch):
         oracles.Row(np.eye(3), np.eye(3) - seen, seen @ q - q),
         oracles.Row(np.eye(3), np.eye(3), -q),
     ]
-    expected = problem.answer(rows, activation=activation, fusion=CovarianceFusion(1e-3))
+    expected = problem.answer(rows, activation=activation, epsilon=1e-3)
     assert_close(printed.joints, expected.mean + np.zeros((*batch, 3)))
     assert_close(printed.covariance, expected.covariance + np.zeros((*batch, 3, 3)))
     by_rows = problem.step([PlanarPosition(), NullSpaceRows(), Canonical()], joints, **options)
@@ -384,7 +384,7 @@ def test_an_operator_known_by_its_a_and_b():
     estimate = problem.step(fusion=CovarianceFusion(1e-2))
     q = Q.numpy()
     rows = [oracles.Row(np.eye(3), matrix, shift - q), oracles.Row(np.eye(3), np.eye(3), -q)]
-    expected = problem.answer(rows, activation="time", fusion=CovarianceFusion(1e-2))
+    expected = problem.answer(rows, activation="time", epsilon=1e-2)
     assert_close(estimate.joints, expected.mean)
     assert_close(estimate.covariance, expected.covariance)
 

@@ -59,7 +59,7 @@ def options_of(case: Case, fusion: str) -> dict[str, float]:
 @pytest.mark.parametrize("n_components", [1, 2, 5])
 def test_a_step_is_the_conditional_of_the_fused_mixture(case, activation, fusion, n_components):
     problem = Problem.of(case, n_components, 2, 2)
-    used = form(fusion, activation, EPSILON, fusion=InformationFusion(PRIOR_STD))
+    used = form(fusion, activation, EPSILON, prior_std=PRIOR_STD)
     regression = problem.regression(fusion=used)
     options = {"activation": activation, **options_of(case, fusion)}
     for time in (times(), times(2, 2)):
@@ -137,7 +137,7 @@ def test_joints_alone_have_nobody_to_give_way_to():
 def test_the_activations_are_different_models_of_two_operators_and_one_of_one(case):
     problem = Problem.of(case, 4)
     weights = [
-        problem.regression(activation=name, fusion=CovarianceFusion()).estimate(
+        problem.regression(fusion=CovarianceFusion(activation=name)).estimate(
             times(), problem.state, problem.frames
         )
         for name in ("time", "product")
