@@ -230,6 +230,15 @@ class LocalizingProgress(WaitingProgress):
         due = since > (1 - 1e-6) * self._step
         measured, reference = new["measured"], array(observation.reference)
         left = self._left_rest(measured, observation.joints)
+        new["since_correction"] = np.where(due, 0.0, since)
+        new["rest_time"] = np.where(left, now, self.rest_time)
+        new["rest_joints"] = np.where(left[..., None], measured, self.rest_joints)
+        new["rest_reference"] = np.where(left[..., None], reference, self.rest_reference)
+        new["stands_for"] = np.maximum(self.stands_for - passed, 0.0)
+        new["moved"] = none = np.zeros_like(self.moved)
+        if not (astray | self.localized).any():
+            following = {"followed_time": now, "followed_joints": measured, "stopped": none}
+            return replace(self, **new, **following, corrected_time=now)
         # a robot that does not move at all although its reference does is stopped, and is led
         # from there; once it moves again, time goes back to what it has missed
         late = now > self.rest_time + STOPPED_AFTER
@@ -240,19 +249,13 @@ class LocalizingProgress(WaitingProgress):
         went = replace(
             self,
             **new,
-            since_correction=np.where(due, 0.0, since),
             corrected_time=np.where(due | ~astray, now, self.corrected_time),
             corrected_error=np.where(due, new["error"], self.corrected_error),
             followed_time=np.where(astray, self.followed_time, now),
             followed_joints=np.where(astray[..., None], self.followed_joints, measured),
-            rest_time=np.where(left, now, self.rest_time),
-            rest_joints=np.where(left[..., None], measured, self.rest_joints),
-            rest_reference=np.where(left[..., None], reference, self.rest_reference),
             stopped=(self.stopped | stopped) & astray & ~left,
             localized=self.localized & astray,
             elsewhere_for=np.where(astray, self.elsewhere_for, 0.0),
-            stands_for=np.maximum(self.stands_for - passed, 0.0),
-            moved=np.zeros_like(self.moved),
         )
         rows = due & astray & ~resumes
         if rows.any():
