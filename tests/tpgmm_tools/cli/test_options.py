@@ -73,7 +73,7 @@ def test_fit_has_the_estimators_defaults():
     estimator = inspect.signature(TaskParameterizedGMM).parameters
     shared = {one.name: one.default for one in SETTINGS}
     shared["n_components"] = inspect.signature(fit).parameters["n_components"].default
-    assert {"tol", "fusion", "covariance_type"} <= shared.keys()
+    assert {"tol", "reg_covar", "covariance_type"} <= shared.keys()
     assert shared == {name: estimator[name].default for name in shared}
 
 

@@ -1,6 +1,7 @@
 """A card says of a model what the model says."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,9 +52,16 @@ def test_what_matters_changes_from_the_object_to_the_joints():
     assert shares[0, joints] == pytest.approx(float(first), abs=0.51)
 
 
+class Unknown(TaskParameterizedGMM):
+    """A model that keeps nothing of its demonstrations."""
+
+    @property
+    def skill(self):
+        return replace(super().skill, summary=None)
+
+
 def test_nothing_is_made_up_where_nothing_is_known():
-    model = TaskParameterizedGMM(3).fit(waves())
-    model.summary_ = None
+    model = Unknown(3).fit(waves())
     card = model_card(model, "lab/wave", notes="One more thing.")
     assert "What was shown is not known." in card
     assert "Not known: it depends on the situation" in card
@@ -64,10 +72,10 @@ def test_nothing_is_made_up_where_nothing_is_known():
 
 
 def test_settings_other_than_the_defaults_are_told_and_no_others():
-    card = describe(TaskParameterizedGMM(3, blend=0.25).fit(waves()))
+    card = describe(TaskParameterizedGMM(3, tol=0.25).fit(waves()))
     learned = dict(row for row in rows(card, "How it was learned"))
-    assert learned["`blend`"] == "0.25"
-    assert not {"`tol`", "`n_components`", "`robot`"} & learned.keys()
+    assert learned["`tol`"] == "0.25"
+    assert not {"`max_iter`", "`n_components`", "`robot`"} & learned.keys()
 
 
 def test_text_that_was_given_stays_in_its_cell():

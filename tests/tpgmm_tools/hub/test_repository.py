@@ -44,7 +44,7 @@ def test_only_the_files_of_a_model_are_fetched(hub, tmp_path):
 def test_what_was_changed_on_the_hub_is_refused(hub):
     push(small_bottle(), "lab/shake")
     files = hub.repositories["lab/shake"]
-    files["config.json"] = files["config.json"].replace(b'"blend": 1.0', b'"blend": 0.5')
+    files["config.json"] = files["config.json"].replace(b'"l_hand"', b'"r_hand"')
     with pytest.raises(ModelFileError, match="changed after it was saved"):
         load("lab/shake")
 
