@@ -27,8 +27,8 @@ def ours(problem: Problem, dtype: str = "float64") -> Fit:
     def fit(n: int) -> object:
         settings = {"blocks": problem.blocks, "tol": 0.0, "max_iter": n, "dtype": dtype}
         with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
-            mixture = BlockGaussianMixture(len(problem.weights), **settings, **problem.start)
-            return mixture.fit(points)
+            mixture = BlockGaussianMixture(len(problem.weights), **settings)
+            return mixture.fit(points, start=problem.start)
 
     return fit
 

@@ -1,10 +1,11 @@
 """Points like those of demonstrations: smooth in time, with noise; and where EM starts."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tpgmm_torch import BlockGaussianMixture
 
 __all__ = ["BLOCKS", "Problem", "motions"]
 
@@ -83,13 +84,10 @@ class Problem:
         return tuple(mean.shape[1] for mean in self.means)
 
     @property
-    def start(self) -> dict[str, Any]:
-        """The start as ``BlockGaussianMixture`` takes it."""
-        return {
-            "weights_init": self.weights,
-            "means_init": self.means,
-            "covariances_init": self.covariances,
-        }
+    def start(self) -> BlockGaussianMixture:
+        """The start as ``BlockGaussianMixture.fit`` takes it."""
+        parameters = self.weights, self.means, self.covariances
+        return BlockGaussianMixture.from_parameters(*parameters)
 
     def joined(self, dtype: str = "float64") -> tuple[Floats, Floats, Floats]:
         """The same in one block, for libraries that have no others.

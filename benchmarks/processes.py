@@ -16,7 +16,7 @@ from benchmarks.points import Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
 from tpgmm_torch import BlockGaussianMixture
-from tpgmm_torch.large_data.processes import ALONE, Processes, joined_processes
+from tpgmm_torch.mixture.processes import ALONE, Processes, joined_processes
 
 __all__ = ["measure"]
 
@@ -61,13 +61,13 @@ def _in_turns(
     problem = Problem.of(motions(n_points, seed=seed), n_components)
     half = len(problem.points) // 2
     share = problem.points[:half] if processes.rank == 0 else problem.points[half:]
-    settings = {"blocks": problem.blocks, "tol": 0.0, **problem.start}
+    settings = {"blocks": problem.blocks, "tol": 0.0}
 
     def taken(n: int, points: object, together: Processes) -> NDArray[np.float64]:
         mixture = BlockGaussianMixture(n_components, max_iter=n, **settings)
         began = np.array([perf_counter(), process_time()])
         with warnings.catch_warnings(action="ignore"):
-            mixture.fit(points, processes=together)
+            mixture.fit(points, start=problem.start, processes=together)
         return np.array([perf_counter(), process_time()]) - began
 
     def iteration(points: object, together: Processes) -> NDArray[np.float64]:

@@ -29,8 +29,9 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, NotFittedError
-from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
@@ -277,7 +278,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         report = Report.of(findings, f"{len(episodes)} demonstrations")
         if processes.rank == 0 or report.errors():
             report.act()
-        moments = column_moments(data.rows, processes)
+        moments = ColumnMoments.of(data.rows, processes)
         mixture = BlockGaussianMixture(
             **self._mixture_settings(data.operators, kinematics),
             group_size=data.group_size,
@@ -286,8 +287,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
                 moments, data.operators, kinematics,
                 reg_covar=self.reg_covar, covariance_type=self.covariance_type,
             ),
-        ).fit_rows(data.rows, moments=moments, processes=processes)  # fmt: skip
-        data.close()
+        ).fit(data.rows, processes=processes)  # fmt: skip
         return self._set(
             mixture, data.operators, kinematics, data.time, data.holds,
             data.n_demonstrations, peaks.result(processes),

@@ -11,7 +11,7 @@ from typing import Any
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.reader import open_recording
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.mixture.processes import ALONE, Processes
 
 __all__ = ["EpisodeBatches"]
 
@@ -31,7 +31,7 @@ class EpisodeBatches:
         Episodes in a batch: what is in memory at a time is three batches.
     processes : Processes, optional
         Those that learn together, see
-        :func:`tpgmm_torch.large_data.processes.joined_processes`: each has a consecutive
+        :func:`tpgmm_torch.mixture.processes.joined_processes`: each has a consecutive
         share of the episodes.
     **options
         All other arguments of :func:`load_lerobot`.

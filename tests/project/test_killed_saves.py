@@ -15,7 +15,6 @@ from tests.support.policies import changed, fitted
 from tests.support.written_sets import FPS, assert_same, demonstration
 from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_torch import atomic
-from tpgmm_torch.large_data.checkpoints import FOLDER
 from tpgmm_torch.persistence import load_model
 
 KILLS = 200 if FULL else 4
@@ -46,23 +45,6 @@ def test_models(tmp_path):
         found = load_model(path)
         assert torch.equal(found.means_[0], mean + found.n_iter_)
         return found.n_iter_
-
-    killed_between(save, load, KILLS)
-    save(10**6)
-    assert left_alone(path)
-
-
-@pytest.mark.usefixtures("exchange")
-def test_checkpoints(tmp_path):
-    path = tmp_path / "em"
-
-    def save(number):
-        FOLDER.write(path, {"number": number}, {"keys": torch.full((1000,), number)})
-
-    def load():
-        config, tensors = FOLDER.read(path)
-        assert bool((tensors["keys"] == config["number"]).all())
-        return config["number"]
 
     killed_between(save, load, KILLS)
     save(10**6)

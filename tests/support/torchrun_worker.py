@@ -25,8 +25,8 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
-from tpgmm_torch.large_data.checkpoints import Checkpoint
-from tpgmm_torch.large_data.processes import Processes, joined_processes
+from tpgmm_torch.mixture.processes import Processes, joined_processes
+from tpgmm_torch.mixture.row_file import RowFile
 from tpgmm_torch.robots import Poses
 
 BLOCKS = (2, 3)
@@ -61,14 +61,6 @@ def uneven(n: int = 5) -> list[Demonstration]:
     return [replace(d, time=d.time * (1 + 0.03 * i)) for i, d in enumerate(handlings(n))]
 
 
-def misplaced(n: int = 5, wrong: int = 3) -> list[Demonstration]:
-    """One of them with its cup in a wrong place."""
-    shown = handlings(n)
-    cup = Frame(shown[wrong].frames["cup"].position + 0.5)
-    shown[wrong] = replace(shown[wrong], frames={"cup": cup})
-    return shown
-
-
 def mixture(**settings) -> BlockGaussianMixture:
     defaults = {"n_components": 4, "blocks": BLOCKS, "tol": 0.0, "max_iter": 10}
     return BlockGaussianMixture(**{**defaults, "random_state": 0, **settings})
@@ -86,7 +78,6 @@ SKILLS = {
     "instants": (handlings, {}),
     "uneven": (uneven, {}),
     "points": (handlings, {"responsibilities": "point", "init_params": "kmeans"}),
-    "misplaced": (misplaced, {}),
 }
 
 
@@ -104,8 +95,8 @@ def learned(model) -> dict[str, torch.Tensor]:
 
 
 def described(model: TaskParameterizedGMM) -> dict[str, torch.Tensor]:
-    """The same of a skill, with its time and what it was learned from."""
-    return learned(model) | {"grid": model.time_, "from": model.demonstration_weights_}
+    """The same of a skill, with its time."""
+    return learned(model.mixture_) | {"grid": model.time_}
 
 
 def share(processes: Processes, X):
@@ -119,18 +110,11 @@ def equal(processes: Processes, folder: Path) -> None:
     found = {}
     for name, settings in MIXTURES.items():
         part = share(processes, rows())
-        source = part if name != "time" else [part[:100], part[100:]]
+        source = part if name != "time" else RowFile.of([part[:100], part[100:]])
         found[name] = learned(mixture(**settings).fit(source, processes=processes))
     for name, (demonstrations, settings) in SKILLS.items():
         model = skill(**settings).fit(share(processes, demonstrations(5)), processes=processes)
         found[name] = described(model)
-    checkpoint = Checkpoint(folder / "em", every=2)
-    mixture(max_iter=4).fit(
-        share(processes, rows()), processes=processes, checkpoint=checkpoint
-    )
-    processes.sum(torch.zeros(1))  # process 0 has written
-    again = mixture().fit(share(processes, rows()), processes=processes, checkpoint=checkpoint)
-    found["resumed"] = learned(again)
     torch.save(found, folder / f"found{processes.rank}.pt")
 
 
@@ -141,7 +125,7 @@ def refused(processes: Processes, folder: Path) -> None:
     bare = [replace(d, frames={}) for d in handlings(3)]
     attempts = {
         "empty": lambda: mixture().fit(
-            [rows() if processes.rank == 0 else nothing], processes=processes
+            RowFile.of([rows() if processes.rank == 0 else nothing]), processes=processes
         ),
         "columns": lambda: mixture(blocks=None).fit(ragged, processes=processes),
         "few": lambda: mixture(n_components=9).fit(
@@ -153,7 +137,6 @@ def refused(processes: Processes, folder: Path) -> None:
         "frames": lambda: skill().fit(
             handlings(3) if processes.rank == 0 else bare, processes=processes
         ),
-        "left": lambda: skill().fit(share(processes, misplaced(wrong=0)), processes=processes),
         "share": lambda: processes.share([1]),
     }
     for name, attempt in attempts.items():
@@ -165,24 +148,20 @@ def refused(processes: Processes, folder: Path) -> None:
         (folder / f"{name}{processes.rank}.txt").write_text(message)
 
 
-class Deadly:
-    """A source whose fifth pass kills the process."""
-
-    def __init__(self) -> None:
-        self.passes = 0
-
-    def __iter__(self):
-        self.passes += 1
-        if self.passes == 5:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return iter([rows()])
-
-
 def dies(processes: Processes, folder: Path) -> None:
     """Process 1 is killed in the middle of a fit."""
-    source = Deadly() if processes.rank == 1 else [rows()]
+    if processes.rank == 1:
+        exchanged, add = [], processes.sum
+
+        def deadly(*tensors):
+            exchanged.append(1)
+            if len(exchanged) == 5:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return add(*tensors)
+
+        processes.sum = deadly
     try:
-        mixture(max_iter=50).fit(source, processes=processes)
+        mixture(max_iter=50).fit(rows(), processes=processes)
     except Exception:
         (folder / f"error{processes.rank}.txt").write_text(traceback.format_exc())
         raise

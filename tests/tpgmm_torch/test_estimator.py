@@ -69,7 +69,6 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.em.covariance_shrinkage import oracle_approximating_intensity
 from tpgmm_torch.exceptions import (
     DataError,
     DegenerateComponentWarning,
@@ -82,7 +81,7 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.mixture.variance_moderation import moderated_variances
+from tpgmm_torch.mixture.covariance_shrinkage import moderated_variances, shrinkage_intensity
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -193,7 +192,7 @@ def test_few_demonstrations_shrink_covariances_given_time_towards_the_diagonal()
         ours = Conditionals.of(mean, covariance)
         em = Conditionals.of(plain.means_[j], plain.covariances_[j])
         torch.testing.assert_close(ours.gain, em.gain, rtol=1e-7, atol=1e-9)
-        share = oracle_approximating_intensity(em.covariance, 4.0)[:, None, None]
+        share = shrinkage_intensity(em.covariance, "auto", 5.0)[:, None, None]
         diagonal = torch.diag_embed(em.covariance.diagonal(dim1=1, dim2=2))
         shrunk = (1 - share) * em.covariance + share * diagonal
         names = model.operators_[j].units(model.kinematics_)

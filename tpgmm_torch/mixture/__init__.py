@@ -1,1 +1,1 @@
-"""The mixture over blocks of columns, as a scikit-learn estimator."""
+"""Gaussian mixtures over blocks of columns, learned by expectation-maximisation."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -19,13 +18,7 @@ from sklearn.utils.validation import validate_data
 from torch import Tensor
 
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.em.column_moments import ColumnMoments
-from tpgmm_torch.em.covariance_family import CovarianceFamily
-from tpgmm_torch.em.covariance_shrinkage import shrink
-from tpgmm_torch.em.expectation_maximization import Fit, expectation_maximization
-from tpgmm_torch.em.parameters import Parameters, Standardization, check_blocks
-from tpgmm_torch.em.points import standardized_chunks
-from tpgmm_torch.em.whitening import Whitener
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import (
     ConvergenceWarning,
     DataError,
@@ -33,26 +26,27 @@ from tpgmm_torch.exceptions import (
     NotFittedError,
     ShapeError,
 )
-from tpgmm_torch.large_data.checkpoints import Checkpoint
-from tpgmm_torch.large_data.processes import (
-    ALONE,
-    Processes,
-    column_moments,
-    common_random_state,
+from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.covariance_shrinkage import shrink
+from tpgmm_torch.mixture.expectation_maximization import (
+    CovarianceFamily,
+    Fit,
+    Parameters,
+    expectation_maximization,
+    log_joint,
+    whiten,
 )
-from tpgmm_torch.large_data.row_batches import BatchedRows, Rows, StoredRows, are_batches
-from tpgmm_torch.large_data.row_points import RowPoints
-from tpgmm_torch.mixture.initial_parameters import InitialParameters
-from tpgmm_torch.mixture.initialization import check_distinct, draw_starts
-from tpgmm_torch.mixture.variance_moderation import moderate
+from tpgmm_torch.mixture.initialization import draw_starts
+from tpgmm_torch.mixture.points import Points
+from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.mixture.row_file import RowFile, Rows
 
-__all__ = ["BlockGaussianMixture", "fit_subsets"]
+__all__ = ["BlockGaussianMixture"]
 
-#: Settings that a checkpoint has to share, beside the blocks and the initial parameters.
-SHAPING = (
-    "n_components", "covariance_type", "tol", "reg_covar", "regularization", "n_init",
-    "init_params", "time_feature", "group_size", "random_state", "dtype",
-)  # fmt: skip
+#: Least regularisation, as a share of the variance, that survives rounding.
+SMALLEST_SHARE = {torch.float64: 1e-12, torch.float32: 2e-6}
+#: Rows at a time when densities are evaluated.
+FEW_ROWS = 2**12
 
 
 class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
@@ -80,17 +74,15 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     tol : float, default=1e-3
         EM stops when the mean log-likelihood changes by less.
     reg_covar : float or array-like of shape (n_features,), default=1e-6
-        Regularisation of the covariances' diagonals.
-    regularization : {"relative", "absolute"}, default="relative"
-        Whether ``reg_covar`` is a share of each column's variance (of its block's mean
-        variance where a column is constant), or in squared units of the data as in
-        scikit-learn. It is never less than 1e-12 (float64), 2e-6 (float32) of the variance.
+        Regularisation of the covariances' diagonals, as a share of each column's variance (of
+        its block's mean variance where a column is constant, or ``covariance_type`` is
+        "spherical"). It is never less than 1e-12 (float64), 2e-6 (float32).
     covariance_shrinkage : float or "auto", default=0
         How far the full or tied covariances that EM found go towards their diagonals, from 0
         to 1. "auto" follows from the number of samples and of columns, component by component
-        (:func:`~tpgmm_torch.em.covariance_shrinkage.oracle_approximating_intensity`); it also
+        (:func:`~tpgmm_torch.mixture.covariance_shrinkage.shrinkage_intensity`); it also
         moderates the variances of columns of one unit by each other
-        (:func:`~tpgmm_torch.mixture.variance_moderation.moderated_variances`).
+        (:func:`~tpgmm_torch.mixture.covariance_shrinkage.moderated_variances`).
     column_units : sequence of str or None, of shape (n_features,), optional
         The unit of each column, for "auto": those of one unit in one block are alike. None is
         for columns that are like no other; by default all are.
@@ -105,26 +97,13 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     n_init : int, default=1
         Number of starts; the one with the highest bound wins.
     init_params : {"time", "kmeans", "random"}, default="time"
-        Equal bins along ``time_feature`` (with bins of random sizes in further starts),
+        Equal bins along the first column (with bins of random sizes in further starts),
         k-means on standardised data, or the nearest of K random points.
-    time_feature : int, default=0
-        Column of the first block that holds time.
     group_size : int, default=1
         In ``fit``, so many consecutive rows share one responsibility, that of the geometric
         mean of their densities: demonstrations of one skill at one instant, for example.
-    weights_init : array-like of shape (K,), optional
-        Start of the weights, in place of what ``init_params`` gives.
-    means_init : sequence of array-like of shape (K, D_j), optional
-        Start of the means, one array per block.
-    covariances_init : sequence of array-like of shape (K, D_j, D_j), optional
-        Start of the covariances, one array per block. They are brought into the family
-        ``covariance_type`` and raised to the regularisation where they are below it.
     random_state : int, RandomState or None, default=None
         For the starts, for components that are reseeded, and for :meth:`sample`.
-    warm_start : bool, default=False
-        Continue from the last fit instead of from the beginning.
-    verbose : int, default=0
-        1 prints a line per start, 2 also one per iteration.
     dtype : {"float64", "float32"}, default="float64"
         Precision of the passes over the data and of the result; sums are in float64.
     device : str or torch.device, default="cpu"
@@ -159,7 +138,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     Examples
     --------
     >>> import numpy as np
-    >>> from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+    >>> from tpgmm_torch import BlockGaussianMixture
     >>> time = np.linspace(0, 1, 50)
     >>> X = np.column_stack([time, time**2, time, np.sin(3 * time)])
     >>> model = BlockGaussianMixture(n_components=3, blocks=(2, 2)).fit(X)
@@ -173,7 +152,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "covariance_type": [Options("full", "tied", "diag", "spherical")],
         "tol": [Interval(Real, 0.0, None, closed="left")],
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
-        "regularization": [Options("relative", "absolute")],
         "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), Options("auto")],
         "column_units": ["array-like", None],
         "n_demonstrations": [Interval(Real, 0, None, closed="neither"), None],
@@ -181,14 +159,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "init_params": [Options("time", "kmeans", "random")],
-        "time_feature": [Interval(Integral, 0, None, closed="left")],
         "group_size": [Interval(Integral, 1, None, closed="left")],
-        "weights_init": ["array-like", None],
-        "means_init": ["array-like", None],
-        "covariances_init": ["array-like", None],
         "random_state": ["random_state"],
-        "warm_start": ["boolean"],
-        "verbose": ["verbose"],
         "dtype": [Options("float64", "float32")],
         "device": [str, torch.device],
     }
@@ -201,7 +173,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         covariance_type: str = "full",
         tol: float = 1e-3,
         reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
-        regularization: str = "relative",
         covariance_shrinkage: float | str = 0.0,
         column_units: Sequence[str | None] | None = None,
         n_demonstrations: float | None = None,
@@ -209,14 +180,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         max_iter: int = 100,
         n_init: int = 1,
         init_params: str = "time",
-        time_feature: int = 0,
         group_size: int = 1,
-        weights_init: Any = None,
-        means_init: Any = None,
-        covariances_init: Any = None,
         random_state: Any = None,
-        warm_start: bool = False,
-        verbose: int = 0,
         dtype: str = "float64",
         device: str | torch.device = "cpu",
     ) -> None:
@@ -225,7 +190,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.covariance_type = covariance_type
         self.tol = tol
         self.reg_covar = reg_covar
-        self.regularization = regularization
         self.covariance_shrinkage = covariance_shrinkage
         self.column_units = column_units
         self.n_demonstrations = n_demonstrations
@@ -233,30 +197,20 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.max_iter = max_iter
         self.n_init = n_init
         self.init_params = init_params
-        self.time_feature = time_feature
         self.group_size = group_size
-        self.weights_init = weights_init
-        self.means_init = means_init
-        self.covariances_init = covariances_init
         self.random_state = random_state
-        self.warm_start = warm_start
-        self.verbose = verbose
         self.dtype = dtype
         self.device = device
 
     @classmethod
     def from_parameters(
-        cls,
-        weights: Tensor,
-        means: Sequence[Tensor],
-        covariances: Sequence[Tensor],
-        **settings: Any,
+        cls, weights: Any, means: Sequence[Any], covariances: Sequence[Any], **settings: Any
     ) -> Self:
         """A fitted mixture from weights (K,), means (K, D_j), covariances (K, D_j, D_j).
 
         Parameters
         ----------
-        weights, means, covariances : Tensor, sequences of Tensor
+        weights, means, covariances : array-like, sequences of array-like
             As in the attributes.
         **settings
             Parameters of the constructor.
@@ -266,37 +220,48 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         ShapeError, DataError
             If they do not fit together or are no mixture.
         """
-        widths = tuple(len(mean[0]) for mean in means)
+        widths = [len(mean[0]) for mean in means]
         defaults: dict[str, Any] = {"n_components": len(weights), "blocks": widths}
         model = cls(**(defaults | settings))
-        widths = check_blocks(model.blocks, sum(widths))
-        given = InitialParameters.checked(
-            weights, means, covariances, model.n_components, widths
-        )
-        model.n_features_in_ = sum(widths)
-        model._set(given.over(None))
-        return model
+        widths, k = model._widths(sum(widths)), model.n_components
+        shapes = [(k,), *((k, d) for d in widths), *((k, d, d) for d in widths)]
+        tensors = [
+            as_tensor(one, "a mixture").double() for one in (weights, *means, *covariances)
+        ]
+        if [tuple(tensor.shape) for tensor in tensors] != shapes:
+            raise ShapeError(
+                f"weights, means and covariances of {k} components have the shapes {shapes}, "
+                f"got {[tuple(tensor.shape) for tensor in tensors]}"
+            )
+        shares, count = tensors[0], len(widths)
+        if bool((shares < 0).any()) or abs(float(shares.sum()) - 1) > 1e-3:
+            raise DataError(f"weights must be positive and add up to 1, got {weights!r}")
+        own = tuple(tensors[1 : count + 1]), tuple(tensors[count + 1 :])
+        whiten(parameters := Parameters(shares / shares.sum(), *own))
+        return model._set(parameters)
 
     def fit(
         self,
         X: Any,
         y: Any = None,
         *,
-        checkpoint: Checkpoint | None = None,
+        start: BlockGaussianMixture | None = None,
         processes: Processes = ALONE,
     ) -> Self:
         """Learn the mixture by EM.
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features), or iterable of such arrays
-            Batches, for data larger than memory: each ``iter(X)`` has to give the same ones,
-            from the first on, in one pass per iteration of EM.
-        checkpoint : Checkpoint, optional
-            Where to keep the state of EM, and to go on from if there is one.
+        X : array-like of shape (n_samples, n_features), or RowFile
+            Data larger than memory are
+            :meth:`RowFile.of(batches) <tpgmm_torch.mixture.row_file.RowFile.of>`.
+        y : ignored
+            Here for scikit-learn.
+        start : BlockGaussianMixture, optional
+            Fitted; EM begins with its parameters, in place of ``init_params``.
         processes : Processes, optional
             Those that learn together: what
-            :func:`~tpgmm_torch.large_data.processes.joined_processes` gives;
+            :func:`~tpgmm_torch.mixture.processes.joined_processes` gives;
             X is then the share of this one, and each has the whole result.
 
         Returns
@@ -306,232 +271,126 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Raises
         ------
         ShapeError
-            If the blocks, the groups, or the arrays of the start do not fit the data.
+            If the blocks, the groups, or the start do not fit the data.
         DataError
-            If there are fewer distinct points than components, a batch is no finite array
-            like the others, or batches can be walked through only once.
-        ModelFileError
-            If the checkpoint is damaged, or of other data or settings.
+            If there are fewer distinct points than components.
         DistributedError
             If another of the processes died.
         """
         check_parameters(self)
-        if are_batches(X):
-            rows: Rows = BatchedRows(X, self.group_size)
-            return self.fit_rows(rows, checkpoint=checkpoint, processes=processes)
-        points = validate_data(
-            self, on_cpu(X), dtype=[np.float64, np.float32], ensure_min_samples=2
-        )
-        rows = StoredRows(points)
-        return self.fit_rows(rows, checkpoint=checkpoint, processes=processes)
-
-    def fit_rows(
-        self,
-        rows: Rows,
-        *,
-        moments: ColumnMoments | None = None,
-        checkpoint: Checkpoint | None = None,
-        processes: Processes = ALONE,
-    ) -> Self:
-        """Learn the mixture from rows that are wherever they are; :meth:`fit` calls this.
-
-        Parameters
-        ----------
-        rows : Rows
-            Of this process.
-        moments : ColumnMoments, optional
-            Of the rows of all processes, where they are known already.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        ShapeError, DataError, ModelFileError, DistributedError
-            As :meth:`fit`.
-        """
-        moments = moments or column_moments(rows, processes)
-        units = self._units(rows, moments)
-        family = self._family(units)
-        points = self._points(rows, units, moments.count, processes=processes)
-        fits, after = None, None
-        if checkpoint is not None:
-            settings: dict[str, Any] = {name: getattr(self, name) for name in SHAPING}
-            settings |= {"blocks": units.widths, "start": self._initial_parameters()}
-            fits = checkpoint.resume(settings, moments, processes)
-
-            def after(fits: Sequence[Fit]) -> None:
-                if processes.rank == 0:
-                    checkpoint.keep(fits, settings, moments, self.max_iter)
-
-        fits = fits or self._starts(rows, moments, units, family, processes)
-        expectation_maximization(
-            fits, points, family, group_size=self.group_size, after=after, **self._loop()
-        )
-        return self._take_best(fits, units, moments.count)
-
-    def _units(self, rows: Rows, moments: ColumnMoments) -> Standardization:
-        """The units in which the mixture is learned."""
+        rows = self._rows(X)
+        moments = ColumnMoments.of(rows, processes)
         if moments.count < 2:
             raise DataError("the data hold 1 sample; a mixture is learned from at least 2")
-        if rows.n_rows % self.group_size:
-            raise ShapeError(
-                f"{rows.n_rows} rows are no multiple of group_size={self.group_size}"
+        widths = self._widths(len(moments.mean))
+        scales = moments.scales(widths, isotropic=self.covariance_type == "spherical")
+        shift, scale = (torch.from_numpy(x).to(self.device) for x in (moments.mean, scales))
+        points = Points(
+            rows, shift, scale, widths, self.n_components, getattr(torch, self.dtype),
+            self.group_size, processes,
+        )  # fmt: skip
+        seed, family = self.random_state, self._family(widths)
+        if processes.count > 1 and not isinstance(seed, Integral):
+            seed = processes.gather(check_random_state(seed).randint(2**31))[0]
+        rng = check_random_state(seed)
+        if start is None:
+            method, k = self.init_params, self.n_components
+            starts = draw_starts(method, self.n_init, k, points, family, rng)
+        else:
+            if [len(start.weights_), *map(_width, start.means_)] != [
+                self.n_components,
+                *widths,
+            ]:
+                raise ShapeError(
+                    f"the start has {len(start.weights_)} components in blocks of "
+                    f"{[*map(_width, start.means_)]} columns, asked for are "
+                    f"{self.n_components} in blocks of {widths}"
+                )
+            starts = [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
+        fits = [
+            expectation_maximization(
+                begin, points, family, RandomState(rng.randint(2**31 - 1)),
+                tol=self.tol, max_iter=self.max_iter,
             )
-        units = moments.standardization(
-            check_blocks(self.blocks, len(moments.mean)),
-            isotropic=self.covariance_type == "spherical",
-        )
-        return units.to(torch.device(self.device))
-
-    def _family(self, units: Standardization) -> CovarianceFamily:
-        """The covariances that are admitted, in those units."""
-        return CovarianceFamily.regularized(
-            self.covariance_type,
-            units,
-            self.reg_covar,
-            relative=self.regularization == "relative",
-            dtype=getattr(torch, self.dtype),
-        )
-
-    def _points(
-        self,
-        rows: Rows,
-        units: Standardization,
-        total: int,
-        *,
-        group_size: int | None = None,
-        processes: Processes = ALONE,
-    ) -> RowPoints:
-        """The rows as EM walks through them, sorted by time where there is such a column."""
-        return RowPoints(
-            rows,
-            total,
-            units,
-            self.n_components,
-            getattr(torch, self.dtype),
-            group_size=group_size or self.group_size,
-            time_feature=self.time_feature if self.time_feature < units.widths[0] else None,
-            processes=processes,
-        )
-
-    @property
-    def unshrunk_covariances(self) -> list[Tensor]:
-        """Where EM ended, before covariances were shrunk; one tensor per block."""
-        return getattr(self, "_unshrunk", None) or self.covariances_
-
-    @unshrunk_covariances.setter
-    def unshrunk_covariances(self, covariances: Sequence[Tensor]) -> None:
-        self._unshrunk = list(covariances)
-
-    def _initial_parameters(self) -> tuple[Any, Any, Any]:
-        """Weights, means and covariances as far as they are given, else None."""
-        if self.warm_start and hasattr(self, "weights_"):
-            # where EM ended, which what was shrunk thereafter is not
-            return self.weights_, self.means_, self.unshrunk_covariances
-        return self.weights_init, self.means_init, self.covariances_init
-
-    def _starts(
-        self,
-        rows: Rows,
-        moments: ColumnMoments,
-        units: Standardization,
-        family: CovarianceFamily,
-        processes: Processes = ALONE,
-    ) -> list[Fit]:
-        """Where EM starts, drawn as far as it is not given."""
-        given = InitialParameters.checked(
-            *self._initial_parameters(), self.n_components, units.widths, self.device
-        )
-        check_distinct(rows, moments.count, self.n_components, processes)
-        rng = common_random_state(self.random_state, processes)
-        drawn: Sequence[Parameters | None] = [None]
-        if not given.complete:
-            standardized = draw_starts(
-                self.init_params,
-                self.n_init,
-                rows,
-                moments.count,
-                units,
-                family,
-                rng,
-                n_components=self.n_components,
-                time_feature=self.time_feature,
-                group_size=self.group_size,
-                processes=processes,
-            )
-            drawn = [units.restore(start) for start in standardized]
-        starts = [units.standardize(given.over(start)) for start in drawn]
-        return [
-            Fit(family.admit(start), RandomState(rng.randint(2**31 - 1))) for start in starts
-        ]
-
-    def _loop(self) -> dict[str, Any]:
-        """The settings of the loop of EM."""
-        return {"tol": self.tol, "max_iter": self.max_iter, "verbose": self.verbose}
-
-    def _take_best(self, fits: Sequence[Fit], units: Standardization, n_rows: int) -> Self:
-        """Take over the best of the fits, and warn of what the user should know."""
+            for begin in starts
+        ]  # fmt: skip
         best = max(fits, key=lambda fit: fit.bounds[-1])
-        self.n_features_in_ = sum(units.widths)
-        self._set(units.restore(best.parameters))
-        self.unshrunk_covariances = self.covariances_
-        self._set(self._shrunk(best.parameters, n_rows, units))
         self.converged_, self.n_iter_ = best.converged, best.n_iter
-        self.lower_bounds_ = [bound - units.log_volume for bound in best.bounds]
+        self.lower_bounds_ = [bound - float(scale.log().sum()) for bound in best.bounds]
         self.lower_bound_ = self.lower_bounds_[-1]
-        if best.reseedings:
-            warnings.warn(
-                f"reseeded for having lost their data: {'; '.join(best.reseedings)}; "
-                "use fewer components, a larger reg_covar or another start",
-                DegenerateComponentWarning,
-                stacklevel=4,
-            )
-        if not best.converged:
-            warnings.warn(
-                f"EM did not converge in {best.n_iter} iterations: raise max_iter or tol, or "
-                "use another start",
-                ConvergenceWarning,
-                stacklevel=4,
-            )
-        return self
+        _warn(best)
+        return self._set(self._shrunk(best.parameters.affine(scale, shift), moments.count))
 
-    def _shrunk(
-        self, parameters: Parameters, n_rows: int, units: Standardization
-    ) -> Parameters:
-        """What EM found, restored, with covariances shrunk where they have correlations."""
-        if self.covariance_type not in ("full", "tied") or self.covariance_shrinkage == 0:
-            return units.restore(parameters)
-        n_samples: Tensor | float = n_rows  # those of a tied covariance
-        if self.n_demonstrations is not None:
-            n_samples = self.n_demonstrations
-        elif self.covariance_type == "full":
-            n_samples = n_rows * parameters.weights
-        given = int(self.timed_blocks)
-        shrunk = shrink(parameters, self.covariance_shrinkage, n_samples, given=given)
-        restored = units.restore(shrunk)
-        if self.column_units is None or self.covariance_shrinkage != "auto":
-            return restored
-        names = iter(self.column_units)
-        if len(self.column_units) != sum(units.widths):
+    def _rows(self, X: Any) -> Rows:
+        """The rows of X, checked."""
+        rows: Rows = X
+        if not isinstance(X, RowFile):
+            kinds = [np.float64, np.float32]
+            rows = validate_data(self, on_cpu(X), dtype=kinds, ensure_min_samples=2)
+        if len(rows) % self.group_size:
             raise ShapeError(
-                f"column_units has {len(self.column_units)} units, but the data have "
-                f"{sum(units.widths)} columns"
+                f"{len(rows)} rows are no multiple of group_size={self.group_size}"
             )
-        of_blocks = [tuple(islice(names, width))[given:] for width in units.widths]
-        return moderate(restored, of_blocks, n_samples, given=given)
+        return rows
 
-    def fit_predict(self, X: Any, y: Any = None) -> NDArray[np.int64]:
-        """Fit, and return :meth:`predict` of the same points."""
-        return self.fit(X).predict(X)
+    def _widths(self, n_features: int) -> list[int]:
+        """Widths of the blocks, checked against the data."""
+        widths = [n_features] if self.blocks is None else list(self.blocks)
+        if not all(isinstance(width, Integral) and width > 0 for width in widths):
+            raise ShapeError(f"blocks must be positive integers, got {self.blocks!r}")
+        if sum(widths) != n_features:
+            raise ShapeError(
+                f"blocks={self.blocks!r} add up to {sum(widths)} columns, but the data have "
+                f"{n_features}"
+            )
+        return list(map(int, widths))
 
-    def _set(self, parameters: Parameters) -> None:
+    def _family(self, widths: list[int]) -> CovarianceFamily:
+        """The covariances that are admitted, in standardised units."""
+        shares = np.asarray(self.reg_covar, dtype=np.float64)
+        if shares.shape not in ((), (sum(widths),)):
+            raise ShapeError(
+                f"reg_covar is one number or one for each of the {sum(widths)} columns, got "
+                f"shape {shares.shape}"
+            )
+        if not (np.isfinite(shares) & (shares >= 0)).all():
+            raise DataError(
+                f"reg_covar must be finite and not negative, got {self.reg_covar!r}"
+            )
+        smallest = SMALLEST_SHARE[getattr(torch, self.dtype)]
+        diagonal = torch.from_numpy(np.broadcast_to(shares, sum(widths)).clip(min=smallest))
+        return CovarianceFamily(self.covariance_type, diagonal.to(self.device).split(widths))
+
+    def _shrunk(self, parameters: Parameters, n_rows: int) -> Parameters:
+        """The mixture with full or tied covariances shrunk."""
+        if self.covariance_type not in ("full", "tied") or self.covariance_shrinkage == 0:
+            return parameters
+        n_samples: Any = self.n_demonstrations
+        if n_samples is None:
+            n_samples = n_rows * (parameters.weights if self.covariance_type == "full" else 1)
+        n_features = sum(map(_width, parameters.means))
+        units: list[str | None] = [None] * n_features
+        if self.column_units is not None and self.covariance_shrinkage == "auto":
+            units = list(self.column_units)
+        if len(units) != n_features:
+            raise ShapeError(
+                f"column_units has {len(units)} units, but the data have {n_features} columns"
+            )
+        given, covariances = int(self.timed_blocks), []
+        for covariance in parameters.covariances:
+            own, units = units[: _width(covariance)], units[_width(covariance) :]
+            shrunk = shrink(covariance, self.covariance_shrinkage, n_samples, own, given=given)
+            covariances.append(shrunk)
+        return Parameters(parameters.weights, parameters.means, tuple(covariances))
+
+    def _set(self, parameters: Parameters) -> Self:
         """Set the mixture in units of the data."""
         target = {"dtype": getattr(torch, self.dtype), "device": torch.device(self.device)}
         self.weights_ = parameters.weights.to(**target)
         self.means_ = [mean.to(**target) for mean in parameters.means]
         self.covariances_ = [covariance.to(**target) for covariance in parameters.covariances]
+        self.n_features_in_ = sum(map(_width, self.means_))
+        return self
 
     def score_samples(self, X: Any) -> NDArray[np.floating]:
         """Log-density of each point.
@@ -544,7 +403,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         -------
         array of shape (n_samples,)
         """
-        return _to_numpy(torch.logsumexp(joint, 0) for joint in self._log_joint(X))
+        return self._evaluate(X, lambda joint: joint.logsumexp(0))
 
     def score(self, X: Any, y: Any = None) -> float:
         """Mean log-density of the points X (n_samples, n_features)."""
@@ -561,34 +420,32 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         -------
         array of shape (n_samples, K)
         """
-        return _to_numpy(torch.softmax(joint, 0).T for joint in self._log_joint(X))
+        return self._evaluate(X, lambda joint: joint.softmax(0).T)
 
     def predict(self, X: Any) -> NDArray[np.int64]:
         """Most probable component of each of the points X, shape (n_samples,)."""
-        return _to_numpy(joint.argmax(0) for joint in self._log_joint(X))
+        return self._evaluate(X, lambda joint: joint.argmax(0))
 
     @property
     def n_parameters_(self) -> int:
         """Number of free parameters: weights, means, and covariances of all blocks."""
-        n_components, widths = len(self._fitted().weights), [m.shape[1] for m in self.means_]
-        per_block = {
-            "full": [n_components * width * (width + 1) // 2 for width in widths],
-            "tied": [width * (width + 1) // 2 for width in widths],
-            "diag": [n_components * width for width in widths],
-            "spherical": [n_components for _ in widths],
-        }[self.covariance_type]
-        return n_components - 1 + n_components * sum(widths) + sum(per_block)
+        k, widths = len(self._fitted().weights), list(map(_width, self.means_))
+        triangles = sum(width * (width + 1) // 2 for width in widths)
+        covariances = {
+            "full": k * triangles,
+            "tied": triangles,
+            "diag": k * sum(widths),
+            "spherical": k * len(widths),
+        }
+        return k - 1 + k * sum(widths) + covariances[self.covariance_type]
 
     def bic(self, X: Any) -> float:
         """Bayesian information criterion on X (n_samples, n_features); lower is better."""
-        values = self.score_samples(X)
-        penalty = self.n_parameters_ * math.log(len(values))
-        return -2 * float(values.sum(dtype=np.float64)) + penalty
+        return -2 * len(X) * self.score(X) + self.n_parameters_ * math.log(len(X))
 
     def aic(self, X: Any) -> float:
         """Akaike information criterion on X (n_samples, n_features); lower is better."""
-        values = self.score_samples(X)
-        return -2 * float(values.sum(dtype=np.float64)) + 2 * self.n_parameters_
+        return -2 * len(X) * self.score(X) + 2 * self.n_parameters_
 
     def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
         """Draw points from the mixture.
@@ -606,8 +463,16 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         parameters = self._fitted()
         if not isinstance(n_samples, Integral) or n_samples < 1:
             raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
-        X, labels = parameters.sample(n_samples, check_random_state(self.random_state))
-        return X.astype(self.dtype), labels
+        rng = check_random_state(self.random_state)
+        weights = parameters.weights.cpu().numpy()
+        counts = rng.multinomial(n_samples, weights / weights.sum())
+        labels = np.repeat(np.arange(len(counts)), counts)
+        columns = []
+        for mean, covariance in zip(parameters.means, parameters.covariances, strict=True):
+            normal = rng.standard_normal((n_samples, mean.shape[1], 1))
+            factor = torch.linalg.cholesky(covariance).cpu().numpy()
+            columns.append(mean.cpu().numpy()[labels] + (factor[labels] @ normal)[..., 0])
+        return np.concatenate(columns, axis=1).astype(self.dtype), labels
 
     def _fitted(self) -> Parameters:
         """The fitted mixture in float64."""
@@ -615,86 +480,33 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             raise NotFittedError(
                 f"this {type(self).__name__} is not fitted yet; call fit before this method"
             )
-        return Parameters.from_covariances(
-            self.weights_.double(),
-            [mean.double() for mean in self.means_],
-            [covariance.double() for covariance in self.covariances_],
+        own = (
+            tuple(x.double() for x in self.means_),
+            tuple(x.double() for x in self.covariances_),
         )
+        return Parameters(self.weights_.double(), *own)
 
-    def _log_joint(self, X: Any) -> Iterator[Tensor]:
-        """Log of weight times density, (K, n), chunk by chunk."""
-        parameters = self._fitted()
+    def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
+        """What a function makes of the log of weight times density, (K, n), of the rows."""
+        parameters, dtype = self._fitted(), self.weights_.dtype
         points = validate_data(self, on_cpu(X), dtype=[np.float64, np.float32], reset=False)
-        units = Standardization.of_mixture(parameters)
-        whitener = Whitener(units.standardize(parameters), self.weights_.dtype)
-        for chunk in standardized_chunks(
-            points, units, len(parameters.weights), self.weights_.dtype
-        ):
-            yield whitener.log_joint(chunk)[0] - units.log_volume
+        # centred, so that offsets cost no digits
+        center = torch.cat([parameters.weights @ mean for mean in parameters.means])
+        exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
+        maps, peaks = [own.to(dtype) for own in exact], peaks.to(dtype)
+        widths, found = [own.shape[1] for own in maps], []
+        for start in range(0, len(points), FEW_ROWS):
+            rows = torch.from_numpy(np.array(points[start : start + FEW_ROWS])).to(center)
+            blocks = [
+                torch.nn.functional.pad(block, (0, 1), value=1.0).T.to(dtype)
+                for block in (rows - center).split(widths, 1)
+            ]
+            found.append(reduce(log_joint(blocks, maps, peaks)[0]).cpu().numpy())
+        return np.concatenate(found)
 
 
-def fit_subsets(
-    mixtures: Sequence[BlockGaussianMixture],
-    X: NDArray[np.floating],
-    members: NDArray[np.bool_],
-    group_size: int = 1,
-    moments: Sequence[ColumnMoments] | None = None,
-) -> None:
-    """Fit several mixtures, each to some of the rows, in passes that they share.
-
-    The result is that of fitting each to its rows alone, to rounding, in less time: points are
-    expanded once for all, as for restarts. That is what cross-validation asks for.
-
-    Parameters
-    ----------
-    mixtures : sequence of BlockGaussianMixture
-        Of equal settings, but for ``reg_covar``, ``group_size``, ``n_demonstrations`` and what
-        the start is.
-    X : array of shape (n_samples, n_features)
-        All rows.
-    members : array of bool, of shape (S, n_samples)
-        The rows of each mixture. Where its start is drawn, ``group_size`` of its own from each
-        group of all.
-    group_size : int, default=1
-        So many consecutive rows of ``X`` share one responsibility.
-    moments : sequence of ColumnMoments, optional
-        Of the rows of each mixture, where they are known already.
-
-    Raises
-    ------
-    ShapeError, DataError
-        As :meth:`BlockGaussianMixture.fit_rows`.
-    """
-    rows = StoredRows(X)
-    first = mixtures[0]
-    units = column_moments(rows).standardization(
-        check_blocks(first.blocks, X.shape[1]), isotropic=first.covariance_type == "spherical"
-    )
-    units = units.to(torch.device(first.device))
-    points = first._points(rows, units, len(X), group_size=group_size)
-    parts = [StoredRows(X[own]) for own in members]
-    moments = moments or [column_moments(part) for part in parts]
-    fits: list[list[Fit]] = []
-    families: list[CovarianceFamily] = []
-    for mixture, part, known in zip(mixtures, parts, moments, strict=True):
-        own_units = mixture._units(part, known)
-        family = mixture._family(own_units)
-        starts = mixture._starts(part, known, own_units, family)
-        for fit in starts:
-            fit.parameters = units.standardize(own_units.restore(fit.parameters))
-        fits.append(starts)
-        families += [family.rescaled(own_units, units)] * len(starts)
-    belongs = torch.from_numpy(members[:, points.numbers()]).to(points.device)
-    expectation_maximization(
-        [fit for starts in fits for fit in starts],
-        points,
-        families,
-        group_size=group_size,
-        members=belongs.repeat_interleave(len(fits[0]), 0),
-        **first._loop(),
-    )
-    for mixture, starts, known in zip(mixtures, fits, moments, strict=True):
-        mixture._take_best(starts, units, known.count)
+def _width(block: Tensor) -> int:
+    return block.shape[-1]
 
 
 def on_cpu(X: Any) -> Any:
@@ -702,7 +514,19 @@ def on_cpu(X: Any) -> Any:
     return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
 
 
-def _to_numpy(chunks: Iterator[Tensor]) -> NDArray[Any]:
-    """Put the results of the chunks together."""
-    result: NDArray[Any] = torch.cat(list(chunks)).cpu().numpy()
-    return result
+def _warn(fit: Fit) -> None:
+    """Warn of what the user should know of the best start."""
+    if fit.reseedings:
+        warnings.warn(
+            f"reseeded for having lost their data: {'; '.join(fit.reseedings)}; use fewer "
+            "components, a larger reg_covar or another start",
+            DegenerateComponentWarning,
+            stacklevel=4,
+        )
+    if not fit.converged:
+        warnings.warn(
+            f"EM did not converge in {fit.n_iter} iterations: raise max_iter or tol, or use "
+            "another start",
+            ConvergenceWarning,
+            stacklevel=4,
+        )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.mixture.processes import ALONE, Processes
 
 __all__ = ["DemonstratedPeaks", "demonstrated_peaks"]
 

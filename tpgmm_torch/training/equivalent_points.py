@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.large_data.processes import ALONE, Processes
-from tpgmm_torch.large_data.row_batches import Rows
+from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.mixture.row_file import Rows
 
 __all__ = ["Instants", "equivalent_points"]
 
@@ -46,13 +46,9 @@ class Instants:
     def add(self, rows: Rows) -> None:
         """Add demonstrations of T rows each, one after the other in ``rows``."""
         length = len(self._reference)
-        left: Tensor = self._reference[:0]
-        for batch in rows:
-            left = torch.cat([left, torch.from_numpy(np.asarray(batch, dtype=np.float64))])
-            whole = len(left) // length * length
-            for demonstration in left[:whole].split(length):
-                self._add(demonstration - self._reference)
-            left = left[whole:]
+        for start in range(0, len(rows), length):
+            demonstration = np.asarray(rows[start : start + length], dtype=np.float64)
+            self._add(torch.from_numpy(demonstration) - self._reference)
 
     def _add(self, deviation: Tensor) -> None:
         self._count += 1

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
 from tpgmm_torch.robots.joint_space import JointSpace
@@ -138,14 +138,12 @@ def regularization(
     DataError
         If a tolerance is no number, negative, or not finite.
     """
-    units = moments.standardization(
-        block_widths(operators, kinematics), isotropic=covariance_type == "spherical"
-    )
     tolerances = [(0.0, *operator.tolerances(kinematics)) for operator in operators]
     for operator, (_, *given) in zip(operators, tolerances, strict=True):
         if not all(isinstance(one, Real) and 0 <= one < math.inf for one in given):
             raise DataError(f"a tolerance is a number of at least 0, {operator!r} has {given}")
-    scales = torch.cat(units.scales).numpy()
+    widths = block_widths(operators, kinematics)
+    scales = moments.scales(widths, isotropic=covariance_type == "spherical")
     paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]
     own = reg_covar * (1 + np.concatenate(paths) / scales**2)
     return own + (np.concatenate(tolerances) / scales) ** 2

@@ -14,9 +14,9 @@ from torch import Tensor
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.large_data.processes import ALONE, Processes, column_moments
-from tpgmm_torch.large_data.row_batches import Rows, StoredRows
-from tpgmm_torch.large_data.row_file import RowFile
+from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.mixture.row_file import RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import Instants
@@ -43,7 +43,7 @@ class TrainingRows:
 
     Parameters
     ----------
-    rows : Rows
+    rows : array of shape (n, sum_j (1 + D_j)), or RowFile
         Of this process.
     group_size : int
         So many consecutive rows share one responsibility.
@@ -59,8 +59,6 @@ class TrainingRows:
         Among which the rows are spread.
     parts : tuple of Tensor of shape (T_m, sum_j (1 + D_j))
         The rows of each demonstration, if all are in memory.
-    file : RowFile, optional
-        Where the rows are, or came from.
     """
 
     rows: Rows
@@ -71,12 +69,6 @@ class TrainingRows:
     holds: tuple[Hold, ...]
     processes: Processes
     parts: tuple[Tensor, ...] = ()
-    file: RowFile | None = None
-
-    def close(self) -> None:
-        """Let go of the temporary file, if there is one."""
-        if self.file is not None:
-            self.file.__exit__()
 
     def within(self, begin: float, end: float) -> Self:
         """Those rows, in memory, whose time is from ``begin`` to before ``end`` [s].
@@ -87,12 +79,12 @@ class TrainingRows:
             If there are less than two instants.
         """
         inside = (self.time >= begin) & (self.time < end)
-        rows = np.concatenate(list(self.rows))
+        rows = self.rows[:]
         own = (rows[:, 0] >= begin) & (rows[:, 0] < end)
         if int(inside.sum()) < 2 or not own.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
         parts = tuple(x[(x[:, 0] >= begin) & (x[:, 0] < end)] for x in self.parts)
-        return replace(self, rows=StoredRows(rows[own]), time=self.time[inside], parts=parts)
+        return replace(self, rows=rows[own], time=self.time[inside], parts=parts)
 
 
 def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
@@ -212,7 +204,7 @@ def read_rows(
         rows, time = one_constant(rows, completed, kinematics), typical_time(head)
         size = _group_size(aligned, responsibilities, len(rows))
         together = torch.cat(rows) if size == 1 else torch.stack(rows, 1).flatten(0, 1)
-        stored = StoredRows(together.cpu().numpy())
+        stored = together.cpu().numpy()
         time = time.to(kinematics.lower)
         return TrainingRows(
             stored, size, time, len(rows), completed, holds, processes, tuple(rows)
@@ -228,20 +220,17 @@ def read_rows(
             rows.append(local_rows(motion.time, x, *known))
         _write(file, following, rows, spans)
         following = next(walk, None)
-    data = TrainingRows(file, 1, grid, 0, completed, holds, processes, (), file)
-    same = all(processes.gather(aligned))
-    try:
-        return _gathered(file, spans, same, responsibilities, kinematics, data)
-    except DataError:
-        data.close()
-        raise
+    return _gathered(
+        file, spans, all(processes.gather(aligned)), responsibilities, kinematics,
+        TrainingRows(file, 1, grid, 0, completed, holds, processes),
+    )  # fmt: skip
 
 
 def _write(
     file: RowFile, batch: Sequence[Demonstration], rows: Sequence[Tensor], spans: list[Span]
 ) -> list[Span]:
     for one, own in zip(batch, rows, strict=True):
-        spans.append((one.duration, file.n_rows, file.n_rows + len(own)))
+        spans.append((one.duration, len(file), len(file) + len(own)))
         file.append(own.cpu().numpy())
     return spans
 
@@ -258,14 +247,14 @@ def _gathered(
     processes, operators = data.processes, data.operators
     n_demonstrations = sum(processes.gather(len(spans)))
     size = _group_size(aligned, responsibilities, n_demonstrations)
-    moments = column_moments(file, processes)
-    first = processes.gather(file.read(*spans[0][1:]))[0]
+    moments = ColumnMoments.of(file, processes)
+    first = processes.gather(file[slice(*spans[0][1:])])[0]
     low, high = (
         torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
     )
     widths, turns = columns_of(operators, kinematics)
     constant = constant_columns(low, high, widths, turns).numpy()
-    file.make_constant(constant, first[0])
+    file[:, constant] = first[0, constant]
     everyone = [
         (duration, rank, start, stop)
         for rank, each in enumerate(processes.gather(spans))
@@ -273,7 +262,7 @@ def _gathered(
     ]
     everyone.sort(key=lambda span: span[0])
     _, owner, start, stop = everyone[len(everyone) // 2]
-    typical = file.read(start, stop)[:, 0] if processes.rank == owner else None
+    typical = file[start:stop, 0] if processes.rank == owner else None
     time = torch.from_numpy(processes.gather(typical)[owner]).to(kinematics.lower)
     data = replace(data, time=time, n_demonstrations=n_demonstrations)
     if size == 1:
@@ -282,7 +271,7 @@ def _gathered(
     instants.add(file)
     points, size = instants.points(processes)
     own = processes.share(range(len(points) // size))
-    share = StoredRows(points[own[0] * size : (own[-1] + 1) * size])
+    share = points[own[0] * size : (own[-1] + 1) * size]
     return replace(data, rows=share, group_size=size)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
-from tpgmm_torch.em.covariance_shrinkage import shrinkage_intensity
+from tpgmm_torch.mixture.covariance_shrinkage import shrinkage_intensity
 
 __all__ = ["CovariancePrior"]
 

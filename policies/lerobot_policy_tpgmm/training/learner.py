@@ -52,8 +52,8 @@ from tpgmm_torch import (
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.piecewise_linear import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
-from tpgmm_torch.em.column_moments import ColumnMoments
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
+from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
@@ -384,8 +384,8 @@ class Learner:
         )
         widths = [mean.shape[1] for mean in self._mixture.means]
         isotropic = config.em.covariance_type == "spherical"
-        scales = torch.cat(moments.standardization(widths, isotropic=isotropic).scales)
-        added = torch.from_numpy(shares) * scales.square()
+        scales = moments.scales(widths, isotropic=isotropic)
+        added = torch.from_numpy(shares * scales**2)
         return list(added.to(self._mixture.time).split(widths))
 
     def _demonstration(self, columns: Mapping[str, Tensor]) -> Demonstration:

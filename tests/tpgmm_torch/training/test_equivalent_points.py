@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.support.skills import HANDLING, HANDS, handlings
-from tpgmm_torch.large_data.row_batches import BatchedRows
+from tpgmm_torch.mixture.row_file import RowFile
 from tpgmm_torch.training.equivalent_points import Instants, equivalent_points
 from tpgmm_torch.training.local_data import local_data
 
@@ -27,13 +27,14 @@ def test_points_without_spread_are_their_mean():
     assert torch.equal(found, mean.expand(3, 2)[None])
 
 
-@pytest.mark.parametrize("cuts", [(), (1, 25, 100)])
-def test_instants_have_the_moments_of_all_demonstrations_block_by_block(cuts):
-    """Whatever the batches, and however far the reference."""
+@pytest.mark.parametrize("in_file", [False, True])
+def test_instants_have_the_moments_of_all_demonstrations_block_by_block(in_file):
+    """However far the reference."""
     rng, widths, length = np.random.RandomState(0), (2, 3), 20
     many = rng.standard_normal((7, length, 5)) + 1e3
     instants = Instants(many[0] + 0.5, widths)
-    instants.add(BatchedRows(np.split(many.reshape(-1, 5), cuts)))
+    rows = many.reshape(-1, 5)
+    instants.add(RowFile.of([rows]) if in_file else rows)
     points, size = instants.points()
     assert size == 4
     points = points.reshape(length, size, 5)

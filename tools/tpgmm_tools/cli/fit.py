@@ -18,7 +18,7 @@ from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.large_data.processes import joined_processes
+from tpgmm_torch.mixture.processes import joined_processes
 from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
 from tpgmm_torch.persistence import save
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion

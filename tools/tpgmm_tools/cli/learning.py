@@ -10,7 +10,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.large_data.processes import ALONE, Processes
+from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.fit_parts import fit_parts

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from tests.support import torchrun_worker as worker
-from tpgmm_torch.exceptions import DataError, DistributedError
-from tpgmm_torch.large_data.processes import ALONE, GroupOfProcesses, joined_processes
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.mixture.processes import Processes, joined_processes
 
 ROOT = Path(__file__).parents[3]
 
 
 def torchrun(*arguments: object, count: int = 2) -> subprocess.CompletedProcess:
-    """Start processes that talk by gloo, and wait for them."""
+    """Start processes that exchange by gloo, and wait for them."""
     paths = [str(ROOT), str(ROOT / "datasets"), str(ROOT / "policies")]
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(paths)}
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone"]
@@ -42,13 +42,11 @@ def alone(name: str) -> dict[str, torch.Tensor]:
         warnings.simplefilter("ignore")
         if name in worker.SKILLS:
             demonstrations, settings = worker.SKILLS[name]
-            model = worker.skill(**settings).fit(demonstrations(5))
-            return worker.described(model)
-        settings = worker.MIXTURES.get(name, {})
-        return worker.learned(worker.mixture(**settings).fit(worker.rows()))
+            return worker.described(worker.skill(**settings).fit(demonstrations(5)))
+        return worker.learned(worker.mixture(**worker.MIXTURES[name]).fit(worker.rows()))
 
 
-@pytest.mark.parametrize("name", [*worker.MIXTURES, *worker.SKILLS, "resumed"])
+@pytest.mark.parametrize("name", [*worker.MIXTURES, *worker.SKILLS])
 def test_two_processes_learn_what_one_learns(found, name):
     torch.testing.assert_close(found[0][name], found[1][name], rtol=0, atol=0)
     if name == "seedless":  # there is nothing to compare with but each other
@@ -57,20 +55,15 @@ def test_two_processes_learn_what_one_learns(found, name):
     torch.testing.assert_close(found[0][name], alone(name), rtol=tolerance, atol=tolerance)
 
 
-def test_processes_leave_out_what_one_does(found):
-    assert found[0]["misplaced"]["from"].tolist() == [1, 1, 1, 0, 1]
-
-
 def test_bad_shares_are_refused_by_all_processes(tmp_path):
     done = torchrun(worker.__file__, "refused", tmp_path)
     assert done.returncode == 0, done.stderr
     expected = {
         "empty": "no rows in process(es) [1] of 2",
-        "columns": "have [5, 4] columns",
+        "columns": "have (5, 4) columns",
         "few": "n_components=9, but the data hold only 3 distinct",
         "none": "no demonstrations in process(es) [1] of 2",
         "frames": "process 1 has demonstrations with",
-        "left": "all demonstrations of process(es) [0] are unlike the others",
         "share": "1 episodes or batches cannot be shared among 2",
     }
     for name, message in expected.items():
@@ -84,30 +77,28 @@ def test_a_process_that_dies_ends_the_job(tmp_path):
     done = torchrun(worker.__file__, "dies", tmp_path)
     assert done.returncode != 0
     assert not list(tmp_path.glob("model*"))
-    told = tmp_path / "error0.txt"
+    error = tmp_path / "error0.txt"
     # torchrun stops the survivor, possibly before it has noticed itself
-    if told.exists():
-        text = told.read_text()
+    if error.exists():
+        text = error.read_text()
         assert "DistributedError: another process of this job has stopped" in text
     assert "-9" in done.stderr or "SIGKILL" in done.stderr
 
 
 def test_without_torchrun_there_is_one_process():
     with joined_processes() as processes:
-        assert processes is ALONE
+        assert (processes.rank, processes.count) == (0, 1)
         assert processes.gather("a word, µ") == ["a word, µ"]
-    with pytest.raises(DistributedError, match=r"torchrun.*init_process_group"):
-        GroupOfProcesses()
+        [one] = processes.sum(torch.ones(2))
+        assert one.tolist() == [1.0, 1.0]
 
 
 def test_shares_are_consecutive_and_nearly_equal():
-    class Third(type(ALONE)):
-        count = 3
-
-        def __init__(self, rank):
-            self.rank = rank
-
-    shares = [Third(rank).share("abcdefgh") for rank in range(3)]
+    processes = Processes()
+    processes.count = 3
+    shares = []
+    for processes.rank in range(3):
+        shares.append(processes.share("abcdefgh"))
     assert shares == [["a", "b"], ["c", "d", "e"], ["f", "g", "h"]]
     with pytest.raises(DataError, match=r"2 episodes or batches.*3 processes"):
-        Third(0).share("ab")
+        processes.share("ab")

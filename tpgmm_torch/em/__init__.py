@@ -1,1 +1,0 @@
-"""Expectation-maximisation for mixtures with block-diagonal covariances."""

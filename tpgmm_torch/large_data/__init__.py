@@ -1,1 +1,0 @@
-"""Data larger than memory, and learning by several processes."""

@@ -1,0 +1,100 @@
+"""Mean, variance and range of columns, of all processes together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.mixture.row_file import Rows
+
+__all__ = ["ColumnMoments"]
+
+Array = NDArray[np.float64]
+
+#: Numbers at a time when moments are summed: a processor's cache full.
+PART = 2**16
+
+
+@dataclass(frozen=True)
+class ColumnMoments:
+    """Moments and range of each column, in float64.
+
+    Parameters
+    ----------
+    count : int
+        Number of rows, at least 1.
+    mean, scatter : array of shape (n_features,)
+        Mean, and sum of squared deviations from it.
+    smallest, largest : array of shape (n_features,)
+    """
+
+    count: int
+    mean: Array
+    scatter: Array
+    smallest: Array
+    largest: Array
+
+    @classmethod
+    def of(cls, rows: Rows, processes: Processes = ALONE) -> ColumnMoments:
+        """Moments of the rows (n, n_features) of all processes.
+
+        Raises
+        ------
+        DataError
+            If a process has no rows, if the processes' rows have different numbers of
+            columns, or if the variance overflows.
+        """
+        counts, widths = zip(*processes.gather(rows.shape), strict=True)
+        if empty := [rank for rank, count in enumerate(counts) if not count]:
+            where = f" in process(es) {empty} of {processes.count}"
+            raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
+        if len(set(widths)) > 1:
+            raise DataError(f"the processes' rows have {widths} columns: all need the same")
+        step = -(-len(rows) // max(1, len(rows) * widths[0] // PART))
+        with np.errstate(over="ignore", invalid="ignore"):
+            own = [_moments(rows[i : i + step]) for i in range(0, len(rows), step)]
+            parts = np.concatenate(processes.gather(np.stack(own)))
+            number, means, scatters, low, high = parts.swapaxes(0, 1)
+            count = number.sum(0)
+            # of all rows, from those of parts (Chan, Golub, LeVeque 1983); from the first part
+            # on, so that a constant column varies by nothing at all
+            mean = means[0] + (number * (means - means[0])).sum(0) / count
+            scatter = scatters.sum(0) + (number * (means - mean) ** 2).sum(0)
+        if not np.isfinite(scatter).all():
+            raise DataError("the variance of the data overflows; divide the data by a constant")
+        return cls(int(count[0]), mean, scatter, low.min(0), high.max(0))
+
+    def scales(self, widths: Sequence[int], *, isotropic: bool) -> Array:
+        """The units (n_features,) in which each column, or block, has standard deviation 1.
+
+        A constant column takes the mean variance of its block, or 1 where that is zero too.
+
+        Parameters
+        ----------
+        widths : sequence of int
+            Widths of the blocks.
+        isotropic : bool
+            Scale all columns of a block alike.
+        """
+        variance = self.scatter / self.count
+        largest = np.maximum(np.abs(self.largest), np.abs(self.smallest))
+        # what rounding leaves of a constant column is no variance
+        variance[np.sqrt(variance) <= 10 * np.finfo(np.float64).eps * largest] = 0.0
+        blocks = np.split(variance, np.cumsum(widths)[:-1])
+        common = np.repeat([block.mean() or 1.0 for block in blocks], list(widths))
+        return np.sqrt(common if isotropic else np.where(variance == 0, common, variance))
+
+
+def _moments(rows: NDArray[np.floating]) -> Array:
+    """Count, mean, scatter, least and largest value of each column, (5, n_features)."""
+    rows = np.asarray(rows, dtype=np.float64)
+    deviation = rows - rows[0]
+    shift = deviation.mean(0)
+    scatter = np.square(deviation - shift).sum(0)
+    count = np.full_like(shift, len(rows))
+    return np.stack([count, rows[0] + shift, scatter, rows.min(0), rows.max(0)])
