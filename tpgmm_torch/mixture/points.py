@@ -95,7 +95,7 @@ class Points:
             piece = rows[start : start + piece_size]
             groups = np.argsort(piece[:: self.group_size, 0], kind="stable")
             order = (groups[:, None] * self.group_size + members).ravel()
-            # all chunks of a piece in one part of memory, which does not fall to pieces
+            # one allocation for all chunks of a piece: many small ones would fragment memory
             height = len(self.values) + len(self.widths)
             memory = self.scale.new_ones(len(piece) * height, dtype=self.dtype)
             numbers = torch.from_numpy(order + start + self._first).to(memory.device)
