@@ -87,7 +87,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         from 0 to 1; slopes over time stay as they are. N demonstrations leave N - 1 directions
         in which they differ, and what seems exact across these is chance. "auto" follows from
         N and the number of coordinates, and falls as 1 / N
-        (``oracle_approximating_intensity``); it also moderates the variances of coordinates of
+        (``shrinkage_intensity``); it also moderates the variances of coordinates of
         one unit by each other (``moderated_variances``), and lets joints give way to hands by
         what is left unknown of them (``predictive_scale``). 0 is the paper's.
     responsibilities : {"auto", "instant", "point"}, default="auto"

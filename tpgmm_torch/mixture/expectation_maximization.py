@@ -267,6 +267,7 @@ def e_step(
                 blocks, [m[index] for m in maps], heights[index], group_size
             )
             density = joint.logsumexp(0)
+            lowest[-1] = float(density.min())
         gamma = joint.sub_(density).clamp_(min=LEAST).exp_()
         if labeller is not None:
             gamma = torch.nn.functional.one_hot(labels, len(index)).T.to(joint)
