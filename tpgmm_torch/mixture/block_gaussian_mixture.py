@@ -326,7 +326,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         rows: Rows = X
         if not isinstance(X, RowFile):
             kinds = [np.float64, np.float32]
-            rows = validate_data(self, on_cpu(X), dtype=kinds, ensure_min_samples=2)
+            rows = validate_data(self, _on_cpu(X), dtype=kinds, ensure_min_samples=2)
         if len(rows) % self.group_size:
             raise ShapeError(
                 f"{len(rows)} rows are no multiple of group_size={self.group_size}"
@@ -489,7 +489,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:
         """What a function makes of the log of weight times density, (K, n), of the rows."""
         parameters, dtype = self._fitted(), self.weights_.dtype
-        points = validate_data(self, on_cpu(X), dtype=[np.float64, np.float32], reset=False)
+        points = validate_data(self, _on_cpu(X), dtype=[np.float64, np.float32], reset=False)
         # centred, so that offsets cost no digits
         center = torch.cat([parameters.weights @ mean for mean in parameters.means])
         exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
@@ -509,7 +509,7 @@ def _width(block: Tensor) -> int:
     return block.shape[-1]
 
 
-def on_cpu(X: Any) -> Any:
+def _on_cpu(X: Any) -> Any:
     """X as an array if it is a tensor, as it is if not."""
     return X.detach().cpu().numpy() if isinstance(X, Tensor) else X
 

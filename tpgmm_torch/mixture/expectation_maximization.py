@@ -23,8 +23,8 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.points import Points
 
 __all__ = [
-    "CovarianceFamily", "Expectation", "Fit", "Parameters", "e_step",
-    "expectation_maximization", "log_joint", "m_step", "whiten",
+    "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
+    "e_step", "expectation_maximization", "log_joint", "m_step", "reseed", "whiten",
 ]  # fmt: skip
 
 #: A component is left out of a chunk where its responsibilities are below exp(-36) = 2e-16 ...
@@ -122,6 +122,11 @@ class CovarianceFamily:
 
 def whiten(parameters: Parameters) -> tuple[list[Tensor], Tensor]:
     """Maps to whitened coordinates ``L_k^-1 (x_j - mu_kj)``, and log-densities at the means.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        In float64; ``Sigma_kj = L_k L_k^T``.
 
     Returns
     -------
@@ -334,6 +339,14 @@ def dead_components(
 
     Either nothing is left of its mass, or at most two points are, without any spread
     beyond the regularisation, though there is data enough to give each component more.
+
+    Parameters
+    ----------
+    expectation : Expectation
+        Of the present mixture.
+    family : CovarianceFamily
+        With the regularisation.
+    points : Points
     """
     mass = expectation.mass
     vanished = mass < 10 * torch.finfo(points.dtype).eps * points.total

@@ -18,7 +18,7 @@ from tpgmm_torch.mixture.expectation_maximization import (
 )
 from tpgmm_torch.mixture.points import Points
 
-__all__ = ["bin_sizes", "draw_starts", "time_bins"]
+__all__ = ["bin_sizes", "draw_starts", "nearest", "time_bins"]
 
 
 def draw_starts(
