@@ -62,7 +62,7 @@ def test_bad_shares_are_refused_by_all_processes(tmp_path):
         "empty": "no rows in process(es) [1] of 2",
         "columns": "have (5, 4) columns",
         "few": "n_components=9, but the data hold only 3 distinct",
-        "none": "no demonstrations in process(es) [1] of 2",
+        "none": "X is empty in process(es) [1] of 2",
         "frames": "process 1 has demonstrations with",
         "share": "1 episodes or batches cannot be shared among 2",
     }
