@@ -413,9 +413,8 @@ def _rows(joints: Any) -> Array:
 
 def _same(pose: Frame, other: Frame) -> bool:
     """Whether poses (N,) are equal up to rounding."""
-    turn = quaternions.match_hemisphere(
-        other.orientation.to(pose.orientation), pose.orientation
-    )
+    other = other.to(pose.position)
+    turn = quaternions.match_hemisphere(other.orientation, pose.orientation)
     differences = as_array(pose.position - other.position), as_array(pose.orientation - turn)
     return all(bool((np.abs(one) < ROUNDING).all()) for one in differences)
 
