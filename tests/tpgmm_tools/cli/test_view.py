@@ -13,15 +13,15 @@ import pytest
 from tests.support import skills
 from tests.support.command_line import output, refusal
 from tests.support.recordings import Recording
-from tests.support.skills import small_bottle
 from tpgmm_datasets import save_lerobot
+from tpgmm_torch.persistence import save
 
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     """A folder as ``tpgmm demo`` writes it."""
     folder = tmp_path_factory.mktemp("demo")
-    skills.save(small_bottle(), folder / "model")
+    save(skills.small_bottle(), folder / "model")
     demonstrations = skills.generator().demonstrations(2)
     save_lerobot(demonstrations, folder / "dataset", fps=20, task="shake")
     return folder

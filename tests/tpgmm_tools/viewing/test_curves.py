@@ -62,7 +62,7 @@ def test_tracked_poses_have_shares_but_no_stiffness():
     assert [curve.label.count("left") for curve in panel.curves] == [2, 2]
 
 
-def test_events_of_the_demonstrations_and_parts_are_marked_where_they_are(tmp_path):
+def test_events_of_the_demonstrations_are_marked_where_they_are(tmp_path):
     shown = [
         replace(one, events={"grasp & lift": at, **more})
         for one, at, more in zip(
@@ -75,10 +75,6 @@ def test_events_of_the_demonstrations_and_parts_are_marked_where_they_are(tmp_pa
     assert (mark.time, mark.label) == (pytest.approx(1.0), "grasp & lift")
     save(model, tmp_path / "model")
     assert motion_marks(load_model(tmp_path / "model"), trajectory) == [mark]
-    parted = skills.canonical(n_components=4, parts=[1.5]).fit(shown)
-    assert motion_marks(parted, trajectory)[1] == Mark(1.5, "part 2")
-    named = skills.canonical(n_components=4, parts=["grasp*"]).fit(shown)
-    assert [one.label for one in motion_marks(named, trajectory)] == ["part 2: grasp & lift"]
     late = replace(trajectory, time=trajectory.time + 0.5)
     assert motion_marks(model, late)[0].time == pytest.approx(0.5)
 

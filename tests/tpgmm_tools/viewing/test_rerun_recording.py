@@ -12,13 +12,22 @@ from tests.support import skills
 from tests.support.worlds import upper_body
 from tpgmm_tools.viewing import parse_shape, write_rerun
 from tpgmm_tools.viewing.curves import motion_marks, motion_panels
-from tpgmm_torch import Situation
+from tpgmm_torch import Situation, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DependencyError
+
+
+class Marked(TaskParameterizedGMM):
+    """A model whose demonstrations name an event."""
+
+    @property
+    def skill(self):
+        learned = super().skill
+        return replace(learned, summary=replace(learned.summary, events={"grasp": 0.4}))
 
 
 def with_an_event():
     model = copy.copy(skills.small_bottle())
-    model.summary_ = replace(model.summary_, events={"grasp": 0.4})
+    model.__class__ = Marked
     return model
 
 

@@ -22,8 +22,6 @@ __all__ = ["Curve", "Mark", "Panel", "as_html", "motion_marks", "motion_panels"]
 STIFFNESS = "#1f77b4"
 #: Of the operators; none is the reproduced path's or the ellipsoids'.
 OPERATORS = ("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#e377c2")
-#: Instants so near each other are one, in durations of the skill; a reason that says nothing.
-SAME, GIVEN = 1e-3, "given"
 
 # The time line's position is in the page's first input; without one there is no marker. On a
 # narrow page the curves would hide the robot: there they begin folded.
@@ -94,7 +92,7 @@ class Mark:
     time : float
         Since the start of the motion [s].
     label : str
-        What happens, or begins, then.
+        Name of the event.
     """
 
     time: float
@@ -102,7 +100,7 @@ class Mark:
 
 
 def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Mark]:
-    """Where parts begin, and events of the demonstrations, within a motion, by time.
+    """Events of the demonstrations within a motion, by time.
 
     Parameters
     ----------
@@ -114,8 +112,7 @@ def motion_marks(model: TaskParameterizedGMM, trajectory: Trajectory) -> list[Ma
     begin, end = float(model.time_[0]), float(model.time_[-1])
     summary = model.skill.summary
     shown = {} if summary is None else summary.events
-    events = {name: begin + share * (end - begin) for name, share in shown.items()}
-    named = [(at, name) for name, at in events.items()]
+    named = [(begin + share * (end - begin), name) for name, share in shown.items()]
     first, last = float(trajectory.time[0]), float(trajectory.time[-1])
     return [Mark(at - first, label) for at, label in sorted(named) if first <= at <= last]
 

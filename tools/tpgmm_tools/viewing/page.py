@@ -68,8 +68,8 @@ def write_motion(
 ) -> Trajectory:
     """Write a reproduction as an HTML file with a time line, which needs nothing else.
 
-    Beside the scene are stiffness and each operator's share over time, and in them where parts
-    begin and when the events of the demonstrations happen.
+    Beside the scene are stiffness and each operator's share over time, with the events of the
+    demonstrations.
 
     Parameters
     ----------
