@@ -17,9 +17,8 @@ DEVICES = [
 
 
 def learned(device: str) -> TaskParameterizedGMM:
-    model = bottle_model(8, device=device, max_iter=20, tol=0.0)
-    with pytest.warns(match="did not converge"):
-        return model.fit(few_bottles())
+    # beyond convergence rounding decides how covariances are regularised: EM stops before
+    return bottle_model(8, device=device).fit(few_bottles())
 
 
 @pytest.fixture(scope="module")
