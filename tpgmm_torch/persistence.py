@@ -155,7 +155,7 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
 
     Parameters
     ----------
-    thing : Operator, Kinematics, Skill, TaskParameterizedGMM, number, text, ...
+    thing : Operator, Kinematics, Skill, TaskParameterizedGMM, number or text
     tensors : dict of str to Tensor, optional
         Takes up the tensors, by a name that the description refers to.
 

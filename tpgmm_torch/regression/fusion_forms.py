@@ -43,8 +43,8 @@ class InformationFusion:
     Examples
     --------
     >>> from tpgmm_torch import InformationFusion, TaskParameterizedGMM
-    >>> TaskParameterizedGMM(10, fusion=InformationFusion(negligible=0.0))
-    TaskParameterizedGMM(fusion=InformationFusion(prior_std=10.0, ...negligible=0.0))
+    >>> TaskParameterizedGMM(10, fusion=InformationFusion(negligible=0.0)).fusion.negligible
+    0.0
     """
 
     prior_std: float | Mapping[str, float] | Sequence[float] = PRIOR_STD

@@ -116,6 +116,7 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
 
     Examples
     --------
+    >>> from tpgmm_torch import Demonstration, SelectWays, Situation, rollout
     >>> rng, time = np.random.default_rng(0), np.linspace(0, 1, 50)
     >>> shown = [
     ...     Demonstration(time, (side * np.sin(3 * time) + 0.02 * rng.normal())[:, None])
