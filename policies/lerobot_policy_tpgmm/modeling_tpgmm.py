@@ -564,7 +564,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         try:
             return super().from_pretrained(pretrained_name_or_path, **options)
         except (DecodingError, ParsingError) as error:
-            raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
+            raise ModelFileError(
+                f"{folder / CONFIG_NAME} cannot be read: {error}. Policies of 0.1 and 0.2 are "
+                "not read any more: fit again"
+            ) from error
 
     @classmethod
     def _load_as_safetensor(

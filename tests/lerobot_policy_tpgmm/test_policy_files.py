@@ -214,6 +214,16 @@ def test_what_lerobot_train_writes_again_is_accepted(directory):
     assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
 
 
+def test_a_policy_of_an_earlier_version_says_to_fit_again(directory):
+    rewritten(directory, lambda tensors: None)  # whatever its digests say
+    config = json.loads((directory / "config.json").read_text())
+    earlier = {name: value for name, value in config.items() if name not in ("em", "control")}
+    earlier |= {"fusion": "information", "clock": "even", "operator_weights": "equal"}
+    (directory / "config.json").write_text(json.dumps(earlier))
+    with pytest.raises(ModelFileError, match="fit again"):
+        TPGMMPolicy.from_pretrained(directory)
+
+
 def test_a_policy_without_digests_loads_and_says_so(directory, caplog):
     rewritten(directory, lambda tensors: None)
     assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
