@@ -23,7 +23,7 @@ Neither recording has the pose of an object. The bottle's is taken from the righ
 it closes, which the detector of events finds in the fingers, the cup's from the left hand when
 the right one pours, also in the held-out episode: as a camera would give it, but free of a
 camera's error. The error at the event thus tells
-whether the model goes where it is told while doing the rest of the skill, and whether it is
+whether the model goes where it is sent while doing the rest of the skill, and whether it is
 there when it should be; it does not tell how well a bottle was seen. Baselines get the same
 situation and cannot use it, or only by choosing a demonstration.
 

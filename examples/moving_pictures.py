@@ -64,7 +64,7 @@ def learned(task: str) -> TaskParameterizedGMM:
     return TaskParameterizedGMM(bench.n_components, operators, bench.robot).fit(aligned)
 
 
-def told(
+def observed(
     observation: dict[str, Any], names: Sequence[str] = ("bottle",)
 ) -> tuple[NDArray[np.float64], dict[str, Frame]]:
     """Posture and objects of an observation."""
@@ -91,10 +91,12 @@ def run(
     )
     observation, _ = env.reset(seed=seed)
     impedance = Impedance(model.kinematics_)
-    controller = Controller(model.skill, *told(observation, bench.objects), impedance=impedance)
+    controller = Controller(
+        model.skill, *observed(observation, bench.objects), impedance=impedance
+    )
     over, step = False, 0
     while not over:
-        command = controller.step(1 / env.fps, *told(observation, bench.objects))
+        command = controller.step(1 / env.fps, *observed(observation, bench.objects))
         if step % (env.fps // PICTURES) == 0:
             yield step / env.fps, command, env.render()
         observation, _, ended, cut, info = env.step(controller.reference.numpy())
@@ -152,7 +154,7 @@ def write_poses(path: Path, model: TaskParameterizedGMM) -> None:
     episodes = []
     for seed in SEEDS:
         observation, _ = BottleShakingEnv().reset(seed=seed)
-        place = told(observation)[1]["bottle"]
+        place = observed(observation)[1]["bottle"]
         w, _, _, z = place.orientation.tolist()  # turned about the vertical alone
         x, y, height = (100 * place.position).tolist()
         angle = np.degrees(2 * np.arctan2(z, w))
@@ -165,7 +167,7 @@ def write_poses(path: Path, model: TaskParameterizedGMM) -> None:
 
 
 def save(path: Path, moments: Sequence[NDArray[np.uint8]]) -> None:
-    """Pictures (height, width, 3) as a file that starts anew after the last."""
+    """Pictures (height, width, 3) as a file that starts again after the last."""
     pictures = [Image.fromarray(moment) for moment in moments]
     shown = round(1000 / (PICTURES * SPEED))
     durations = [shown] * (len(pictures) - 1) + [1500]  # the last one stands

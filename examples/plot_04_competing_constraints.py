@@ -4,7 +4,7 @@ Competing constraints in joint space and in task space
 
 Two hands reach for a bottle, bring it to the chest, and shake it. Until the grasp it matters
 where the hands are *seen from the bottle*; while shaking it matters what the *shoulder joints*
-do. The model is told about both and decides by what the demonstrations have in common. This is
+do. The model has both and decides by what the demonstrations have in common. This is
 figure 6 of the paper in small: five demonstrations at 20 steps per second.
 """
 
@@ -57,7 +57,7 @@ model.fit(demonstrations)
 # -----------
 # A :class:`~tpgmm_torch.Trajectory` carries what each operator alone asked of the joints, and
 # its share of the information about each joint. The shares follow from the covariances; nobody
-# told the model which phase is which.
+# said which phase is which.
 
 spans = {"grasp": (3.8, 4.6), "shake": (8.5, 12.0)}
 shoulder = trajectory.joint_names.index("l_shoulder_pitch")

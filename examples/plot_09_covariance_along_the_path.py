@@ -103,7 +103,7 @@ print(f"spread of 200 samples over what the ellipses say: {ratio:.2f} (median ov
 # %%
 # On the left the path in a new situation with its ellipses of two standard deviations, on the
 # right their size over time. In the gate the model is more than three times surer than at the
-# end; nobody told it when the gate is passed.
+# end; nobody said when the gate is passed.
 
 plt.style.use(STYLE)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained")

@@ -3,7 +3,7 @@ What matters, and when
 ======================
 
 Five objects stand around, and the demonstrations say nothing about which of them the skill is
-about. It need not be told: an operator matters if demonstrations that were left out are more
+about. That can be found: an operator matters if demonstrations that were left out are more
 likely with it than without. :class:`~tpgmm_torch.SelectOperators` asks that of every link in
 every frame, and says why it kept what it kept.
 """

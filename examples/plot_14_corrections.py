@@ -69,7 +69,7 @@ print([f"{float(p.time[0]):.2f} to {float(p.time[-1]):.2f} s" for p in placed])
 # %%
 # The picture
 # -----------
-# Bands are one standard deviation: at the via-point there is none left.
+# Bands are one standard deviation: at the via-point nothing is left of it.
 
 plt.style.use(STYLE)
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")

@@ -84,7 +84,7 @@ def fit(shown, shrinkage):
 # -------------------
 # Each hand sways by itself, so that no two coordinates have anything to do with one another.
 # From three demonstrations they seem to, by chance; sixty show that they have not. How much of
-# such correlations is believed depends on how many demonstrations and coordinates there are:
+# such correlations counts depends on how many demonstrations and coordinates there are:
 # here, nothing. Below, the hands in the box's frame while they rest at it.
 
 generator = np.random.default_rng(0)
@@ -144,8 +144,8 @@ for draw in range(4):
             distance = off.unflatten(-1, (2, 3)).norm(dim=-1).mean(dim=(1, 2))
             error[row, draw] = 1e3 * distance.median()
 for shrinkage, error in errors.items():
-    told = ", ".join(f"{value:.1f}" for value in np.median(error, axis=1))
-    print(f"{labels[shrinkage]:>11}, from {COUNTS} demonstrations: {told} mm")
+    listed = ", ".join(f"{value:.1f}" for value in np.median(error, axis=1))
+    print(f"{labels[shrinkage]:>11}, from {COUNTS} demonstrations: {listed} mm")
 
 # %%
 # From one demonstration nobody can tell what matters: nothing differs, and all operators are

@@ -90,8 +90,8 @@ for row, spread in enumerate(SPREADS):
         mean = quaternions.mean(recordings)
         for geometry, error in errors.items():
             error[row, draw] = between(reproduce(recordings, geometry), mean).mean()
-    told = (f"{g} {np.median(e[row]):.3f} ({e[row].max():.3f})" for g, e in errors.items())
-    print(f"spread {spread} rad, median and worst [deg]: {', '.join(told)}")
+    listed = (f"{g} {np.median(e[row]):.3f} ({e[row].max():.3f})" for g, e in errors.items())
+    print(f"spread {spread} rad, median and worst [deg]: {', '.join(listed)}")
 
 # %%
 # When to use it

@@ -122,16 +122,16 @@ for name, chosen in (("up to 1", novelty <= 1), ("above 1", novelty > 1)):
 # it is now, and a program can stop, or ask, before anything is missed.
 
 controller = Controller(model.skill, REST, {"object": Frame([0.55, 0, 0])})
-joints, told = REST, []
+joints, record = REST, []
 while not controller.finished:
-    pulled = 0.4 * np.clip(0.01 * len(told) - 0.5, 0, 1)  # 40 cm in a second [m]
+    pulled = 0.4 * np.clip(0.01 * len(record) - 0.5, 0, 1)  # 40 cm in a second [m]
     frames = {"object": Frame([0.55 + pulled, 0.0, 0.0])}
     command = controller.step(0.01, joints=joints, frames=frames)
     joints = command.reference
-    told.append((float(command.time), 100 * pulled, float(command.novelty)))
-told = np.array(told)
-new = int((told[:, 2] > 1).argmax())
-print(f"new from {told[new, 0]:.2f} s on, when it was pulled by {told[new, 1]:.0f} cm")
+    record.append((float(command.time), 100 * pulled, float(command.novelty)))
+record = np.array(record)
+new = int((record[:, 2] > 1).argmax())
+print(f"new from {record[new, 0]:.2f} s on, when it was pulled by {record[new, 1]:.0f} cm")
 
 # %%
 # On the left novelty of an object anywhere in the plane, the box dashed, and how far the arm
@@ -161,7 +161,7 @@ plane.add_patch(plt.Circle((0, 0), sum(LENGTHS), fill=False, color="0.2", linewi
 plane.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", xlim=(0.1, 1.0), ylim=(-0.65, 0.65))
 plane.legend(loc="upper left", handlelength=1)
 figure.colorbar(image, ax=plane, label="novelty")
-axes.plot(told[:, 0], told[:, 2], color=BLUE)
+axes.plot(record[:, 0], record[:, 2], color=BLUE)
 axes.axhline(1.0, color=VERMILION)
 axes.axvspan(0.5, 1.5, color="0.9", zorder=0)
 axes.annotate("it is pulled away", (1.0, 2.1), ha="center", color="0.4")

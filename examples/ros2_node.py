@@ -16,8 +16,8 @@ topic                 type                              what
 
 The skill begins when joints and all frames are there. A pose whose ``header.frame_id`` is not
 the parameter ``base_frame`` (if that is given) is refused: transform it first. The controller
-is told how old joints and poses are, and holds the robot when it has had nothing to believe for
-too long. Where poses are only known at the start, ``-p follow_frames:=false``. After the end
+gets the ages of joints and poses, and holds the robot when none were accepted for too long.
+Where poses are only known at the start, ``-p follow_frames:=false``. After the end
 the last reference is sent on. The node checks no collisions, and it is no emergency stop.
 """
 

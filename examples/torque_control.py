@@ -3,7 +3,7 @@
 The bottle is shaken with torque motors under gravity (the environment ``bottle_torque``), once
 with the stiffness of position control, and once with the one that the model gives: firm where
 demonstrations agree, soft where they do not. Both get the same references. Then an upright
-post stands in the way of a hand, and nobody tells the robot.
+post stands in the way of a hand, and nothing announces it to the robot.
 
     python examples/torque_control.py --seeds 50 --post 1
 
