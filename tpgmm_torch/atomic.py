@@ -120,7 +120,7 @@ def open_whole(path: str | Path) -> Iterator[BinaryIO]:
     Raises
     ------
     OSError
-        If it is missing; if it cannot be read to its end, like a pipe that nobody writes to;
+        If it is missing; if it cannot be read to its end, like a pipe without a writer;
         or if Git LFS has not fetched it.
     """
     flags = (getattr(os, name, 0) for name in ("O_NONBLOCK", "O_BINARY"))  # none has both
@@ -137,7 +137,7 @@ def open_whole(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def consistent[T](path: str | Path, read: Callable[[], T]) -> T:
-    """What ``read`` returns of a folder that may be replaced meanwhile.
+    """Read a folder that may be replaced meanwhile.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def read_whole(path: str | Path) -> bytes:
 
 
 def _left(path: Path, kind: str) -> list[Path]:
-    """What processes that died left beside ``path``: "new" or "previous"."""
+    """Folders beside ``path`` that processes left when they died: "new" or "previous"."""
     name = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}\.{kind}")
     with suppress(OSError):
         return sorted(item for item in path.parent.iterdir() if name.fullmatch(item.name))

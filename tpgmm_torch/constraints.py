@@ -1,4 +1,4 @@
-"""What the parameters of a constructor may be: a table in each estimator, read by ``fit``.
+"""Allowed values of constructors' parameters: a table in each estimator, read by ``fit``.
 
 Constructors of scikit-learn's interface only store. What they stored is checked where it is
 used, by a table ``_parameter_constraints`` of the class: for each parameter the kinds of
@@ -31,7 +31,7 @@ from tpgmm_torch.exceptions import InvalidParameterError
 
 __all__ = ["ANYTHING", "Interval", "Options", "check_parameters"]
 
-#: What a table says of a parameter that is checked elsewhere.
+#: Entry of a parameter that is checked elsewhere.
 ANYTHING: tuple[Any, ...] = (object,)
 
 BOOLEANS = (bool, np.bool_)

@@ -118,7 +118,7 @@ def find_boundaries(demonstration: Demonstration, robot: Any = None) -> list[Bou
     for stop in find_stops(demonstration, robot):
         early, late = stop.begin - margin, stop.end + margin
         near = [i for i, one in enumerate(found) if early <= one.time <= late]
-        for i in near:  # poses alone tell a contact less exactly than a stop
+        for i in near:  # poses alone locate a contact less exactly than a stop
             exact = found[i].begin < found[i].end and stop.begin <= found[i].time <= stop.end
             time = found[i].time if exact else stop.time
             reason = f"{found[i].reason}, stop"

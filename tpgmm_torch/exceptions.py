@@ -44,7 +44,7 @@ class PlausibilityError(DataError):
 
 
 class InvalidParameterError(TPGMMError, ValueError, TypeError):
-    """A parameter of a constructor is not what it may be; ``fit`` says so."""
+    """A parameter of a constructor has a value that is not allowed; raised by ``fit``."""
 
 
 class UnknownNameError(TPGMMError, KeyError):
@@ -97,7 +97,7 @@ class ConvergenceWarning(SklearnConvergenceWarning):
 
 
 class DegenerateComponentWarning(UserWarning):
-    """A mixture component lost its data and was placed anew."""
+    """A mixture component lost its data."""
 
 
 class MissingLimitsWarning(UserWarning):
@@ -107,6 +107,6 @@ class MissingLimitsWarning(UserWarning):
 class PlausibilityWarning(UserWarning):
     """Recordings or situations are unlikely to be what they are taken for.
 
-    One for each call, with all that was found; each finding says what to do. Make errors of
+    One for each call, with all that was found; each with a remedy. Make errors of
     them by ``strict=True`` or ``plausibility="error"``.
     """

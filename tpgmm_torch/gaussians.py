@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-#: So many numbers are sooner looked at by Python than by an operation of the library.
+#: Up to this many numbers Python is faster than an operation of the library.
 FEW = 64
 
 
@@ -56,7 +56,7 @@ def cholesky(matrix: Tensor, name: str) -> Tensor:
         If a matrix is not positive definite.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
-    # of a few matrices, Python asks sooner than an operation does
+    # of a few matrices, Python is faster than an operation
     if any(info.tolist()) if info.ndim == 1 and len(info) <= FEW else info.any():
         raise DataError(
             f"{name} is not positive definite ({int((info != 0).sum())} of {info.numel()} "
@@ -146,7 +146,7 @@ def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:
 def information(
     jacobian: Tensor | None, targets: Tensor, covariance: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """What ``J x = y``, given with covariance ``S``, says about ``x``.
+    """Information about ``x`` in ``J x = y``, given with covariance ``S``.
 
     ``J^T S^-1 J`` is the Moore-Penrose inverse of ``J^+ S J^+^T`` where J has full row rank,
     so that sums of these terms are the product (2) of the projected Gaussians

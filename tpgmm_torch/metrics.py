@@ -65,7 +65,7 @@ def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """How far a link is from where it was shown.
+    """Distance of a link from where it was shown.
 
     Parameters
     ----------

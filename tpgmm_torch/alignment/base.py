@@ -78,7 +78,7 @@ def retime(
 
 
 class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
-    """Transformer of demonstrations onto one time grid; a subclass says how to find the paths.
+    """Transformer of demonstrations onto one time grid; a subclass finds the paths.
 
     Attributes
     ----------

@@ -11,8 +11,8 @@ from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
 __all__ = ["Finding", "Report", "listed"]
 
-#: So many examples of one finding, and so many findings, are spelled out in a message; a
-#: report has them all.
+#: Largest numbers of examples of one finding, and of findings, in a message; a report has
+#: them all.
 MOST_EXAMPLES, MOST_FINDINGS = 3, 8
 PACKAGE = str(Path(__file__).parents[1])
 
@@ -98,7 +98,7 @@ class Report:
         return f"{self.subject}: {one} {worst}: {items}"
 
     def errors(self) -> tuple[Finding, ...]:
-        """What cannot be."""
+        """Findings that are impossible."""
         return tuple(finding for finding in self if finding.impossible)
 
     def act(self, packages: tuple[str, ...] = ()) -> Report:

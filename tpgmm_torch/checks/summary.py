@@ -217,7 +217,7 @@ class TrainingSummary:
         )
 
     def novelty(self, joints: Any = None, frames: Mapping[str, Frame] | None = None) -> Array:
-        """How far situations are from the demonstrations, in units of the furthest of these.
+        """Distance of situations from the demonstrations, in units of the furthest of these.
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
         each frame's orientation from their regions, there where the skill begins, divided by

@@ -82,7 +82,7 @@ class PathSummary:
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """What the checks and the summary of a model need of one demonstration, of any length.
+    """Summary of one demonstration, of any length, for the checks and the summary of a model.
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
 def _freedom(
     count: int, operators: Sequence[Operator], kinematics: Kinematics, correlated: bool
 ) -> Iterator[Finding]:
-    """Too few demonstrations to tell what may vary, and what varies together."""
+    """Too few demonstrations to estimate variances and correlations."""
     widest = max((operator.dimension(kinematics) for operator in operators), default=0)
     placed = widest > 2 and frame_names(operators, kinematics)
     remedy = "Show the skill 5 times or more, from other starts and places"
@@ -292,7 +292,7 @@ def _freedom(
         yield Finding(
             "freedom",
             f"two demonstrations differ in one direction, and the covariances of {widest} "
-            "coordinates would have to tell all apart",
+            "coordinates would have to distinguish all",
             f"{remedy}, or learn with covariance_shrinkage='auto'",
             value=2.0,
         )

@@ -1,1 +1,1 @@
-"""What goes in and what comes out: frames, demonstrations, situations, trajectories."""
+"""Frames, demonstrations, situations and trajectories: input and output of a model."""

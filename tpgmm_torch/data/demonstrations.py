@@ -1,4 +1,4 @@
-"""What goes into a model: demonstrations and new situations.
+"""Demonstrations and new situations, the input of a model.
 
 Times are in seconds, joints in radians (or metres, where they slide). Everything given is
 copied once into tensors, see :mod:`tpgmm_torch.data.arrays`; nothing is modified in place.
@@ -99,7 +99,7 @@ class Demonstration(_PlainFrames):
         ``"end"`` need not be given: they are the first and the last instant.
     holds : sequence of Hold, optional
         From when to when the robot holds which object, see
-        :func:`~tpgmm_torch.attach_holds`; empty if it holds none, None if nobody knows.
+        :func:`~tpgmm_torch.attach_holds`; empty if it holds none, None if that is not known.
 
     Raises
     ------

@@ -185,7 +185,7 @@ class Frame:
         values : array-like of shape (..., 7)
             Position x, y, z [m], and a unit quaternion.
         order : {"wxyz", "xyzw"}
-            Where the quaternion's real part stands. There is no default: no number tells.
+            Where the quaternion's real part stands; no default, as numbers do not show it.
 
         Raises
         ------

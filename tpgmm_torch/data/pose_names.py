@@ -30,7 +30,7 @@ def words(name: str) -> tuple[str, ...]:
 
 
 def is_gripper(name: str) -> bool:
-    """Whether a joint's name tells of a gripper, which may have any unit.
+    """Whether a joint's name is that of a gripper, which may have any unit.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def is_gripper(name: str) -> bool:
 
 
 def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
-    """Positions of the seven parts of every pose that the names tell of.
+    """Positions of the seven parts of every pose among the names.
 
     A pose ``bottle`` is there when ``bottle.x``, ... ``bottle.qz`` (or ``bottle_x``, ...) are.
 
@@ -60,7 +60,7 @@ def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
 
 
 def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
-    """Positions of (w, x, y, z) of every quaternion that the names tell of.
+    """Positions of (w, x, y, z) of every quaternion among the names.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
 
 
 def incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Which columns of poses are missing that the names tell of in part.
+    """Missing columns of poses of which the names have a part.
 
-    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, tell of a pose.
+    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, count as a pose.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What comes out of a model: joint references, and where they come from."""
+"""Joint references that a model predicts, and what they are made of."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Candidate", "Trajectory"]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What one operator alone asks of the joints (one colour of the paper's figure 6).
+    """The estimate of the joints by one operator alone (one colour of the paper's figure 6).
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""From how well a motion is known to how firmly it is followed."""
+"""Stiffness and damping from the covariance of a motion."""

@@ -121,7 +121,7 @@ class Stiffness:
         ----------
         covariance : Tensor of shape (..., n, n)
             Positive semi-definite: directions without variance are as stiff as may be. One that
-            is not finite says nothing, and gives the lowest stiffness.
+            is not finite gives the lowest stiffness.
 
         Returns
         -------

@@ -1,1 +1,1 @@
-"""How to get to what is wanted: motions within bounds on speed, acceleration and jerk."""
+"""Motions to wanted postures within bounds on speed, acceleration and jerk."""

@@ -177,7 +177,7 @@ def reach(
 def _errors(
     robot: Robot, joints: Tensor, poses: Mapping[str, Frame], orientations: bool
 ) -> dict[str, Tensor]:
-    """How far each link is from its poses: (N, 2), in metres and radians."""
+    """Distance of each link from its poses: (N, 2), in metres and radians."""
     state, errors = robot.state(joints), {}
     for link, pose in poses.items():
         away = (pose.position.to(joints) - state.position(link)).norm(dim=-1)
@@ -190,7 +190,7 @@ def _errors(
 
 
 def _described(errors: Mapping[str, Tensor]) -> str:
-    """How far links are from the pose that each misses by most."""
+    """Largest distance of each link from its poses."""
     texts = []
     for link, error in errors.items():
         worst = int(error.amax(-1).argmax())
@@ -286,7 +286,7 @@ def _model(robot: Robot) -> tuple[Any, list[int]]:
 
 def _add(parent: Any, name: str, pose: Array) -> Any:
     turn = quaternions.from_matrix(torch.from_numpy(pose[:3, :3].copy())).numpy()
-    # the mass says nothing here, but MuJoCo wants one of what moves
+    # the mass has no effect here, but MuJoCo requires one of what moves
     body = parent.add_body(name=name, pos=pose[:3, 3], quat=turn, mass=1.0, inertia=np.ones(3))
     body.explicitinertial = True
     return body

@@ -86,7 +86,7 @@ def stopping_range(start: Array, acceleration: Array, jerk: Array) -> tuple[Arra
         unknown = np.full_like(position, np.inf)
         return -unknown, unknown
     extrema = np.array([(bound.min, bound.max) for bound in plan.position_extrema]).T
-    moves = np.array(plan.independent_min_durations) > 0  # of the others it says 0
+    moves = np.array(plan.independent_min_durations) > 0  # 0 for the others
     low, high = np.where(moves, extrema, position)
     return low, high
 

@@ -103,7 +103,7 @@ class _Orientation(PoseOperator):
         return bound
 
     def path_variances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
-        """How far the path moves, alike for the three axes [rad^2]."""
+        """Variance of the path, equal for the three axes [rad^2]."""
         if self.path is None:
             return super().path_variances(kinematics)
         orientations = self._path[1]

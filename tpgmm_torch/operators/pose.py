@@ -64,7 +64,7 @@ class PoseOperator(Operator):
 
     @cached_property
     def term(self) -> _Term:
-        """What its linearisation depends on, for :func:`linearize_poses`."""
+        """Arguments of its linearisation, for :func:`linearize_poses`."""
         return _Term(self.link, self._frame, self._held, self.gain)
 
     def moving_reference(self, state: RobotState) -> str | None:
@@ -110,7 +110,7 @@ def _place(name: str, state: RobotState, frames: Mapping[str, Frame]) -> Frame:
 
 
 class _Term(NamedTuple):
-    """What the constants of an operator depend on; ``gain`` is None for a position."""
+    """Arguments of an operator's constants; ``gain`` is None for a position."""
 
     link: str
     frame: str | None

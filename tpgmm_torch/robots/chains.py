@@ -63,6 +63,6 @@ def _unit(axis: Any) -> Array:
 
 
 def _ends(limits: Any) -> tuple[float, float]:
-    """A range; one of a single point, as readers make of one that is not given, is none."""
+    """A range; None for a single point, which readers make of a range that is not given."""
     lower, upper = (-math.inf, math.inf) if limits is None else map(float, limits)
     return (lower, upper) if lower < upper else (-math.inf, math.inf)

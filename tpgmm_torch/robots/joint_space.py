@@ -40,7 +40,7 @@ class JointSpace(Kinematics):
         return RobotState(joints, (), positions, orientations, jacobians, joint_names=names)
 
     def config(self) -> dict[str, Any]:
-        """What :meth:`from_config` needs, ready for JSON."""
+        """Arguments of :meth:`from_config`, ready for JSON."""
         return {"joint_names": list(self.joint_names)}
 
     @classmethod

@@ -252,7 +252,7 @@ class RobotState:
 
 
 class Kinematics(abc.ABC):
-    """What the operators need of a robot; derive from it to bring your own.
+    """Base class of robots: links' poses and Jacobians; derive from it to bring your own.
 
     A subclass sets the attributes below and defines :meth:`state`, nothing else. It must not
     change afterwards: models share one robot instead of copying it. To be saved with a

@@ -179,7 +179,7 @@ class _Translation:
         return lower, upper, velocity
 
     def _mimics(self) -> dict[int, Mimic]:
-        """What follows a joint: ``q - q0 = c0 + c1 (q' - q0')`` by an equality that is on."""
+        """Joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by active equalities."""
         import mujoco
 
         model = self.model

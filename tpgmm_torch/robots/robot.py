@@ -424,7 +424,7 @@ def _check_joints(
     coordinates: Sequence[str],
     locked: Mapping[str, float],
 ) -> None:
-    """Whether each coordinate, joint and locked joint can be what it is said to be."""
+    """Check coordinates, joints and locked joints against the description."""
     actuated = set(model.actuated)
     for name in coordinates:
         if name in model.joint:
@@ -529,7 +529,7 @@ def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, 
             continue
         try:
             leader = model.leader(joint.name)
-        except TPGMMError:  # told where it matters: to a link that depends on it
+        except TPGMMError:  # raised where it matters: for a link that depends on it
             continue
         if leader.joint not in rows or leader.multiplier == 0:
             continue

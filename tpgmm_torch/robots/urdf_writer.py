@@ -136,7 +136,7 @@ def joined(
 
 
 def _visuals(robot: ElementTree.Element) -> dict[str, list[ElementTree.Element]]:
-    """What each link looks like, with the materials that are described for all in place."""
+    """Visual elements of each link, with the materials that are described for all in place."""
     materials = {m.get("name"): m for m in robot.findall("material")}
     for material in robot.findall("link/visual/material"):
         described = materials.get(material.get("name"))

@@ -33,7 +33,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Trust:
-    """Which readings a controller uses, and for how long it goes on without.
+    """Rules of which readings a controller accepts, and for how long it goes on without.
 
     A reading that is not finite is lost; one beyond the limits is impossible; one too far from
     the last one has jumped. None of them is used. A jump is accepted once the readings have
