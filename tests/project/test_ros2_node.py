@@ -9,7 +9,7 @@ import pytest
 
 from tests.support import ros_stub, skills
 from tests.support.skills import small_bottle
-from tpgmm_torch import save
+from tpgmm_torch import Controller, save
 
 FILE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
 
@@ -64,7 +64,7 @@ def test_nothing_is_sent_before_everything_is_known(node):
 
 def test_a_robot_that_follows_is_led_as_the_controller_leads_it(node):
     joints = START.joints[0]
-    direct = skills.Controller(small_bottle().skill, joints, START.frames)
+    direct = Controller(small_bottle().skill, joints, START.frames)
     for _ in range(400):
         tell_joints(node, joints.tolist())
         tell_bottle(node)
