@@ -18,6 +18,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import load_model, load_skill
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.robots import Poses
 
 #: Quick, and silent about two episodes and about none that are aligned.
@@ -27,7 +28,7 @@ QUICK = ("--n-components", 2, "--rate", 5, "--alignment", "none", "--plausibilit
 def test_fit_saves_a_model_and_says_what_it_learned(fitted):
     folder, text = fitted
     model = load_model(folder)
-    assert (model.n_components, model.reg_covar, model.fusion) == (6, 1e-5, "covariance")
+    assert (model.n_components, model.reg_covar, model.fusion) == (6, 1e-5, CovarianceFusion())
     assert list(model.operators_) == default_operators(("l_hand", "r_hand"), ("bottle",))
     printed = dict(line.split(maxsplit=1) for line in text.splitlines())
     assert printed["demonstrations"].startswith("3 of 10.65 to 15.30 s")
@@ -86,9 +87,8 @@ def test_fit_finds_operators_parts_and_components_and_says_why(dataset, tmp_path
     assert f"components       {len(model.weights_)} (full)" in printed.splitlines()
     found = ("--n-components", 8, "--parts", "auto", "--alignment", "parts")
     text = output("fit", dataset, *UPPER_BODY, *QUICK, *found, "--out", tmp_path / "parts")
-    parts = load_model(tmp_path / "parts").parts_
+    parts = load_skill(tmp_path / "parts").skills
     assert len(parts) > 1 and "because of" in text
-    assert f"part 1           0.00 to {parts[0].end:.2f} s, " in text
 
 
 def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
@@ -103,7 +103,7 @@ def test_fit_finds_the_ways_of_a_skill_and_reproduce_chooses(tmp_path):
     assert "2 ways:" in text and "  1  4 of 8 demonstrations: 1, 3, 5, 7" in text
     assert len(load_skill(tmp_path / "model").skills) == 2
     new = ("--dataset", data, "--episodes", "0", "--out", tmp_path / "new.csv")
-    assert "(mode 0: p = " in output("reproduce", tmp_path / "model", *new)
+    assert "(way 0: p = " in output("reproduce", tmp_path / "model", *new)
 
 
 def test_batches_and_processes_learn_the_same(tmp_path):
