@@ -41,8 +41,9 @@ def _parts(name: str) -> Iterator[str]:
     phases = ", ".join(f"{phase} {seconds:g} s" for phase, seconds in task.phases.items())
     yield f'`{name}`: "{task.description}". Observed: {objects}. Phases: {phases}.'
     rows = [
-        f"| `{figure}` | {task.headings[figure][0]} | {_bounds(*limits)} |"
-        for figure, limits in task.limits.items()
+        f"| `{name}` | {figure.heading} | {_bounds(figure.low, figure.high)} |"
+        for name, figure in task.figures.items()
+        if figure.limited
     ]
     yield "\n".join(("| figure | | in a success |", "|---|---|---|", *rows))
     yield COMMANDS.format(name=name)

@@ -30,30 +30,16 @@ __all__ = [
 
 _PACKAGE = "lerobot_env_bimanual"
 
-gym.register(
-    id=f"{_PACKAGE}/BottleShaking-v0",
-    entry_point=f"{_PACKAGE}.bottle.shaking:BottleShakingEnv",
-)
-gym.register(
-    id=f"{_PACKAGE}/BottleTorque-v0",
-    entry_point=f"{_PACKAGE}.bottle.torque:BottleTorqueEnv",
-)
-gym.register(
-    id=f"{_PACKAGE}/CarryAndPut-v0",
-    entry_point=f"{_PACKAGE}.bottle.carrying:CarryAndPutEnv",
-)
-gym.register(
-    id=f"{_PACKAGE}/Bimanual-v0",
-    entry_point=f"{_PACKAGE}.suite.env:SuiteEnv",
-)
-gym.register(
-    id=f"{_PACKAGE}/AlohaState-v0",
-    entry_point=f"{_PACKAGE}.aloha.state:AlohaStateEnv",
-)
-gym.register(
-    id=f"{_PACKAGE}/MetaworldState-v0",
-    entry_point=f"{_PACKAGE}.metaworld.state:MetaworldStateEnv",
-)
+_ENVIRONMENTS = {
+    "BottleShaking-v0": "bottle.shaking:BottleShakingEnv",
+    "BottleTorque-v0": "bottle.torque:BottleTorqueEnv",
+    "CarryAndPut-v0": "bottle.carrying:CarryAndPutEnv",
+    "Bimanual-v0": "suite.env:SuiteEnv",
+    "AlohaState-v0": "aloha.state:AlohaStateEnv",
+    "MetaworldState-v0": "metaworld.state:MetaworldStateEnv",
+}
+for _name, _place in _ENVIRONMENTS.items():
+    gym.register(id=f"{_PACKAGE}/{_name}", entry_point=f"{_PACKAGE}.{_place}")
 
 
 def _features(n_joints: int, n_objects: int = 1) -> dict[str, PolicyFeature]:
@@ -101,6 +87,17 @@ class _StateEnvConfig(EnvConfig):
         return rate_processors(self.fps)
 
 
+@dataclass
+class _ControlledEnvConfig(_StateEnvConfig):
+    """A robot that follows joint references, and what can go wrong meanwhile."""
+
+    fps: int = 100
+    episode_length: int | None = None
+    pushes: bool = False
+    noise: float = 0.0
+    condition: str = NOMINAL
+
+
 class _TaskEnvConfig(_StateEnvConfig):
     """One environment of gymnasium's that has several tasks."""
 
@@ -119,7 +116,7 @@ class _TaskEnvConfig(_StateEnvConfig):
 
 @EnvConfig.register_subclass("bottle_shaking")
 @dataclass
-class BottleShakingConfig(_StateEnvConfig):
+class BottleShakingConfig(_ControlledEnvConfig):
     """``--env.type=bottle_shaking``.
 
     Parameters
@@ -135,13 +132,8 @@ class BottleShakingConfig(_StateEnvConfig):
     """
 
     task: str | None = "BottleShaking-v0"
-    fps: int = 100
     mode: str = "dynamic"
-    episode_length: int | None = None
-    pushes: bool = False
-    noise: float = 0.0
     track: bool = False
-    condition: str = NOMINAL
     frequency: float | None = None
     amplitude: float | None = None
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17))
@@ -175,7 +167,7 @@ class BottleTorqueConfig(BottleShakingConfig):
 
 @EnvConfig.register_subclass("carry_and_put")
 @dataclass
-class CarryAndPutConfig(_StateEnvConfig):
+class CarryAndPutConfig(_ControlledEnvConfig):
     """``--env.type=carry_and_put``.
 
     Parameters
@@ -191,18 +183,13 @@ class CarryAndPutConfig(_StateEnvConfig):
     """
 
     task: str | None = "CarryAndPut-v0"
-    fps: int = 100
     mode: str = "dynamic"
-    episode_length: int | None = None
-    pushes: bool = False
-    noise: float = 0.0
-    condition: str = NOMINAL
     features: dict[str, PolicyFeature] = field(default_factory=lambda: _features(17, 2))
 
 
 @EnvConfig.register_subclass("bimanual")
 @dataclass
-class BimanualConfig(_TaskEnvConfig):
+class BimanualConfig(_TaskEnvConfig, _ControlledEnvConfig):
     """``--env.type=bimanual``: the tasks of the suite.
 
     Parameters
@@ -224,11 +211,6 @@ class BimanualConfig(_TaskEnvConfig):
 
     task: str | None = "handover"
     robot: str = UPPER_BODY
-    fps: int = 100
-    episode_length: int | None = None
-    pushes: bool = False
-    noise: float = 0.0
-    condition: str = NOMINAL
 
     def __post_init__(self) -> None:
         if self.task is None or self.task not in SUITE:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -13,17 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_env_bimanual.base import Observation, StateEnv
 from lerobot_env_bimanual.disturbances import (
+    NOMINAL,
     Course,
     Disturbance,
     displaced,
     generators,
     parse_condition,
 )
+from lerobot_env_bimanual.robot_scene import CAMERA, RobotScene
 from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["ControlledEnv", "Scene"]
+__all__ = ["ControlledEnv"]
 
 #: Standard deviations of the sensors at ``noise=1``: joints [rad], the objects' positions [m]
 #: and orientations [rad].
@@ -31,38 +33,6 @@ NOISE_JOINTS = 2e-3
 NOISE_POSE = np.array([1e-3] * 3 + [math.radians(0.5)] * 3)
 #: The range in which an object is observed: position [m] and quaternion.
 RANGE = np.array([5.0] * 3 + [1.0] * 4)
-
-
-class Scene(Protocol):
-    """The state of a simulated world with a robot under joint position control."""
-
-    model: Any
-    data: Any
-
-    @property
-    def joints(self) -> NDArray[np.float64]:
-        """Joint positions [rad]."""
-
-    @property
-    def objects(self) -> Sequence[NDArray[np.float64]]:
-        """The poses of what is observed, shape (7,) each."""
-
-    def follow(
-        self, references: NDArray[np.float64], torques: NDArray[np.float64] | None = None
-    ) -> None:
-        """Simulate position control; one reference for now, and for each millisecond."""
-
-    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
-        """Put the joints somewhere without dynamics, while time passes."""
-
-    def rest(self) -> None:
-        """Stand still, as it is."""
-
-    def snapshot(self) -> Any:
-        """The state without velocities."""
-
-    def restore(self, snapshot: Any) -> None:
-        """Bring everything to where it was."""
 
 
 class ControlledEnv(StateEnv):
@@ -75,16 +45,44 @@ class ControlledEnv(StateEnv):
     ----------
     robot : Robot
         Its joints are those of the scene, in that order.
-    scene : Scene
-    camera : str
-        Of the scene's model.
+    scene : RobotScene
+        The simulated world.
     duration : float
         Of an episode that nothing delays [s].
     course : Course
         When what happens in the task.
-    fps, mode, episode_length, pushes, noise, track, condition, render_mode, render_width, \
-    render_height
-        As for :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`.
+    fps : int, default=100
+        Actions per second; a divisor of 1000, at least 10.
+    mode : {"dynamic", "kinematic"}, default="dynamic"
+        ``"kinematic"`` puts the joints where the references are: no masses, no delay.
+    episode_length : int, optional
+        In actions; as many as ``duration`` takes by default.
+    pushes : bool, default=False
+        Whether a torque of 40 to 50 N m pushes a shoulder or an elbow for 0.1 to 0.3 s at a
+        random moment: enough to move a free hand by 1 to 3 cm.
+    noise : float, default=0
+        Of the sensors, in multiples of standard deviations of 2 mrad for joints, and of 1 mm
+        and 0.5 deg about each axis for the objects (once per episode, unless they are tracked).
+    track : bool, default=False
+        Observe the objects' present poses instead of their initial ones.
+    condition : str or sequence of Disturbance, default="nominal"
+        What goes wrong, as
+        :func:`~lerobot_env_bimanual.disturbances.parse_condition` takes it:
+        ``"stopped-3"``, ``"moved+pose-noise"``. Its moments are drawn from the seed; an episode
+        becomes longer by the delay that it means.
+    render_mode : {"rgb_array"}, optional
+    render_width, render_height : int
+        Of the picture.
+
+    Attributes
+    ----------
+    joint_names : tuple of str
+        The order of actions and of ``agent_pos``.
+
+    Raises
+    ------
+    DataError
+        If an option is not one of the above.
     """
 
     _start: Start
@@ -96,26 +94,25 @@ class ControlledEnv(StateEnv):
     def __init__(
         self,
         robot: Robot,
-        scene: Scene,
-        camera: str,
+        scene: RobotScene,
         duration: float,
         course: Course,
         *,
-        fps: int,
-        mode: str,
-        episode_length: int | None,
-        pushes: bool,
-        noise: float,
-        track: bool,
-        condition: str | Sequence[Disturbance],
-        render_mode: str | None,
-        render_width: int,
-        render_height: int,
+        fps: int = 100,
+        mode: str = "dynamic",
+        episode_length: int | None = None,
+        pushes: bool = False,
+        noise: float = 0.0,
+        track: bool = False,
+        condition: str | Sequence[Disturbance] = NOMINAL,
+        render_mode: str | None = None,
+        render_width: int = 320,
+        render_height: int = 240,
     ) -> None:
         self.disturbances = parse_condition(condition)
         delay = sum(disturbance.delay for disturbance in self.disturbances)
         steps = round((duration + delay) * fps) if episode_length is None else episode_length
-        super().__init__(fps, steps, camera, render_mode, (render_width, render_height))
+        super().__init__(fps, steps, CAMERA, render_mode, (render_width, render_height))
         self.mode, self.pushes, self.noise, self.track = mode, pushes, noise, track
         self.condition, self._course, self._scene = condition, course, scene
         self._check_options()
@@ -208,10 +205,7 @@ class ControlledEnv(StateEnv):
         )
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Any]] = []
-        errors = start.misperception.reshape(-1, 6)
-        poses = zip(self._scene.objects, errors, strict=True)
-        self._seen = np.concatenate([self._perceived(*pair) for pair in poses])
-        self._shown = self._seen
+        self._shown = self._seen = self._perceived(start.misperception.reshape(-1, 6))
         for part in self._drawn:
             if part.start():
                 self._put_on_path(part.start())
@@ -353,9 +347,8 @@ class ControlledEnv(StateEnv):
         if self.noise:
             joints += self.noise * NOISE_JOINTS * draw(len(joints))
         if self._live:
-            errors = [draw(6) if self.noise else np.zeros(6) for _ in self._scene.objects]
-            poses = zip(self._scene.objects, errors, strict=True)
-            self._seen = np.concatenate([self._perceived(*pair) for pair in poses])
+            n = len(self._scene.objects)
+            self._seen = self._perceived(draw((n, 6)) if self.noise else np.zeros((n, 6)))
         shown = self._seen
         for part, rng in zip(self._drawn, self._rngs, strict=True):
             shown = part.seen(shown, self._shown, self._time, rng)
@@ -366,13 +359,15 @@ class ControlledEnv(StateEnv):
             "timestamp": np.array([self._time]),
         }
 
-    def _perceived(
-        self, pose: NDArray[np.float64], errors: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """A pose with errors given in standard deviations."""
-        if not self.noise:
-            return pose
-        return np.clip(displaced(pose, self.noise * NOISE_POSE * errors), -RANGE, RANGE)
+    def _perceived(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The objects' poses with errors given in standard deviations (n_objects, 6)."""
+        poses = self._scene.objects
+        if self.noise:
+            poses = [
+                np.clip(displaced(pose, self.noise * NOISE_POSE * error), -RANGE, RANGE)
+                for pose, error in zip(poses, errors, strict=True)
+            ]
+        return np.concatenate(poses)
 
     def _simulation(self) -> tuple[Any, Any]:
         return self._scene.model, self._scene.data

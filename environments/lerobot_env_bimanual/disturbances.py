@@ -84,6 +84,10 @@ class Disturbance:
         """By how much an episode becomes longer for it [s]."""
         return 0.0
 
+    def window(self, course: Course) -> tuple[float, float] | None:
+        """Between which times its ``moment`` is drawn [s]; None without a moment."""
+        return None
+
     def drawn(
         self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
     ) -> Self:
@@ -94,7 +98,12 @@ class Disturbance:
         usual : callable
             Whether an object that is displaced so (6,) stands where the task is meant for.
         """
-        return self
+        window = self.window(course)
+        if window is None:
+            return self
+        first, last = window
+        moment, given = rng.uniform(first, max(first, last)), vars(self)["moment"]
+        return dataclasses.replace(self, **{"moment": moment if math.isnan(given) else given})
 
     def stops(self, time: float) -> bool:
         """Whether the robot is stopped."""
@@ -131,11 +140,6 @@ class Disturbance:
         """Where in the task the episode begins [s]."""
         return 0.0
 
-    def _moment(self, rng: np.random.Generator, first: float, last: float) -> Self:
-        """With a ``moment`` between two times, unless it is given."""
-        moment, given = rng.uniform(first, max(first, last)), vars(self)["moment"]
-        return dataclasses.replace(self, **{"moment": moment if math.isnan(given) else given})
-
 
 @dataclass(frozen=True)
 class Stopped(Disturbance):
@@ -159,11 +163,9 @@ class Stopped(Disturbance):
         """As long as the stop."""
         return self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def window(self, course: Course) -> tuple[float, float]:
         """At any moment, all equally likely, until the task is done."""
-        return self._moment(rng, FIRST, course.end)
+        return FIRST, course.end
 
     def stops(self, time: float) -> bool:
         """For ``seconds`` from ``moment`` on."""
@@ -199,13 +201,11 @@ class Displaced(Disturbance):
         """While somebody holds the robot where it was put."""
         return self.moment <= time < self.moment + HELD
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def window(self, course: Course) -> tuple[float, float]:
         """While there is such a past, or enough future to judge."""
         if self.seconds < 0:
-            return self._moment(rng, FIRST - self.seconds, course.end)
-        return self._moment(rng, FIRST, course.latest - self.seconds)
+            return FIRST - self.seconds, course.end
+        return FIRST, course.latest - self.seconds
 
     def shove(self, begin: float, end: float) -> float:
         """``seconds``, at ``moment``."""
@@ -227,11 +227,9 @@ class StartedMidway(Disturbance):
 
     moment: float = math.nan
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def window(self, course: Course) -> tuple[float, float]:
         """Between a second after the beginning and the last moment that leaves enough."""
-        return self._moment(rng, 2 * FIRST, course.latest)
+        return 2 * FIRST, course.latest
 
     def start(self) -> float:
         """``moment``."""
@@ -265,11 +263,15 @@ class Moved(Disturbance):
     moment: float = math.nan
     step: Vector | None = dataclasses.field(default=None, compare=False)
 
+    def window(self, course: Course) -> tuple[float, float]:
+        """On the way to the object."""
+        return FIRST, course.grasp - APPROACH - self.seconds
+
     def drawn(
         self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
     ) -> Self:
         """On the way to the object, and within its usual places if it is in one of them."""
-        drawn = self._moment(rng, FIRST, course.grasp - APPROACH - self.seconds)
+        drawn = super().drawn(rng, course, usual)
         anywhere = not usual(np.zeros(6))
         # where its usual places are narrower than the step, none of whole length may be left
         for share in np.repeat(np.linspace(1, 0.1, 10), 1000):
@@ -339,11 +341,9 @@ class PoseLost(Disturbance):
         """As long as there is nothing to go by."""
         return self.seconds
 
-    def drawn(
-        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
-    ) -> Self:
+    def window(self, course: Course) -> tuple[float, float]:
         """At any moment before the grasp, after which the poses would matter less."""
-        return self._moment(rng, FIRST, course.grasp)
+        return FIRST, course.grasp
 
     def seen(
         self, poses: Vector, last: Vector, time: float, rng: np.random.Generator

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -13,16 +15,9 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "CAMERA",
-    "DAMPING",
-    "PALM",
-    "PALM_SIZE",
-    "STIFFNESS",
-    "TIMESTEP",
-    "RobotScene",
-    "controlled",
-    "robot_spec",
-]
+    "BOX", "CAMERA", "CYLINDER", "DAMPING", "PALM", "PALM_SIZE", "STIFFNESS", "TABLE",
+    "TIMESTEP", "RobotScene", "add_geom", "add_table", "add_weld", "controlled", "robot_spec",
+]  # fmt: skip
 
 #: Of the simulation and of the position control of the joints [s].
 TIMESTEP = 1e-3
@@ -34,8 +29,9 @@ CAMERA = "front"
 _DIVERGED = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{x}")) for x in ("QPOS", "QVEL", "QACC")
 ]
-#: What the palms collide with, as a bit; no other part of the robot collides.
-PALM = 2
+#: What collides with what, as bits: the table; the palms, and no other part of the robot.
+TABLE, PALM = 1, 2
+BOX, CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
 #: Half the sides of the upper body's palms, which robots without palms are given [m].
 PALM_SIZE = (0.025, 0.01, 0.04)
 
@@ -100,7 +96,27 @@ def _add_view(spec: Any) -> None:
     )
 
 
-class RobotScene:
+def add_geom(body: Any, shape: Any, size: Sequence[float], **more: Any) -> None:
+    """Add a shape to a body, of half sizes [m], with which nothing collides by default."""
+    body.add_geom(type=shape, size=size, **{"contype": 0, "conaffinity": 0, **more})
+
+
+def add_table(spec: Any, width: float) -> None:
+    """Add a body ``table`` whose top is where that is, drawn so wide [m]."""
+    table, plane = spec.worldbody.add_body(name="table"), mujoco.mjtGeom.mjGEOM_PLANE
+    add_geom(table, plane, (0, 0, 1), contype=TABLE, group=3)
+    size = (0.2, width / 2, 0.01)
+    add_geom(table, BOX, size, pos=(0.34, 0, -0.01), rgba=(0.6, 0.5, 0.4, 1))
+
+
+def add_weld(spec: Any, hand: str, thing: str) -> Any:
+    """Let a hand hold a thing: a weld between the bodies, not active."""
+    weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2=thing)
+    weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
+    return weld
+
+
+class RobotScene(ABC):
     """A simulated world with the robot in it, whose joints come first.
 
     Parameters
@@ -118,6 +134,23 @@ class RobotScene:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
         self._n = self.model.nu
+
+    @property
+    @abstractmethod
+    def objects(self) -> list[NDArray[np.float64]]:
+        """The poses of what is observed, shape (7,) each."""
+
+    @abstractmethod
+    def place(self, joints: NDArray[np.float64], seconds: float) -> None:
+        """Put the joints somewhere without dynamics, while time passes."""
+
+    @abstractmethod
+    def snapshot(self) -> Any:
+        """The state without velocities."""
+
+    @abstractmethod
+    def restore(self, snapshot: Any) -> None:
+        """Bring everything to where it was."""
 
     @property
     def joints(self) -> NDArray[np.float64]:
@@ -166,3 +199,21 @@ class RobotScene:
         data.qvel[:] = data.qacc_warmstart[:] = data.qfrc_applied[:] = 0
         data.ctrl[:] = data.qpos[: self._n]
         mujoco.mj_forward(self.model, data)
+
+    def _attach(self, weld: int, hand: int, thing: int) -> None:
+        """Activate a weld between two bodies as one lies in the other."""
+        data = self.data
+        inverse, turn = np.empty(4), np.empty(4)
+        mujoco.mju_negQuat(inverse, data.xquat[hand])
+        mujoco.mju_mulQuat(turn, inverse, data.xquat[thing])
+        point = data.xmat[thing].reshape(3, 3).T @ (data.xpos[hand] - data.xpos[thing])
+        # a point of the thing, where it is in the hand, and how the thing is turned there
+        self.model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
+        data.eq_active[weld] = True
+
+    def _contact_force(self, index: int, first: bool) -> NDArray[np.float64]:
+        """Of a contact's first or second geom on the other, friction too, shape (3,) [N]."""
+        force, frame = np.empty(6), self.data.contact.frame[index].reshape(3, 3)
+        mujoco.mj_contactForce(self.model, self.data, index, force)
+        # it is what the first geom does to the second, in the contact's frame
+        return np.asarray((1 if first else -1) * force[:3] @ frame)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_env_bimanual.base import finite_vector
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Start", "check_start"]
+__all__ = ["Start"]
 
 #: From a reference to the motors [ms]: a field bus and the cycles of some controllers.
 DELAY = (1, 8)
@@ -29,6 +31,8 @@ class Start:
     ----------
     joints : ndarray of shape (n_joints,)
         Start posture [rad].
+    poses : mapping of str to ndarray of shape (7,)
+        The objects' initial positions [m] and orientations, unit quaternions.
     delay : int
         From a reference to the motors [ms].
     pushed : int
@@ -39,19 +43,26 @@ class Start:
         [N m]
     misperception : ndarray of shape (6 * n_objects,)
         Of the objects' initial positions and orientations, in standard deviations.
+    mass : float
+        Of the bottle [kg].
+    slide : ndarray of shape (2,)
+        How far the bottle slides [m] and turns [rad] in the hands while they close.
     """
 
     joints: NDArray[np.float64]
+    poses: Mapping[str, NDArray[np.float64]]
     delay: int
     pushed: int
     push_start: float
     push_length: float
     push_torque: float
     misperception: NDArray[np.float64]
+    mass: float = 1.0
+    slide: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
     @staticmethod
     def drawn(rng: np.random.Generator, robot: Robot, objects: int = 1) -> dict[str, Any]:
-        """All but the posture."""
+        """Delay, push and misperception, as fields."""
         names = robot.joint_names
         strong = [i for i, name in enumerate(names) if any(part in name for part in PUSHED)]
         return dict(
@@ -63,6 +74,33 @@ class Start:
             misperception=rng.standard_normal(6 * objects),
         )
 
+    def given(self, options: Mapping[str, Any], robot: Robot) -> Self:
+        """With the objects' poses, the posture or the slide that options name.
+
+        Raises
+        ------
+        DataError
+            If a value has another shape, is not finite, is no unit quaternion, or is out of the
+            joints' ranges.
+        """
+        usual = {"joints": self.joints, "slide": self.slide, **self.poses}
+        chosen = usual | {
+            name: finite_vector(name, options[name], len(value))
+            for name, value in usual.items()
+            if name in options
+        }
+        joints, slide = chosen.pop("joints"), chosen.pop("slide")
+        beyond = np.maximum(robot.lower.numpy() - joints, joints - robot.upper.numpy())
+        if beyond.max() > 1e-6:
+            joint = robot.joint_names[int(beyond.argmax())]
+            raise DataError(f"{joint} is out of its range by {beyond.max():.3g} rad")
+        for name, pose in chosen.items():
+            if abs(np.linalg.norm(pose[3:]) - 1) > 1e-3:
+                raise DataError(
+                    f"{name} is x, y, z and a unit quaternion w, x, y, z; got {pose.tolist()}"
+                )
+        return replace(self, joints=joints, poses=chosen, slide=slide)
+
     def torques(self, start: int, steps: int) -> NDArray[np.float64]:
         """The push, as torques (steps, n_joints) [N m], one for each millisecond."""
         torques = np.zeros((steps, len(self.joints)))
@@ -70,28 +108,3 @@ class Start:
         last = first + round(1000 * self.push_length)
         torques[max(first, 0) : max(last, 0), self.pushed] = self.push_torque
         return torques
-
-
-def check_start(name: str, values: NDArray[np.float64], robot: Robot) -> None:
-    """Refuse a pose without a unit quaternion, and joints out of their ranges.
-
-    Parameters
-    ----------
-    name : str
-        ``"joints"``, or an object's.
-    values : ndarray
-        Shape (n_joints,) [rad], or (7,).
-
-    Raises
-    ------
-    DataError
-    """
-    if name == "joints":
-        beyond = np.maximum(robot.lower.numpy() - values, values - robot.upper.numpy())
-        if beyond.max() > 1e-6:
-            joint = robot.joint_names[int(beyond.argmax())]
-            raise DataError(f"{joint} is out of its range by {beyond.max():.3g} rad")
-    elif abs(np.linalg.norm(values[3:]) - 1) > 1e-3:
-        raise DataError(
-            f"{name} is x, y, z and a unit quaternion w, x, y, z; got {values.tolist()}"
-        )

@@ -16,7 +16,7 @@ import torch
 import lerobot_env_bimanual  # noqa: F401  registers what gym.make finds
 from lerobot_env_bimanual.aloha.demonstrations import record_aloha
 from lerobot_env_bimanual.aloha.robot import aloha_operators, aloha_robot
-from lerobot_env_bimanual.bottle.measures import LIMITS, PUT_LIMITS
+from lerobot_env_bimanual.bottle.measures import FIGURES, PUT_FIGURES, Figure
 from lerobot_env_bimanual.disturbances import CONDITIONS, NOMINAL
 from lerobot_env_bimanual.suite.env import SUITE_CONDITIONS
 from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
@@ -43,8 +43,8 @@ __all__ = ["BENCHMARKS", "OTHER_ROBOTS", "Benchmark", "benchmark"]
 
 #: How hard the robot moved, as the report shows it.
 PEAKS = {
-    "peak_speed": ("peak speed [rad/s]", 1),
-    "peak_acceleration": ("peak acceleration [rad/s²]", 0),
+    "peak_speed": Figure("peak speed [rad/s]", 1),
+    "peak_acceleration": Figure("peak acceleration [rad/s²]"),
 }
 
 
@@ -65,10 +65,8 @@ class Benchmark(ABC):
     default_rate: ClassVar[int]
     #: Whether all demonstrations run on one clock from the beginning.
     synchronous: ClassVar[bool] = False
-    #: The entries of ``info`` that the report shows, with heading and digits.
-    figures: Mapping[str, tuple[str, int]]
-    #: Between which bounds they have to lie in a success.
-    criteria: Mapping[str, tuple[float, float]] = {}
+    #: The entries of ``info`` that the report shows.
+    figures: Mapping[str, Figure]
     #: K of TP-GMM.
     n_components: ClassVar[int]
     #: Disturbances of the evaluation and the options that make them.
@@ -82,6 +80,11 @@ class Benchmark(ABC):
     ) -> None:
         self.rate = rate or self.default_rate
         self.options = {**self.fixed, **(options or {})}
+
+    @property
+    def criteria(self) -> dict[str, Figure]:
+        """The figures on which a success depends."""
+        return {name: figure for name, figure in self.figures.items() if figure.limited}
 
     @property
     def all_conditions(self) -> tuple[str, ...]:
@@ -238,15 +241,7 @@ class BottleBenchmark(_HandlingBenchmark):
 
     env = "bottle_shaking"
     gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
-    figures: Mapping[str, tuple[str, int]] = {
-        "grasp_mm": ("grasp [mm]", 1),
-        "grasp_deg": ("grasp [deg]", 1),
-        "lift_mm": ("lift [mm]", 0),
-        "frequency_error": ("frequency error", 2),
-        "amplitude_error": ("amplitude error", 2),
-        **PEAKS,
-    }
-    criteria = LIMITS
+    figures: Mapping[str, Figure] = {**FIGURES, **PEAKS}
 
     def __init__(
         self, rate: int | None = None, options: Mapping[str, Any] | None = None
@@ -270,14 +265,7 @@ class CarryBenchmark(_HandlingBenchmark):
 
     env = "carry_and_put"
     gym_id, task, objects = "CarryAndPut-v0", CARRY, ("bottle", "tray")
-    figures: Mapping[str, tuple[str, int]] = {
-        "put_mm": ("at the tray [mm]", 2),
-        "put_deg": ("at the tray [deg]", 2),
-        "standing": ("put down", 0),
-        "grasp_mm": ("grasp [mm]", 1),
-        **PEAKS,
-    }
-    criteria = PUT_LIMITS
+    figures: Mapping[str, Figure] = {**PUT_FIGURES, **PEAKS}
 
     def __init__(
         self, rate: int | None = None, options: Mapping[str, Any] | None = None
@@ -333,8 +321,7 @@ class SuiteBenchmark(_HandlingBenchmark):
         self.skill, self.robot_type = suite_task(name, robot), robot
         super().__init__(rate, {"task": name, "robot": robot, **(options or {})})
         self.robot, self.objects = self.skill.robot, self.skill.objects
-        self.task, self.criteria = self.skill.description, self.skill.limits
-        self.figures = {**self.skill.headings, **PEAKS}
+        self.task, self.figures = self.skill.description, {**self.skill.figures, **PEAKS}
 
     def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
         """Of the task's expert."""
@@ -364,9 +351,9 @@ class AlohaBenchmark(Benchmark):
     default_rate = 50
     synchronous = True
     n_components = 24
-    figures: Mapping[str, tuple[str, int]] = {
-        "max_reward": ("stage, 0 to 4", 0),
-        "lift_mm": ("lift [mm]", 0),
+    figures: Mapping[str, Figure] = {
+        "max_reward": Figure("stage, 0 to 4"),
+        "lift_mm": Figure("lift [mm]"),
     }
     #: Between the first episodes of two seeds, which have none in common.
     SPACING = 1_000

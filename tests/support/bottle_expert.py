@@ -18,7 +18,7 @@ def nominal(env):
 def perform(env, seed, looking=True):
     """An episode's last ``info``: with the even clock, or going on from where the robot is."""
     observation, info = env.reset(seed=seed)
-    path, bottle, last = nominal(env), env._start.bottle, env._start.bottle
+    path, bottle, last = nominal(env), env._start.poses["bottle"], env._start.poses["bottle"]
     at, then, over = 0.0, 0.0, False
     while not over:
         now, joints = observation["timestamp"][0], observation["agent_pos"]

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.bottle.conditions import Conditions, skill
+from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
-from lerobot_env_bimanual.bottle.measures import PUT_LIMITS, Closing, successful
+from lerobot_env_bimanual.bottle.measures import PUT_FIGURES, Closing, successful
 from lerobot_env_bimanual.bottle.scene import Snapshot, TrayScene
-from lerobot_env_bimanual.disturbances import (
-    NOMINAL,
-    Course,
-    Disturbance,
-)
+from lerobot_env_bimanual.disturbances import Course
+from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.carrying import SLIDE, TASK, CarryAndPut, slide
 from tpgmm_datasets.bottle.skill import FOOT
 from tpgmm_torch import Demonstration, Frame, Situation
@@ -44,37 +41,6 @@ PATH_RATE = 25.0
 def carrying() -> CarryAndPut:
     """The generator, on the robot of the other tasks."""
     return CarryAndPut(robot=skill().robot)
-
-
-@dataclass(frozen=True)
-class CarryConditions(Conditions):
-    """What an episode of carrying draws from its seed.
-
-    Parameters
-    ----------
-    tray : ndarray of shape (7,)
-        Position [m] and orientation, a unit quaternion.
-    slide : ndarray of shape (2,)
-        How far the bottle slides [m] and turns [rad] in the hands while they close.
-    """
-
-    tray: NDArray[np.float64]
-    slide: NDArray[np.float64]
-
-    @classmethod
-    def draw(cls, rng: np.random.Generator) -> Self:
-        """Draw, first what all tasks with the bottle draw."""
-        drawn = cls._with_bottle(rng, carrying())
-        position = torch.from_numpy(drawn["bottle"][None, :3])
-        tray = carrying().tray_poses(Frame(position), rng)[0]
-        return cls(
-            **{
-                **drawn,
-                "tray": np.concatenate((tray.position, tray.orientation)),
-                "slide": carrying().slides(1, rng)[0],
-                "misperception": np.append(drawn["misperception"], rng.standard_normal(6)),
-            }
-        )
 
 
 class CarryAndPutEnv(BottleEnv):
@@ -103,9 +69,8 @@ class CarryAndPutEnv(BottleEnv):
 
     Parameters
     ----------
-    fps, mode, episode_length, pushes, noise, condition, render_mode, render_width, \
-    render_height
-        As for :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`; an
+    **options
+        Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``track``; an
         episode takes 15.5 s by default.
 
     Raises
@@ -116,37 +81,10 @@ class CarryAndPutEnv(BottleEnv):
 
     task = TASK
     task_description = "take the bottle with both hands and put it on the tray"
-    _start: CarryConditions
     _scene: TrayScene
 
-    def __init__(
-        self,
-        *,
-        fps: int = 100,
-        mode: str = "dynamic",
-        episode_length: int | None = None,
-        pushes: bool = False,
-        noise: float = 0.0,
-        condition: str | Sequence[Disturbance] = NOMINAL,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
-    ) -> None:
-        super().__init__(
-            TrayScene(),
-            DURATION,
-            COURSE,
-            fps=fps,
-            mode=mode,
-            episode_length=episode_length,
-            pushes=pushes,
-            noise=noise,
-            track=True,
-            condition=condition,
-            render_mode=render_mode,
-            render_width=render_width,
-            render_height=render_height,
-        )
+    def __init__(self, **options: Any) -> None:
+        super().__init__(TrayScene(), DURATION, COURSE, track=True, **options)
 
     def figures(self) -> dict[str, float]:
         """How well the episode goes, so far; the class says what each figure is."""
@@ -169,12 +107,21 @@ class CarryAndPutEnv(BottleEnv):
         return math.degrees(2 * math.asin(min(1.0, math.hypot(x, y))))
 
     def _successful(self, figures: Mapping[str, float]) -> bool:
-        return successful(figures, PUT_LIMITS)
+        return successful(figures, PUT_FIGURES)
 
-    def _draw(self, options: Mapping[str, Any]) -> CarryConditions:
-        start = CarryConditions.draw(self.np_random).with_start(options)
-        self._scene.reset(start.bottle, start.joints, start.mass)
-        self._scene.put_tray(start.tray)
+    def _draw(self, options: Mapping[str, Any]) -> Start:
+        rng, task = self.np_random, carrying()
+        start = draw_start(rng, task)
+        place = Frame(torch.from_numpy(start.poses["bottle"][None, :3]))
+        tray: Any = task.tray_poses(place, rng)[0]
+        start = replace(
+            start,
+            poses={**start.poses, "tray": np.concatenate((tray.position, tray.orientation))},
+            slide=task.slides(1, rng)[0],
+            misperception=np.append(start.misperception, rng.standard_normal(6)),
+        ).given(options, task.robot)
+        self._scene.reset(start.poses["bottle"], start.joints, start.mass)
+        self._scene.put_tray(start.poses["tray"])
         self._closed: float | None = None  # when the hands began to close
         self._opening, self._lifted, self._put = Closing(reach=PUT), False, False
         return start
@@ -216,8 +163,8 @@ class CarryAndPutEnv(BottleEnv):
         self._put &= not self._scene.held and self._lifted
 
     def _nominal(self) -> Demonstration:
-        start = self._start
-        return _path(*map(tuple, (start.joints, self._standing(), start.tray, start.slide)))
+        start, standing = self._start, self._standing()
+        return _path(*map(tuple, (start.joints, standing, start.poses["tray"], start.slide)))
 
     def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
         return carrying().usual(Frame(bottle[:3], bottle[3:]))

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.bottle.conditions import Conditions, skill
+from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.measures import Closing
 from lerobot_env_bimanual.bottle.scene import BottleScene, Snapshot
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import Course, displaced
-from lerobot_env_bimanual.robot_scene import CAMERA
+from lerobot_env_bimanual.start import Start
 from tpgmm_torch import Demonstration, Frame
 
 __all__ = ["BottleEnv"]
@@ -37,15 +37,14 @@ class BottleEnv(ControlledEnv):
     """
 
     _scene: BottleScene
-    _start: Conditions
 
     def __init__(
         self, scene: BottleScene, duration: float, course: Course, **options: Any
     ) -> None:
-        super().__init__(skill().robot, scene, CAMERA, duration, course, **options)
+        super().__init__(skill().robot, scene, duration, course, **options)
 
     @abstractmethod
-    def _draw(self, options: Mapping[str, Any]) -> Conditions:
+    def _draw(self, options: Mapping[str, Any]) -> Start:
         """Draw an episode, and set the scene."""
 
     @abstractmethod
@@ -59,10 +58,10 @@ class BottleEnv(ControlledEnv):
     def _stands_usually(self, bottle: NDArray[np.float64]) -> bool:
         """Whether the task is meant for a bottle there."""
 
-    def _begin(self, options: Mapping[str, Any]) -> Conditions:
+    def _begin(self, options: Mapping[str, Any]) -> Start:
         start = self._draw(options)
         self._closing = Closing()
-        self._nearest, self._contact = math.inf, (start.joints, start.bottle)
+        self._nearest, self._contact = math.inf, (start.joints, start.poses["bottle"])
         # when the hands closed, in steps that count; joints and height at each of these
         self._grasp_step: int | None = None
         self._counted = 0
@@ -118,11 +117,11 @@ class BottleEnv(ControlledEnv):
         return np.stack([np.interp(grid, times, column) for column in motion.T], axis=1)
 
     def _usual(self, step: NDArray[np.float64]) -> bool:
-        return self._stands_usually(displaced(self._start.bottle, step))
+        return self._stands_usually(displaced(self._start.poses["bottle"], step))
 
     def _displace(self, step: NDArray[np.float64]) -> None:
         if self._grasp_step is None:
-            self._scene.put_bottle(displaced(self._start.bottle, step))
+            self._scene.put_bottle(displaced(self._start.poses["bottle"], step))
 
     def _restore(self, before: Snapshot) -> None:
         super()._restore(before)

@@ -6,39 +6,76 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LIMITS", "PUT_LIMITS", "Closing", "Shaking", "find_shaking", "successful"]
-
-#: The figures of a successful episode: smallest and largest.
-LIMITS = MappingProxyType(
-    {
-        "grasp_mm": (0.0, 10.0),
-        "grasp_deg": (0.0, 5.0),
-        "lift_mm": (50.0, math.inf),
-        "frequency_error": (0.0, 0.1),
-        "amplitude_error": (0.0, 0.2),
-    }
-)
-#: The same for a bottle that is put on a tray.
-PUT_LIMITS = MappingProxyType(
-    {"put_mm": (0.0, 5.0), "put_deg": (0.0, 3.0), "standing": (1.0, 1.0)}
-)
+__all__ = [
+    "FIGURES", "PUT_FIGURES", "Closing", "Figure", "Shaking", "find_shaking", "successful",
+]  # fmt: skip
 
 
-def successful(
-    figures: Mapping[str, float], limits: Mapping[str, tuple[float, float]] = LIMITS
-) -> bool:
-    """Whether the figures of an episode are good enough.
+class Figure(NamedTuple):
+    """A figure of an episode, which is 0 or more.
 
     Parameters
     ----------
-    figures : mapping of str to float
-        Those of ``limits``; more are ignored.
+    heading : str
+        What a report calls it, with its unit.
+    digits : int
+        That a report shows.
+    low, high : float
+        The smallest and the largest of a success.
     """
-    return all(low <= figures[name] <= high for name, (low, high) in limits.items())
+
+    heading: str
+    digits: int = 0
+    low: float = 0.0
+    high: float = math.inf
+
+    @property
+    def limited(self) -> bool:
+        """Whether a success depends on it."""
+        return self.low > 0 or self.high < math.inf
+
+
+#: Of bottle shaking.
+FIGURES = MappingProxyType(
+    {
+        "grasp_mm": Figure("grasp [mm]", 1, high=10.0),
+        "grasp_deg": Figure("grasp [deg]", 1, high=5.0),
+        "lift_mm": Figure("lift [mm]", low=50.0),
+        "frequency_error": Figure("frequency error", 2, high=0.1),
+        "amplitude_error": Figure("amplitude error", 2, high=0.2),
+    }
+)
+#: Of a bottle that is put on a tray.
+PUT_FIGURES = MappingProxyType(
+    {
+        "put_mm": Figure("at the tray [mm]", 2, high=5.0),
+        "put_deg": Figure("at the tray [deg]", 2, high=3.0),
+        "standing": Figure("put down", 0, 1.0, 1.0),
+        "grasp_mm": Figure("grasp [mm]", 1),
+    }
+)
+
+
+def successful(values: Mapping[str, float], figures: Mapping[str, Figure] = FIGURES) -> bool:
+    """Whether an episode is one of success.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Of ``figures``; more are ignored.
+    figures : mapping of str to Figure
+        What was asked for.
+    """
+    return all(
+        figure.low <= values[name] <= figure.high
+        for name, figure in figures.items()
+        if figure.limited
+    )
 
 
 @dataclass

@@ -14,7 +14,18 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_env_bimanual.robot_scene import PALM, TIMESTEP, RobotScene, robot_spec
+from lerobot_env_bimanual.robot_scene import (
+    BOX,
+    CYLINDER,
+    PALM,
+    TABLE,
+    TIMESTEP,
+    RobotScene,
+    add_geom,
+    add_table,
+    add_weld,
+    robot_spec,
+)
 from tpgmm_datasets.bottle.skill import FOOT, GRASP_POINT, HANDS
 
 __all__ = ["FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "TrayScene", "bottle_spec"]
@@ -22,7 +33,6 @@ __all__ = ["FOOT", "TABLE_LOW", "BottleScene", "Snapshot", "TrayScene", "bottle_
 #: Where the table stands once it has sunk [m], and how fast it sinks [m/s]: the chest, to which
 #: the bottle is brought, is lower than some of the places where it stood.
 TABLE_LOW, TABLE_SPEED = -0.08, 0.2
-_TABLE = 1  # what else collides with the bottle, as a bit
 
 
 def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
@@ -41,46 +51,25 @@ def bottle_spec(tray: bool = False) -> mujoco.MjSpec:
         ``r_palm``; a weld between each hand and the bottle, not active.
     """
     spec = robot_spec()
-    _add_table(spec)
+    add_table(spec, 0.6)
     _add_bottle(spec, abs(GRASP_POINT[HANDS[0]][1]) - float(spec.geom("l_palm").size[1]))
     for hand in HANDS:
-        weld = spec.add_equality(type=mujoco.mjtEq.mjEQ_WELD, name1=hand, name2="bottle")
-        weld.objtype, weld.active = mujoco.mjtObj.mjOBJ_BODY, False
+        add_weld(spec, hand, "bottle")
     if tray:
         body = spec.worldbody.add_body(name="tray")
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(0.09, 0.09, 0.001),
-            contype=0,
-            conaffinity=0,
-            rgba=(0.2, 0.6, 0.3, 1),
-        )
+        add_geom(body, BOX, (0.09, 0.09, 0.001), rgba=(0.2, 0.6, 0.3, 1))
     return spec
-
-
-def _add_table(spec: Any) -> None:
-    table = spec.worldbody.add_body(name="table")
-    table.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=_TABLE, conaffinity=0, group=3
-    )
-    table.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(0.2, 0.3, 0.01),
-        pos=(0.34, 0, -0.01),
-        contype=0,
-        conaffinity=0,
-        rgba=(0.6, 0.5, 0.4, 1),
-    )
 
 
 def _add_bottle(spec: Any, radius: float) -> None:
     bottle = spec.worldbody.add_body(name="bottle")
     bottle.add_freejoint()
-    shape: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "contype": 0}
-    body = {"name": "bottle", "mass": 1.0, "rgba": (0.3, 0.6, 0.9, 1)}
-    bottle.add_geom(**shape, **body, size=(radius, FOOT, 0))
+    bottle.add_geom(
+        name="bottle", type=CYLINDER, size=(radius, FOOT, 0), mass=1.0, contype=0,
+        rgba=(0.3, 0.6, 0.9, 1),
+    )  # fmt: skip
     for size, height in (((0.025, 0.02, 0), FOOT + 0.02), ((0.03, 0.012, 0), FOOT + 0.05)):
-        bottle.add_geom(**shape, mass=0, conaffinity=0, size=size, pos=(0, 0, height))
+        add_geom(bottle, CYLINDER, size, mass=0, pos=(0, 0, height))
 
 
 @dataclass(frozen=True)
@@ -157,7 +146,7 @@ class BottleScene(RobotScene):
         model.body_inertia[self._bottle] = mass * self._unit_inertia
         mujoco.mj_setConst(model, data)
         mujoco.mj_resetData(model, data)
-        model.geom_conaffinity[self._surface] = _TABLE | PALM
+        model.geom_conaffinity[self._surface] = TABLE | PALM
         self.held = False
         data.ctrl[:] = data.qpos[: self._n] = joints
         data.qpos[self._n :] = bottle
@@ -214,7 +203,7 @@ class BottleScene(RobotScene):
         self.model.body_pos[self._table, 2] = snapshot.table
         self.held = snapshot.held
         self.data.eq_active[:] = snapshot.held
-        self.model.geom_conaffinity[self._surface] = _TABLE | (0 if self.held else PALM)
+        self.model.geom_conaffinity[self._surface] = TABLE | (0 if self.held else PALM)
         mujoco.mj_kinematics(self.model, self.data)
 
     def gap(self) -> float:
@@ -227,18 +216,10 @@ class BottleScene(RobotScene):
 
     def hold(self) -> None:
         """Attach the bottle to both hands as it lies in them; from then on the table sinks."""
-        model, data, bottle = self.model, self.data, self._bottle
         self.held = True
-        model.geom_conaffinity[self._surface] = _TABLE
-        inverse, turn = np.empty(4), np.empty(4)
+        self.model.geom_conaffinity[self._surface] = TABLE
         for weld, hand in enumerate(self._hands):
-            offset = data.xpos[hand] - data.xpos[bottle]
-            mujoco.mju_negQuat(inverse, data.xquat[hand])
-            mujoco.mju_mulQuat(turn, inverse, data.xquat[bottle])
-            point = data.xmat[bottle].reshape(3, 3).T @ offset
-            # a point of the bottle, where it is in the hand, and how the bottle is turned there
-            model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
-            data.eq_active[weld] = True
+            self._attach(weld, hand, self._bottle)
 
     def let_go(self) -> None:
         """Open both hands."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,11 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.bottle.conditions import Conditions, skill
+from lerobot_env_bimanual.bottle.conditions import draw_start, skill
 from lerobot_env_bimanual.bottle.handling import BottleEnv
 from lerobot_env_bimanual.bottle.measures import find_shaking, successful
 from lerobot_env_bimanual.bottle.scene import TABLE_LOW, BottleScene
-from lerobot_env_bimanual.disturbances import NOMINAL, Course, Disturbance
+from lerobot_env_bimanual.disturbances import Course
+from lerobot_env_bimanual.start import Start
 from tpgmm_datasets.bottle.skill import FOOT, PHASES, SHOULDERS, TASK, BottleShaking
 from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.exceptions import DataError
@@ -72,36 +73,12 @@ class BottleShakingEnv(BottleEnv):
 
     Parameters
     ----------
-    fps : int, default=100
-        Actions per second; a divisor of 1000, at least 10.
-    mode : {"dynamic", "kinematic"}, default="dynamic"
-        ``"kinematic"`` puts the joints where the references are: no masses, no delay.
-    episode_length : int, optional
-        In actions; as many as 16 s take by default.
-    pushes : bool, default=False
-        Whether a torque of 40 to 50 N m pushes a shoulder or an elbow for 0.1 to 0.3 s at a
-        random moment: enough to move a free hand by 1 to 3 cm.
-    noise : float, default=0
-        Of the sensors, in multiples of standard deviations of 2 mrad for joints, and of 1 mm
-        and 0.5 deg about each axis for the bottle (once per episode, unless it is tracked).
-    track : bool, default=False
-        Observe the bottle's present pose instead of its initial one.
-    condition : str or sequence of Disturbance, default="nominal"
-        What goes wrong, as
-        :func:`~lerobot_env_bimanual.disturbances.parse_condition` takes it:
-        ``"stopped-3"``, ``"moved+pose-noise"``. Its moments are drawn from the seed; an episode
-        becomes longer by the delay that it means.
     frequency, amplitude : float
         What the shaking should have [Hz, rad]; by default what demonstrations with a steady
         rhythm have.
-    render_mode : {"rgb_array"}, optional
-    render_width, render_height : int
-        Of the picture.
-
-    Attributes
-    ----------
-    joint_names : tuple of str
-        The order of actions and of ``agent_pos``.
+    **options
+        Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`; an episode takes 16 s
+        by default.
 
     Raises
     ------
@@ -115,35 +92,12 @@ class BottleShakingEnv(BottleEnv):
     def __init__(
         self,
         *,
-        fps: int = 100,
-        mode: str = "dynamic",
-        episode_length: int | None = None,
-        pushes: bool = False,
-        noise: float = 0.0,
-        track: bool = False,
-        condition: str | Sequence[Disturbance] = NOMINAL,
         frequency: float = FREQUENCY,
         amplitude: float = AMPLITUDE,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
+        **options: Any,
     ) -> None:
         self.frequency, self.amplitude = frequency, amplitude
-        super().__init__(
-            BottleScene(),
-            DURATION,
-            COURSE,
-            fps=fps,
-            mode=mode,
-            episode_length=episode_length,
-            pushes=pushes,
-            noise=noise,
-            track=track,
-            condition=condition,
-            render_mode=render_mode,
-            render_width=render_width,
-            render_height=render_height,
-        )
+        super().__init__(BottleScene(), DURATION, COURSE, **options)
         self._pitches = [self.joint_names.index(name) for name in SHOULDERS]
 
     def _check_options(self) -> None:
@@ -175,9 +129,9 @@ class BottleShakingEnv(BottleEnv):
     def _successful(self, figures: Mapping[str, float]) -> bool:
         return successful(figures)
 
-    def _draw(self, options: Mapping[str, Any]) -> Conditions:
-        start = Conditions.draw(self.np_random).with_start(options)
-        self._scene.reset(start.bottle, start.joints, start.mass)
+    def _draw(self, options: Mapping[str, Any]) -> Start:
+        start = draw_start(self.np_random, skill()).given(options, skill().robot)
+        self._scene.reset(start.poses["bottle"], start.joints, start.mass)
         return start
 
     def _nominal(self) -> Demonstration:

@@ -14,7 +14,7 @@ from lerobot_env_bimanual.base import Observation
 from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.bottle.scene import BottleScene, bottle_spec
 from lerobot_env_bimanual.bottle.shaking import BottleShakingEnv
-from lerobot_env_bimanual.robot_scene import DAMPING, STIFFNESS
+from lerobot_env_bimanual.robot_scene import DAMPING, STIFFNESS, add_geom
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_torch.exceptions import DataError, ShapeError
 
@@ -65,16 +65,11 @@ class TorqueScene(BottleScene):
             for geom in (geom for body in spec.bodies for geom in body.geoms):
                 if geom.group == _ROBOT:
                     geom.conaffinity |= _OBSTACLE
-            spec.worldbody.add_geom(
-                name="obstacle",
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                size=(RADIUS, HEIGHT / 2, 0),
-                pos=AWAY,  # at 0 it would be taken to stay where the world is
-                contype=_OBSTACLE,
-                conaffinity=0,
-                solref=(0.005, 1.0),
-                rgba=(0.8, 0.2, 0.2, 1),
-            )
+            # at 0 it would be taken to stay where the world is
+            look = {"name": "obstacle", "pos": AWAY, "rgba": (0.8, 0.2, 0.2, 1)}
+            shape, size = mujoco.mjtGeom.mjGEOM_CAPSULE, (RADIUS, HEIGHT / 2, 0)
+            contact = {"contype": _OBSTACLE, "solref": (0.005, 1.0)}
+            add_geom(spec.worldbody, shape, size, **look, **contact)
         super().__init__(spec)
         model, n = self.model, self._n
         model.body_gravcomp[:] = 0
@@ -153,18 +148,15 @@ class TorqueScene(BottleScene):
         if self.torques is None:
             control = control + data.qfrc_bias[: self._n]
         super()._step(control)
-        if self._obstacle >= 0 and (force := self._contact_force()):
+        if self._obstacle >= 0 and (force := self._obstacle_force()):
             self.force = max(self.force, force)
             self._touched = min(self._touched, float(data.time))
 
-    def _contact_force(self) -> float:
+    def _obstacle_force(self) -> float:
         """Between robot and obstacle [N]."""
-        total, part, pairs = np.zeros(3), np.empty(6), self.data.contact.geom
+        total, pairs = np.zeros(3), self.data.contact.geom
         for index in np.flatnonzero((pairs == self._obstacle).any(1)):
-            mujoco.mj_contactForce(self.model, self.data, index, part)
-            # the frame's rows are its axes; the normal points from geom 0 to geom 1
-            sign = 1 if pairs[index, 0] == self._obstacle else -1
-            total += sign * part[:3] @ self.data.contact.frame[index].reshape(3, 3)
+            total += self._contact_force(index, pairs[index, 0] == self._obstacle)
         return math.sqrt(total @ total)
 
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.base import finite_vector
 from lerobot_env_bimanual.bottle.measures import Closing, successful
 from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.disturbances import (
@@ -23,10 +21,10 @@ from lerobot_env_bimanual.disturbances import (
     displaced,
     parse_condition,
 )
-from lerobot_env_bimanual.robot_scene import CAMERA
-from lerobot_env_bimanual.start import Start, check_start
+from lerobot_env_bimanual.robot_scene import add_table
+from lerobot_env_bimanual.start import Start
 from lerobot_env_bimanual.suite.names import UPPER_BODY
-from lerobot_env_bimanual.suite.scene import SuiteScene, table_spec
+from lerobot_env_bimanual.suite.scene import SuiteScene
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tpgmm_torch.exceptions import DataError
 
@@ -49,21 +47,6 @@ SUITE_CONDITIONS = tuple(
 )
 
 
-@dataclass(frozen=True)
-class SuiteStart(Start):
-    """What an episode of the suite draws from its seed.
-
-    Parameters
-    ----------
-    joints, delay, pushed, push_start, push_length, push_torque, misperception
-        As of :class:`Start`.
-    poses : mapping of str to ndarray of shape (7,)
-        The objects' positions [m] and orientations, unit quaternions.
-    """
-
-    poses: Mapping[str, NDArray[np.float64]]
-
-
 class SuiteEnv(ControlledEnv):
     """A robot at a table, and a task for both hands.
 
@@ -82,10 +65,10 @@ class SuiteEnv(ControlledEnv):
     robot : str, default="upper_body"
         The 17-joint ``upper_body``; ``viperx``, gym-aloha's two arms of 6 joints; or ``g1``,
         waist and arms of a Unitree G1, 17 joints.
-    fps, episode_length, pushes, noise, condition, render_mode, render_width, render_height
-        As for :class:`~lerobot_env_bimanual.bottle.shaking.BottleShakingEnv`; an
-        episode takes as long as the slowest demonstration and a second by default. Nobody puts
-        the robot ahead in its task.
+    **options
+        Those of :class:`~lerobot_env_bimanual.controlled.ControlledEnv`, but for ``mode`` and
+        ``track``; an episode takes as long as the slowest demonstration and a second by
+        default. Nobody puts the robot ahead in its task.
 
     Raises
     ------
@@ -96,48 +79,28 @@ class SuiteEnv(ControlledEnv):
     """
 
     _scene: SuiteScene
-    _start: SuiteStart
 
-    def __init__(
-        self,
-        task: str,
-        robot: str = UPPER_BODY,
-        *,
-        fps: int = 100,
-        episode_length: int | None = None,
-        pushes: bool = False,
-        noise: float = 0.0,
-        condition: str | Sequence[Disturbance] = NOMINAL,
-        render_mode: str | None = None,
-        render_width: int = 320,
-        render_height: int = 240,
-    ) -> None:
+    def __init__(self, task: str, robot: str = UPPER_BODY, **options: Any) -> None:
         self._task = suite_task(task, robot)
+        condition = options.get("condition", NOMINAL)
         if any(map(_skips, parse_condition(condition))):
             raise DataError(
                 f"condition {condition!r} skips a part of the task, which {task} does not "
                 "offer: what its hands and its judge would have done meanwhile is not known"
             )
-        spec = table_spec(self._task.embodiment.spec())
+        spec = self._task.embodiment.spec()
+        add_table(spec, 0.7)
         self._task.furnish(spec)
         ends = self._task.ends()
-        whole = list(ends.values())
+        *_, last, _ = ends.values()
         super().__init__(
             self._task.robot,
             SuiteScene(spec, self._task.objects, self._task.holds),
-            CAMERA,
             self._task.duration,
-            Course(grasp=ends[self._task.grasp], latest=whole[-2], end=whole[-2]),
-            fps=fps,
+            Course(grasp=ends[self._task.grasp], latest=last, end=last),
             mode="dynamic",
-            episode_length=episode_length,
-            pushes=pushes,
-            noise=noise,
             track=True,
-            condition=condition,
-            render_mode=render_mode,
-            render_width=render_width,
-            render_height=render_height,
+            **options,
         )
         self.robot, self.task, self.task_description = robot, task, self._task.description
 
@@ -146,23 +109,17 @@ class SuiteEnv(ControlledEnv):
         return self._judge.figures(self._scene)
 
     def _successful(self, figures: Mapping[str, float]) -> bool:
-        return successful(figures, self._task.limits)
+        return successful(figures, self._task.figures)
 
-    def _begin(self, options: Mapping[str, Any]) -> SuiteStart:
+    def _begin(self, options: Mapping[str, Any]) -> Start:
         task, rng = self._task, self.np_random
-        drawn = task.draw(rng)
-        joints = task.start_posture(rng)
-        for name in options.keys() & {*drawn, "joints"}:
-            given = finite_vector(name, options[name], len(joints) if name == "joints" else 7)
-            check_start(name, given, task.robot)
-            if name == "joints":
-                joints = given
-            else:
-                drawn[name] = given
-        start = SuiteStart(
-            joints=joints, poses=drawn, **Start.drawn(rng, task.robot, len(task.objects))
-        )
-        self._scene.reset(drawn, joints, float(drawn[task.objects[0]][2]) - task.foot)
+        start = Start(
+            poses=task.draw(rng),
+            joints=task.start_posture(rng),
+            **Start.drawn(rng, task.robot, len(task.objects)),
+        ).given(options, task.robot)
+        first = start.poses[task.objects[0]]
+        self._scene.reset(start.poses, start.joints, float(first[2]) - task.foot)
         self._judge, self._noted = task.judge(), 0.0
         self._watch_hands()
         return start
@@ -204,7 +161,7 @@ class SuiteEnv(ControlledEnv):
         snapshot, judge = before
         self._scene.restore(snapshot)
         self._judge = copy.deepcopy(judge)
-        self._watch_hands()  # their patience begins anew
+        self._watch_hands()
 
     def _put_on_path(self, instant: float) -> None:
         raise NotImplementedError("no disturbance of these tasks puts the robot ahead")

@@ -8,28 +8,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
 import numpy as np
-import torch
 
-from lerobot_env_bimanual.bottle.measures import Closing
+from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import TABLE, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
+    Box,
     Judge,
     Leg,
     Pose,
     Style,
     SuiteTask,
+    moved,
     raised,
-    stands_in,
-    upright_pose,
+    seen,
+    vector,
 )
 from tpgmm_datasets.bottle.skill import attached
-from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
+from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.operators import Operator
 
 __all__ = ["Handover"]
@@ -38,7 +39,7 @@ RADIUS, FOOT = 0.02, 0.08
 LEFT = Hold("l_hand", "baton", "baton")
 RIGHT = Hold("r_hand", "baton", "baton")
 #: Where batons and stands are: the box of the baton's centre, and the same on the other side.
-LOWEST, HIGHEST, YAW = (0.24, 0.06, 0.10), (0.32, 0.13, 0.15), 20.0
+BOX = Box((0.24, 0.06, 0.10), (0.32, 0.13, 0.15), 20.0)
 #: Where the palms touch the baton, and where they wait, in its frame [m].
 GRIP = {"l_hand": (0.0, RADIUS + 0.01, -0.035), "r_hand": (0.0, -RADIUS - 0.01, 0.035)}
 WAIT = {"l_hand": (-0.05, 0.1, -0.035), "r_hand": (-0.05, -0.1, 0.035)}
@@ -57,74 +58,32 @@ class Handover(SuiteTask):
     description = "take the baton with the left hand, pass it to the right, put it on the stand"
     objects = SUITE["handover"]
     foot = FOOT
-    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {
-            "reach": 2.0,
-            "close": 1.0,
-            "hold": 0.6,
-            "raise": 0.8,
-            "bring": 2.0,
-            "meet": 1.2,
-            "pass": 0.8,
-            "leave": 1.0,
-            "carry": 2.0,
-            "lower": 1.2,
-            "open": 0.8,
-            "away": 1.0,
-            "rest": 0.4,
-        }
-    )
-    grasp = "close"
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.0, "hold": 0.6, "raise": 0.8, "bring": 2.0, "meet": 1.2,
+        "pass": 0.8, "leave": 1.0, "carry": 2.0, "lower": 1.2, "open": 0.8, "away": 1.0,
+        "rest": 0.4,
+    }  # fmt: skip
+    grasp, box = "close", BOX
     holds = (LEFT, RIGHT)
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
-        {
-            "place_mm": (0.0, 8.0),
-            "lean_deg": (0.0, 5.0),
-            "passed": (1.0, 1.0),
-            "put": (1.0, 1.0),
-        }
-    )
-    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
-        {
-            "place_mm": ("on the stand [mm]", 1),
-            "lean_deg": ("lean [deg]", 1),
-            "passed": ("passed", 0),
-            "put": ("put down", 0),
-        }
-    )
+    figures: ClassVar = {
+        "place_mm": Figure("on the stand [mm]", 1, high=8.0),
+        "lean_deg": Figure("lean [deg]", 1, high=5.0),
+        "passed": Figure("passed", 0, 1.0, 1.0),
+        "put": Figure("put down", 0, 1.0, 1.0),
+    }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         """A baton, and a flat stand that nothing collides with."""
-        baton = add_thing(spec, "baton")
-        baton.add_geom(
-            name="baton",
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=(RADIUS, FOOT, 0),
-            mass=0.3,
-            contype=0,
-            conaffinity=TABLE,
-            rgba=(0.85, 0.3, 0.3, 1),
-        )
+        look = {"name": "baton", "rgba": (0.85, 0.3, 0.3, 1)}
+        baton, size = add_thing(spec, "baton"), (RADIUS, FOOT, 0)
+        add_geom(baton, CYLINDER, size, **look, mass=0.3, conaffinity=TABLE)
         stand = add_thing(spec, "stand", free=False)
-        stand.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            size=(0.05, 0.001, 0),
-            contype=0,
-            conaffinity=0,
-            rgba=(0.2, 0.6, 0.3, 1),
-        )
+        add_geom(stand, CYLINDER, (0.05, 0.001, 0), rgba=(0.2, 0.6, 0.3, 1))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """The baton on the left, the stand on the right of the table."""
-        baton = upright_pose(rng, LOWEST, HIGHEST, YAW)
-        (x, y, _), (far, wide, _) = LOWEST, HIGHEST
-        height = baton[2] - FOOT
-        stand = upright_pose(rng, (x, -wide, height), (far, -y, height), YAW)
-        return {"baton": baton, "stand": stand}
-
-    def usual(self, pose: Pose) -> bool:
-        """Whether it stands in its box."""
-        return stands_in(pose, LOWEST, HIGHEST, YAW)
+        baton = BOX.draw(rng)
+        return {"baton": baton, "stand": BOX.across(baton[2] - FOOT).draw(rng)}
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
@@ -132,33 +91,28 @@ class Handover(SuiteTask):
         """Left to the baton, to the meeting, and back; right to the meeting and the stand."""
         baton, stand = poses["baton"], poses["stand"]
         aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
-        spread = style.free * torch.tensor(MEETING_SPREAD, dtype=torch.float64)
-        meeting = Frame(torch.tensor(MEETING, dtype=torch.float64) + spread)
-        place = Frame(
-            stand.transform(torch.tensor((0.0, 0.0, FOOT), dtype=torch.float64)),
-            stand.orientation,
-        )
+        meeting = Frame(vector(MEETING) + style.free * vector(MEETING_SPREAD))
+        place = Frame(stand.transform(vector((0.0, 0.0, FOOT))), stand.orientation)
 
-        def at(pose: Frame, hand: str, points: Mapping[str, tuple[float, ...]]) -> Frame:
-            return attached(pose, points[hand])
+        def grip(pose: Frame, hand: str) -> Frame:
+            return attached(pose, GRIP[hand])
 
         def near(pose: Frame, hand: str) -> Frame:
-            waiting = at(pose, hand, WAIT)
-            return Frame(waiting.position + aside[hand], waiting.orientation)
+            return moved(attached(pose, WAIT[hand]), aside[hand])
 
         left = [
             Leg("reach", near(baton, "l_hand"), free=True),
-            Leg("close", at(baton, "l_hand", GRIP)),
-            Leg("raise", at(raised(baton, LIFT), "l_hand", GRIP)),
-            Leg("bring", at(meeting, "l_hand", GRIP), free=True),
+            Leg("close", grip(baton, "l_hand")),
+            Leg("raise", grip(raised(baton, LIFT), "l_hand")),
+            Leg("bring", grip(meeting, "l_hand"), free=True),
             Leg("leave", near(meeting, "l_hand")),
             Leg("carry", starts["l_hand"], free=True),
         ]
         right = [
             Leg("bring", near(meeting, "r_hand"), free=True),
-            Leg("meet", at(meeting, "r_hand", GRIP)),
-            Leg("carry", at(raised(place, LIFT), "r_hand", GRIP), free=True),
-            Leg("lower", at(place, "r_hand", GRIP)),
+            Leg("meet", grip(meeting, "r_hand")),
+            Leg("carry", grip(raised(place, LIFT), "r_hand"), free=True),
+            Leg("lower", grip(place, "r_hand")),
             Leg("away", near(place, "r_hand")),
         ]
         return {"l_hand": left, "r_hand": right}
@@ -172,13 +126,9 @@ class Handover(SuiteTask):
 
         With what is held, the baton from the stand; otherwise the right hand.
         """
-        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-
-        def seen(what: str, frame: str) -> Stack:
-            return Stack(*(kind(what, frame) for kind in kinds))
-
-        last = seen("baton" if held else "r_hand", "stand")
-        return [seen("l_hand", "baton"), seen("r_hand", "l_hand"), last, Canonical()]
+        pairs = (("l_hand", "baton"), ("r_hand", "l_hand"))
+        last = ("baton" if held else "r_hand", "stand")
+        return [*(seen(*pair, orientation) for pair in (*pairs, last)), Canonical()]
 
 
 class _Judge(Judge):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
@@ -17,27 +16,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_env_bimanual.bottle.measures import Closing
+from lerobot_env_bimanual.bottle.measures import Closing, Figure
+from lerobot_env_bimanual.robot_scene import BOX as CUBOID
+from lerobot_env_bimanual.robot_scene import TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import TABLE, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
+    Box,
     Judge,
     Leg,
     Pose,
     Style,
     SuiteTask,
-    stands_in,
-    upright_pose,
+    seen,
+    vector,
 )
 from tpgmm_datasets.bottle.skill import attached
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-    quaternions,
-)
+from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
@@ -49,10 +44,10 @@ HALF = (0.05, 0.06, 0.04)
 #: left hand does not come in its way [m].
 HINGE = (0.0, -HALF[1], HALF[2])
 KNOB, KNOB_HALF = (0.0, 0.08, 0.015), (0.02, 0.008, 0.015)
-BOX = Hold("l_hand", "box", "box")
+HELD = Hold("l_hand", "box", "box")
 LID = Hold("r_hand", "lid", "knob")
 #: Where boxes are: the box of their origins, and how they are turned [m, deg].
-LOWEST, HIGHEST, YAW = (0.25, -0.055, 0.065), (0.30, -0.03, 0.09), 12.0
+AREA = Box((0.25, -0.055, 0.065), (0.30, -0.03, 0.09), 12.0)
 #: Half of a palm's thickness [m].
 PALM = 0.01
 #: Where the palms touch: the left one in the box's frame, the right one in the lid's [m].
@@ -78,91 +73,42 @@ class Lid(SuiteTask):
     description = "hold the box with the left hand, open its lid with the right, close it"
     objects = SUITE["lid"]
     foot = HALF[2]
-    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {
-            "reach": 2.0,
-            "close": 1.0,
-            "hold": 0.6,
-            "open": 2.5,
-            "keep": 2.0,
-            "shut": 2.5,
-            "release": 0.8,
-            "away": 1.2,
-            "rest": 0.4,
-        }
-    )
-    grasp = "close"
-    holds = (BOX, LID)
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
-        {
-            "opened_deg": (OPEN, math.inf),
-            "kept_s": (KEPT, math.inf),
-            "box_mm": (0.0, 5.0),
-            "shut_deg": (0.0, SHUT),
-            "grips": (1.0, 1.0),
-        }
-    )
-    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
-        {
-            "opened_deg": ("opened [deg]", 1),
-            "kept_s": ("kept open [s]", 1),
-            "box_mm": ("box moved [mm]", 1),
-            "shut_deg": ("shut to [deg]", 1),
-            "grips": ("grips kept", 0),
-            "pull_n": ("pull [N]", 0),
-        }
-    )
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.0, "hold": 0.6, "open": 2.5, "keep": 2.0, "shut": 2.5,
+        "release": 0.8, "away": 1.2, "rest": 0.4,
+    }  # fmt: skip
+    grasp, box = "close", AREA
+    holds = (HELD, LID)
+    figures: ClassVar = {
+        "opened_deg": Figure("opened [deg]", 1, low=OPEN),
+        "kept_s": Figure("kept open [s]", 1, low=KEPT),
+        "box_mm": Figure("box moved [mm]", 1, high=5.0),
+        "shut_deg": Figure("shut to [deg]", 1, high=SHUT),
+        "grips": Figure("grips kept", 0, 1.0, 1.0),
+        "pull_n": Figure("pull [N]"),
+    }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         """A box, and on it a lid with a knob, which turns about the upper right edge."""
-        visible = {"contype": 0, "conaffinity": 0}
         wide, deep, _ = HALF
         box = add_thing(spec, "box")
-        box.add_geom(
-            name="box",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=HALF,
-            mass=0.4,
-            friction=(0.4, 0.005, 0.0001),
-            contype=0,
-            conaffinity=TABLE,
-            rgba=(0.75, 0.6, 0.4, 1),
-        )
+        look = {"name": "box", "rgba": (0.75, 0.6, 0.4, 1)}
+        rough = {"friction": (0.4, 0.005, 0.0001), "conaffinity": TABLE}
+        add_geom(box, CUBOID, HALF, mass=0.4, **look, **rough)
         lid = box.add_body(name="lid", pos=HINGE)
         lid.add_joint(
-            name="lid",
-            type=mujoco.mjtJoint.mjJNT_HINGE,
-            axis=(1, 0, 0),
-            limited=mujoco.mjtLimited.mjLIMITED_TRUE,
-            range=(0.0, math.radians(110.0)),
-            damping=0.01,
-            frictionloss=0.02,
-        )
-        lid.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(wide, deep, 0.003),
-            pos=(0, deep, 0.003),
-            mass=0.08,
-            rgba=(0.6, 0.45, 0.3, 1),
-            **visible,
-        )
-        lid.add_geom(
-            name="knob",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=KNOB_HALF,
-            pos=KNOB,
-            mass=0.02,
-            rgba=(0.3, 0.3, 0.35, 1),
-            **visible,
-        )
+            name="lid", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(1, 0, 0),
+            limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=(0.0, math.radians(110.0)),
+            damping=0.01, frictionloss=0.02,
+        )  # fmt: skip
+        look = {"pos": (0, deep, 0.003), "rgba": (0.6, 0.45, 0.3, 1)}
+        add_geom(lid, CUBOID, (wide, deep, 0.003), mass=0.08, **look)
+        look = {"name": "knob", "pos": KNOB, "rgba": (0.3, 0.3, 0.35, 1)}
+        add_geom(lid, CUBOID, KNOB_HALF, mass=0.02, **look)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """The box a little to the right of the middle."""
-        return {"box": upright_pose(rng, LOWEST, HIGHEST, YAW)}
-
-    def usual(self, pose: Pose) -> bool:
-        """Whether it stands in its box."""
-        return stands_in(pose, LOWEST, HIGHEST, YAW)
+        return {"box": AREA.draw(rng)}
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
@@ -171,7 +117,7 @@ class Lid(SuiteTask):
         box = poses["box"]
         opened = torch.deg2rad(OPENED + SPREAD * style.free[:, 0])
         rolled = torch.full_like(opened, math.radians(ROLL))
-        hinge, point = (torch.tensor(at, dtype=torch.float64) for at in (HINGE, GRIP))
+        hinge, point = map(vector, (HINGE, GRIP))
 
         def lid(share: Tensor) -> Frame:
             """Where the right hand holds the lid, opened by a share of the angle."""
@@ -209,13 +155,8 @@ class Lid(SuiteTask):
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """The hands seen from the box, and from each other, which is the closed chain."""
-        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-
-        def seen(what: str, frame: str) -> Stack:
-            return Stack(*(kind(what, frame) for kind in kinds))
-
         pairs = (("l_hand", "box"), ("r_hand", "box"), ("r_hand", "l_hand"))
-        return [*(seen(*pair) for pair in pairs), Canonical()]
+        return [*(seen(*pair, orientation) for pair in pairs), Canonical()]
 
 
 def _turned(pose: Frame, angle: Tensor) -> Frame:
@@ -257,7 +198,7 @@ class _Judge(Judge):
             "kept_s": self.kept,
             "box_mm": 1e3 * self.moved,
             "shut_deg": max(self._angle(scene), 0.0),
-            "grips": float({BOX, LID} <= scene.taken and not self.lost),
+            "grips": float({HELD, LID} <= scene.taken and not self.lost),
             "pull_n": self.pull,
         }
 

@@ -10,41 +10,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.robot_scene import BOX as CUBOID
+from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import (
-    OBJECT,
-    TABLE,
-    Hold,
-    SuiteScene,
-    add_thing,
-)
+from lerobot_env_bimanual.suite.scene import OBJECT, Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
+    Box,
     Judge,
     Leg,
     Pose,
     Style,
     SuiteTask,
+    moved,
     raised,
-    stands_in,
-    upright_pose,
+    seen,
+    vector,
 )
 from tpgmm_datasets.bottle.skill import attached
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-    quaternions,
-)
+from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
 __all__ = ["PegInHole"]
@@ -56,11 +47,14 @@ WIDTH, HEIGHT = 0.04, 0.03
 #: Between peg and hole all round, how much wider the hole's mouth is, and the hole's depth [m].
 CLEARANCE, CHAMFER, DEPTH = 0.001, 0.002, 0.05
 #: Wood on wood, smoothed; and how stiff a contact is: its time constant [s], its damping.
-FRICTION, STIFF = 0.3, (0.004, 1.0)
+SOLID = {
+    "contype": OBJECT, "conaffinity": TABLE | OBJECT,
+    "friction": (0.3, 0.005, 0.0001), "solref": (0.004, 1.0),
+}  # fmt: skip
 PEG = Hold("r_hand", "peg", "peg")
 BLOCK = Hold("l_hand", "block", "block")
 #: Where pegs are: the box of the peg's centre; blocks are on the other side of the table.
-LOWEST, HIGHEST, YAW = (0.24, -0.13, 0.075), (0.32, -0.07, 0.1), 20.0
+AREA = Box((0.24, -0.13, 0.075), (0.32, -0.07, 0.1), 20.0)
 #: Where the palms touch peg and block, and where they wait, in their frames [m].
 GRIP = {"r_hand": (0.0, -HEAD[0] - 0.01, 0.03), "l_hand": (0.0, WIDTH + 0.01, 0.015)}
 WAIT = {"r_hand": (-0.05, -0.09, 0.03), "l_hand": (-0.05, 0.11, 0.015)}
@@ -82,36 +76,18 @@ class PegInHole(SuiteTask):
     description = "take the peg and the block with a hole, and insert the peg in the air"
     objects = SUITE["peg_in_hole"]
     foot = LENGTH
-    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {
-            "reach": 2.0,
-            "close": 1.0,
-            "hold": 0.6,
-            "lift": 0.8,
-            "bring": 2.0,
-            "align": 1.2,
-            "insert": 2.0,
-            "keep": 1.2,
-        }
-    )
-    grasp = "close"
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 0.8, "bring": 2.0, "align": 1.2,
+        "insert": 2.0, "keep": 1.2,
+    }  # fmt: skip
+    grasp, box = "close", AREA
     holds = (PEG, BLOCK)
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
-        {
-            "depth_mm": (1e3 * DEEP, math.inf),
-            "inserted_s": (0.5, math.inf),
-            "force_n": (0.0, 30.0),
-            "held": (1.0, 1.0),
-        }
-    )
-    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
-        {
-            "depth_mm": ("depth [mm]", 1),
-            "inserted_s": ("inserted for [s]", 1),
-            "force_n": ("pressed by [N]", 1),
-            "held": ("both held", 0),
-        }
-    )
+    figures: ClassVar = {
+        "depth_mm": Figure("depth [mm]", 1, low=1e3 * DEEP),
+        "inserted_s": Figure("inserted for [s]", 1, low=0.5),
+        "force_n": Figure("pressed by [N]", 1, high=30.0),
+        "held": Figure("both held", 0, 1.0, 1.0),
+    }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         """A round peg with a head, and a block of boxes around a square hole with a chamfer."""
@@ -121,48 +97,19 @@ class PegInHole(SuiteTask):
             ("peg", (radius, tall, 0), LENGTH - tall),
             ("pin", (RADIUS, LENGTH - tall, 0), -tall),
         ):
-            _add_solid(
-                peg,
-                mujoco.mjtGeom.mjGEOM_CYLINDER,
-                size,
-                name=name,
-                pos=(0.0, 0.0, height),
-                mass=0.05,
-                rgba=(0.85, 0.3, 0.3, 1),
-            )
+            look = {"name": name, "pos": (0.0, 0.0, height), "rgba": (0.85, 0.3, 0.3, 1)}
+            add_geom(peg, CYLINDER, size, mass=0.05, **look, **SOLID)
         block = add_thing(spec, "block")
         # the hand closes on the whole, and it has the mass of it
-        block.add_geom(
-            name="block",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=(WIDTH, WIDTH, HEIGHT),
-            mass=0.25,
-            contype=0,
-            conaffinity=0,
-            group=3,
-        )
+        add_geom(block, CUBOID, (WIDTH, WIDTH, HEIGHT), name="block", mass=0.25, group=3)
         for position, half, orientation in _block():
-            _add_solid(
-                block,
-                mujoco.mjtGeom.mjGEOM_BOX,
-                half,
-                pos=position,
-                quat=orientation,
-                mass=0,
-                rgba=(0.3, 0.45, 0.7, 1),
-            )
+            look = {"pos": position, "quat": orientation, "rgba": (0.3, 0.45, 0.7, 1)}
+            add_geom(block, CUBOID, half, mass=0, **look, **SOLID)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """The peg on the right, the block on the left of the table."""
-        peg = upright_pose(rng, LOWEST, HIGHEST, YAW)
-        (x, y, _), (far, wide, _) = LOWEST, HIGHEST
-        height = peg[2] - LENGTH + HEIGHT
-        block = upright_pose(rng, (x, -wide, height), (far, -y, height), YAW)
-        return {"peg": peg, "block": block}
-
-    def usual(self, pose: Pose) -> bool:
-        """Whether it stands in its box."""
-        return stands_in(pose, LOWEST, HIGHEST, YAW)
+        peg = AREA.draw(rng)
+        return {"peg": peg, "block": AREA.across(peg[2] - LENGTH + HEIGHT).draw(rng)}
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
@@ -170,24 +117,20 @@ class PegInHole(SuiteTask):
         """Left to the block and the meeting; right to the peg, beside, above, and in."""
         peg, block = poses["peg"], poses["block"]
         aside = {"l_hand": style.aim[:, 0], "r_hand": style.aim[:, 1]}
-        spread = style.free * torch.tensor(MEETING_SPREAD, dtype=torch.float64)
         # nobody turns them on the way
-        meeting = Frame(torch.tensor(MEETING, dtype=torch.float64) + spread, block.orientation)
+        place = vector(MEETING) + style.free * vector(MEETING_SPREAD)
+        meeting = Frame(place, block.orientation)
 
-        def over(height: float | Tensor) -> Frame:
+        def over(height: float) -> Frame:
             """The peg so high above where the hole begins."""
-            up = torch.tensor((0.0, 0.0, HEIGHT + LENGTH + height), dtype=torch.float64)
+            up = vector((0.0, 0.0, HEIGHT + LENGTH + height))
             return Frame(meeting.position + up, _straighter(peg))
 
         def waiting(pose: Frame, hand: str) -> Frame:
-            near = attached(pose, WAIT[hand])
-            return Frame(near.position + aside[hand], near.orientation)
+            return moved(attached(pose, WAIT[hand]), aside[hand])
 
         begun = over(ABOVE)
-        offset = torch.tensor(BESIDE, dtype=torch.float64) + aside["r_hand"] * torch.tensor(
-            (1, 1, 0)
-        )
-        beside = Frame(begun.position + offset, begun.orientation)
+        beside = moved(begun, vector(BESIDE) + aside["r_hand"] * torch.tensor((1, 1, 0)))
         left = [
             Leg("reach", waiting(block, "l_hand"), free=True),
             Leg("close", attached(block, GRIP["l_hand"])),
@@ -213,16 +156,13 @@ class PegInHole(SuiteTask):
 
         Without what is held, one hand from the other in place of the peg from the block.
         """
-        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-        grasps = [
-            Stack(*(kind(*pair) for kind in kinds))
-            for pair in (("r_hand", "peg"), ("l_hand", "block"))
+        together = ("peg", "block") if held else ("r_hand", "l_hand")
+        return [
+            seen("r_hand", "peg", orientation),
+            seen("l_hand", "block", orientation),
+            seen(*together, orientation, held),
+            Canonical(),
         ]
-        if held:
-            together = Stack(*(kind("peg", "block", held=True) for kind in kinds))
-        else:
-            together = Stack(*(kind("r_hand", "l_hand") for kind in kinds))
-        return [*grasps, together, Canonical()]
 
 
 class _Judge(Judge):
@@ -259,19 +199,6 @@ def _straighter(pose: Frame) -> Tensor:
     straight[..., 0] = 1.0
     half = torch.full(pose.batch_shape, 0.5, dtype=torch.float64)
     return quaternions.slerp(straight, pose.orientation, half)
-
-
-def _add_solid(body: Any, kind: Any, size: Sequence[float], **more: Any) -> None:
-    """A geom that stands on the table and collides with other objects."""
-    body.add_geom(
-        type=kind,
-        size=size,
-        contype=OBJECT,
-        conaffinity=TABLE | OBJECT,
-        friction=(FRICTION, 0.005, 0.0001),
-        solref=STIFF,
-        **more,
-    )
 
 
 def _block() -> list[tuple[Sequence[float], Sequence[float], Sequence[float]]]:

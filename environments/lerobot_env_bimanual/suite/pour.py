@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
@@ -20,27 +19,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.robot_scene import CYLINDER, TABLE, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
-from lerobot_env_bimanual.suite.scene import TABLE, Hold, SuiteScene, add_thing
+from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
+    Box,
     Judge,
     Leg,
     Pose,
     Style,
     SuiteTask,
+    moved,
     raised,
-    stands_in,
-    upright_pose,
+    seen,
+    vector,
 )
 from tpgmm_datasets.bottle.skill import attached, between
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-    quaternions,
-)
+from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
@@ -52,7 +48,7 @@ JUG, JUG_HALF = 0.025, 0.06
 LEFT = Hold("l_hand", "jug", "jug")
 RIGHT = Hold("r_hand", "cup", "cup")
 #: Where cups and jugs stand: the box of the cup's centre, and the jug's on the other side.
-LOWEST, HIGHEST, YAW = (0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0
+BOX = Box((0.25, -0.13, 0.055), (0.32, -0.06, 0.085), 20.0)
 #: Where the palms touch them, and where they wait, in their frames [m].
 GRIP = {"l_hand": (0.0, JUG + 0.01, 0.01), "r_hand": (0.0, -CUP - 0.01, 0.0)}
 WAIT = {"l_hand": (-0.05, 0.1, 0.01), "r_hand": (-0.05, -0.1, 0.0)}
@@ -83,42 +79,19 @@ class Pour(SuiteTask):
     description = "take the cup with the right hand, the jug with the left, pour into the cup"
     objects = SUITE["pour"]
     foot = CUP_HALF
-    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {
-            "reach": 2.0,
-            "close": 1.0,
-            "hold": 0.6,
-            "lift": 1.6,
-            "grip": 0.6,
-            "raise": 0.8,
-            "bring": 2.0,
-            "tilt": 1.6,
-            "pour": 1.6,
-            "back": 1.6,
-            "leave": 1.6,
-            "rest": 0.4,
-        }
-    )
-    grasp = "close"
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
+        "bring": 2.0, "tilt": 1.6, "pour": 1.6, "back": 1.6, "leave": 1.6, "rest": 0.4,
+    }  # fmt: skip
+    grasp, box = "close", BOX
     holds = (LEFT, RIGHT)
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
-        {
-            "poured": (0.9, math.inf),
-            "spilled": (0.0, 0.1),
-            "cup_deg": (0.0, 10.0),
-            "jug_deg": (0.0, 10.0),
-            "held": (1.0, 1.0),
-        }
-    )
-    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
-        {
-            "poured": ("poured", 2),
-            "spilled": ("spilled", 2),
-            "cup_deg": ("cup's lean [deg]", 1),
-            "jug_deg": ("jug's lean in the end [deg]", 1),
-            "held": ("both held", 0),
-        }
-    )
+    figures: ClassVar = {
+        "poured": Figure("poured", 2, low=0.9),
+        "spilled": Figure("spilled", 2, high=0.1),
+        "cup_deg": Figure("cup's lean [deg]", 1, high=10.0),
+        "jug_deg": Figure("jug's lean in the end [deg]", 1, high=10.0),
+        "held": Figure("both held", 0, 1.0, 1.0),
+    }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         """A cup and a jug, which collide with the table alone."""
@@ -127,27 +100,13 @@ class Pour(SuiteTask):
             "jug": (JUG, JUG_HALF, 0.3, (0.9, 0.75, 0.3, 1)),
         }
         for name, (radius, half, mass, colour) in shapes.items():
-            add_thing(spec, name).add_geom(
-                name=name,
-                type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-                size=(radius, half, 0),
-                mass=mass,
-                contype=0,
-                conaffinity=TABLE,
-                rgba=colour,
-            )
+            look, body = {"name": name, "rgba": colour}, add_thing(spec, name)
+            add_geom(body, CYLINDER, (radius, half, 0), mass=mass, conaffinity=TABLE, **look)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """The cup on the right, the jug on the left of the table."""
-        cup = upright_pose(rng, LOWEST, HIGHEST, YAW)
-        (x, y, _), (far, near, _) = LOWEST, HIGHEST
-        height = cup[2] - CUP_HALF + JUG_HALF
-        jug = upright_pose(rng, (x, -near, height), (far, -y, height), YAW)
-        return {"cup": cup, "jug": jug}
-
-    def usual(self, pose: Pose) -> bool:
-        """Whether it stands in its box."""
-        return stands_in(pose, LOWEST, HIGHEST, YAW)
+        cup = BOX.draw(rng)
+        return {"cup": cup, "jug": BOX.across(cup[2] - CUP_HALF + JUG_HALF).draw(rng)}
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
@@ -155,16 +114,14 @@ class Pour(SuiteTask):
         """Right to the cup, and lifts it; left to the jug, over the cup, and back."""
         cup, jug = poses["cup"], poses["jug"]
         aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
-        sway = style.free * torch.tensor(SWAY, dtype=torch.float64)
-        meeting = torch.tensor(MEETING, dtype=torch.float64) + aside["r_hand"]
+        sway, meeting = style.free * vector(SWAY), vector(MEETING) + aside["r_hand"]
         # where the cup is at the ends of the phases in which it is poured into
         turns = [Frame(meeting + share * sway) for share in (0.0, 1.0, -1.0, 0.0)]
         cups = dict(zip(("tilt", "pour", "back"), pairwise(turns), strict=True))
         side = _turn(SIDE + SIDE_SPREAD * style.free[:, 2], (0.0, 0.0, 1.0))
 
         def near(pose: Frame, hand: str) -> Frame:
-            waiting = attached(pose, WAIT[hand])
-            return Frame(waiting.position + aside[hand], waiting.orientation)
+            return moved(attached(pose, WAIT[hand]), aside[hand])
 
         def pouring(phase: str, tilted: Callable[[Tensor], Tensor]) -> Leg:
             def way(done: Tensor) -> Frame:
@@ -174,7 +131,7 @@ class Pour(SuiteTask):
             return Leg(phase, way)
 
         ready = _over(turns[0], side, torch.zeros_like(side[:, 0]))
-        away = Frame(torch.tensor(ASIDE, dtype=torch.float64) + aside["l_hand"])
+        away = Frame(vector(ASIDE) + aside["l_hand"])
         left = [
             Leg("reach", near(jug, "l_hand"), free=True),
             Leg("lift", attached(jug, GRIP["l_hand"])),
@@ -199,15 +156,11 @@ class Pour(SuiteTask):
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """Each hand seen from what it takes, the jug seen from the cup; the joints."""
-        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-
-        def seen(what: str, frame: str, thing: bool = False) -> Stack:
-            return Stack(*(kind(what, frame, held=thing) for kind in kinds))
-
+        together = ("jug", "cup") if held else ("l_hand", "r_hand")
         return [
-            seen("r_hand", "cup"),
-            seen("l_hand", "jug"),
-            seen("jug", "cup", thing=True) if held else seen("l_hand", "r_hand"),
+            seen("r_hand", "cup", orientation),
+            seen("l_hand", "jug", orientation),
+            seen(*together, orientation, held),
             Canonical(),
         ]
 
@@ -227,8 +180,8 @@ def _over(cup: Frame, side: Tensor, tilt: Tensor) -> Frame:
     beside[..., 1] = BESIDE * (1 - minimum_jerk((tilt / math.radians(OVER)).clamp(max=1)))
     beside[..., 2] = CUP_HALF + ABOVE
     mouth = cup.position + quaternions.rotate(side, beside)
-    lip = torch.tensor((0.0, -JUG, JUG_HALF), dtype=torch.float64)
-    return Frame(mouth - quaternions.rotate(orientation, lip), orientation)
+    lip = quaternions.rotate(orientation, vector((0.0, -JUG, JUG_HALF)))
+    return Frame(mouth - lip, orientation)
 
 
 class _Judge(Judge):

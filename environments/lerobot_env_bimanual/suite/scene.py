@@ -10,12 +10,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_env_bimanual.robot_scene import RobotScene
+from lerobot_env_bimanual.robot_scene import RobotScene, add_weld
 
-__all__ = ["OBJECT", "TABLE", "Hold", "Snapshot", "SuiteScene", "add_thing", "table_spec"]
+__all__ = ["OBJECT", "Hold", "Snapshot", "SuiteScene", "add_thing"]
 
-#: What collides with what, as bits: the table, and objects among each other. Palms do not.
-TABLE, OBJECT = 1, 8
+#: What objects collide with, as a bit, beside the table: one another, but no palms.
+OBJECT = 8
 #: How a grip yields: time constant [s] and damping ratio. The lighter a thing is, the softer it
 #: is held; with MuJoCo's own 0.02 s a baton would hang from the hand by some degrees.
 GRIP = (0.004, 1.0)
@@ -40,29 +40,6 @@ class Hold:
     hand: str
     thing: str
     grip: str
-
-
-def table_spec(spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Put a robot at a table, a body ``table`` whose top is where that is.
-
-    Parameters
-    ----------
-    spec : mujoco.MjSpec
-        That of an embodiment.
-    """
-    table = spec.worldbody.add_body(name="table")
-    table.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE, size=(0, 0, 1), contype=TABLE, conaffinity=0, group=3
-    )
-    table.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=(0.2, 0.35, 0.01),
-        pos=(0.34, 0, -0.01),
-        contype=0,
-        conaffinity=0,
-        rgba=(0.6, 0.5, 0.4, 1),
-    )
-    return spec
 
 
 def add_thing(spec: mujoco.MjSpec, name: str, *, free: bool = True) -> mujoco.MjsBody:
@@ -109,7 +86,7 @@ class SuiteScene(RobotScene):
     Parameters
     ----------
     spec : mujoco.MjSpec
-        That of :func:`table_spec` with the objects in it.
+        A robot at a table, with the objects in it.
     names : sequence of str
         The objects that are observed.
     holds : sequence of Hold
@@ -128,12 +105,8 @@ class SuiteScene(RobotScene):
         self, spec: mujoco.MjSpec, names: Sequence[str], holds: Sequence[Hold]
     ) -> None:
         for hold in holds:
-            weld = spec.add_equality(
-                type=mujoco.mjtEq.mjEQ_WELD, name1=hold.hand, name2=hold.thing
-            )
-            weld.name, weld.active = f"{hold.hand} {hold.thing}", False
-            weld.objtype = mujoco.mjtObj.mjOBJ_BODY
-            weld.solref = GRIP
+            weld = add_weld(spec, hold.hand, hold.thing)
+            weld.name, weld.solref = f"{hold.hand} {hold.thing}", GRIP
         super().__init__(spec)
         model = self.model
         self.names = tuple(names)
@@ -205,15 +178,8 @@ class SuiteScene(RobotScene):
 
     def hold(self, hold: Hold) -> None:
         """Attach an object to a hand as it lies in it."""
-        data, weld = self.data, self._welds[hold]
-        hand, thing = data.body(hold.hand), data.body(hold.thing)
-        inverse, turn = np.empty(4), np.empty(4)
-        mujoco.mju_negQuat(inverse, hand.xquat)
-        mujoco.mju_mulQuat(turn, inverse, thing.xquat)
-        point = thing.xmat.reshape(3, 3).T @ (hand.xpos - thing.xpos)
-        # a point of the thing, where it is in the hand, and how the thing is turned there
-        self.model.eq_data[weld, :10] = np.concatenate((point, np.zeros(3), turn))
-        data.eq_active[weld] = True
+        hand, thing = (self.model.body(name).id for name in (hold.hand, hold.thing))
+        self._attach(self._welds[hold], hand, thing)
         self.held.add(hold)
         self.taken.add(hold)
 
@@ -243,17 +209,12 @@ class SuiteScene(RobotScene):
 
     def force(self, first: str, second: str) -> NDArray[np.float64]:
         """What one body does to another where they touch, friction too; shape (3,) [N]."""
-        model, data, part = self.model, self.data, np.empty(6)
-        total = np.zeros(3)
+        total, model = np.zeros(3), self.model
         bodies = model.body(first).id, model.body(second).id
-        for index in range(data.ncon):
-            contact = data.contact[index]
-            pair = tuple(model.geom_bodyid[contact.geom])
+        for index, geoms in enumerate(self.data.contact.geom):
+            pair = tuple(model.geom_bodyid[geoms])
             if set(pair) == set(bodies):
-                mujoco.mj_contactForce(model, data, index, part)
-                # it is what the first geom does to the second, in the contact's frame
-                sign = 1 if pair == bodies else -1
-                total += sign * part[:3] @ contact.frame.reshape(3, 3)
+                total += self._contact_force(index, pair == bodies)
         return total
 
     def snapshot(self) -> Snapshot:

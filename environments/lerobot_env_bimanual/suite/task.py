@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import mujoco
 import numpy as np
@@ -20,24 +20,26 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
 from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
-from tpgmm_torch import Demonstration, Frame, Robot
+from tpgmm_torch import (
+    Demonstration,
+    Frame,
+    RelativeOrientation,
+    RelativePosition,
+    Robot,
+    Stack,
+)
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
 
 __all__ = [
-    "Judge",
-    "Leg",
-    "Style",
-    "SuiteTask",
-    "hands_along",
-    "raised",
-    "stands_in",
-    "upright_pose",
-]
+    "Box", "Judge", "Leg", "Pose", "Style", "SuiteTask", "hands_along", "moved", "raised",
+    "seen", "vector",
+]  # fmt: skip
 
 Pose = NDArray[np.float64]
 #: Durations differ by up to this share.
@@ -162,10 +164,10 @@ class SuiteTask(ABC):
     grasp: ClassVar[str]
     #: Which hand may take hold of what.
     holds: ClassVar[tuple[Hold, ...]]
-    #: The figures of a successful episode: smallest and largest.
-    limits: ClassVar[Mapping[str, tuple[float, float]]]
-    #: How a report calls figures, and their digits.
-    headings: ClassVar[Mapping[str, tuple[str, int]]]
+    #: What a judge finds, and what a success needs of it.
+    figures: ClassVar[Mapping[str, Figure]]
+    #: Where the first object may be.
+    box: ClassVar[Box]
 
     def __init__(self, embodiment: Embodiment) -> None:
         self.embodiment = embodiment
@@ -183,9 +185,9 @@ class SuiteTask(ABC):
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """Where the objects are, shape (7,) each; always as many random numbers."""
 
-    @abstractmethod
     def usual(self, pose: Pose) -> bool:
         """Whether the task is meant for a first object there, as the table's height is."""
+        return self.box.contains(pose)
 
     @abstractmethod
     def legs(
@@ -362,33 +364,58 @@ def hands_along(
             if leg.free:
                 # nothing at both ends, without a speed there
                 bump = torch.sin(math.pi * minimum_jerk(done)).square()
-                pose = Frame(pose.position + bump[:, None] * aside, pose.orientation)
+                pose = moved(pose, bump[:, None] * aside)
         poses.append(pose)
     return poses
 
 
+def moved(pose: Frame, offset: Tensor) -> Frame:
+    """Elsewhere by so much [m], as it is turned."""
+    return Frame(pose.position + offset, pose.orientation)
+
+
 def raised(pose: Frame, height: float) -> Frame:
     """Lifted straight up [m], as what stands on the table is before it is carried away."""
-    up = torch.tensor((0.0, 0.0, height), dtype=torch.float64)
-    return Frame(pose.position + up, pose.orientation)
+    return moved(pose, vector((0.0, 0.0, height)))
 
 
-def upright_pose(
-    rng: np.random.Generator, lowest: Sequence[float], highest: Sequence[float], yaw: float
-) -> Pose:
-    """A pose in a box [m], turned about the vertical by up to ``yaw`` either way [deg]."""
-    position = rng.uniform(lowest, highest)
-    half = math.radians(rng.uniform(-yaw, yaw)) / 2
-    return np.concatenate((position, (math.cos(half), 0.0, 0.0, math.sin(half))))
+def vector(values: Sequence[float]) -> Tensor:
+    """A tensor of double precision."""
+    return torch.tensor(values, dtype=torch.float64)
 
 
-def stands_in(
-    pose: Pose, lowest: Sequence[float], highest: Sequence[float], yaw: float
-) -> bool:
-    """Whether :func:`upright_pose` may give a pose (7,), but for rounding."""
-    inside = np.all(
-        (np.subtract(lowest, 1e-9) <= pose[:3]) & (pose[:3] <= np.add(highest, 1e-9))
-    )
-    w, x, y, z = pose[3:]
-    turn = (math.degrees(2 * math.atan2(z, w)) + 180) % 360 - 180
-    return bool(inside) and math.hypot(x, y) < 1e-6 and abs(turn) < yaw + 1e-6
+def seen(what: str, frame: str, orientation: bool, held: bool = False) -> Stack:
+    """Where a link, or what is ``held``, is seen from a frame, turned or not."""
+    kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
+    return Stack(*(kind(what, frame, held=held) for kind in kinds))
+
+
+class Box(NamedTuple):
+    """Where upright things stand: between two corners [m], turned either way [deg]."""
+
+    lowest: tuple[float, ...]
+    highest: tuple[float, ...]
+    yaw: float
+
+    def draw(self, rng: np.random.Generator) -> Pose:
+        """A pose (7,) in it."""
+        position = rng.uniform(self.lowest, self.highest)
+        half = math.radians(rng.uniform(-self.yaw, self.yaw)) / 2
+        return np.concatenate((position, (math.cos(half), 0.0, 0.0, math.sin(half))))
+
+    def across(self, height: float) -> Box:
+        """The same on the other side of the table, at a height [m]."""
+        (x, y, _), (far, wide, _) = self.lowest, self.highest
+        return Box((x, -wide, height), (far, -y, height), self.yaw)
+
+    def contains(self, pose: Pose) -> bool:
+        """Whether :meth:`draw` may give a pose (7,), but for rounding."""
+        w, x, y, z = pose[3:]
+        turn = (math.degrees(2 * math.atan2(z, w)) + 180) % 360 - 180
+        upright = math.hypot(x, y) < 1e-6 and abs(turn) < self.yaw + 1e-6
+        return self.surrounds(pose) and upright
+
+    def surrounds(self, pose: Pose) -> bool:
+        """Whether a pose is between the corners, however turned, but for rounding."""
+        low, high = np.subtract(self.lowest, 1e-9), np.add(self.highest, 1e-9)
+        return bool(np.all((low <= pose[:3]) & (pose[:3] <= high)))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import ClassVar
 
 import mujoco
@@ -17,25 +16,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_env_bimanual.robot_scene import PALM
+from lerobot_env_bimanual.bottle.measures import Figure
+from lerobot_env_bimanual.robot_scene import BOX, PALM, add_geom
 from lerobot_env_bimanual.suite.names import SUITE
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene, add_thing
 from lerobot_env_bimanual.suite.task import (
+    Box,
     Judge,
     Leg,
     Pose,
     Style,
     SuiteTask,
+    moved,
+    seen,
+    vector,
 )
-from tpgmm_datasets.bottle.skill import attached
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-    quaternions,
-)
+from tpgmm_datasets.bottle.skill import HANDS, attached
+from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
 __all__ = ["Wipe"]
@@ -46,8 +43,7 @@ FOOT = 0.06
 BOARD = (0.075, 0.085, 0.01)
 #: Where boards are: the box of that middle [m], and how far they are turned about the vertical
 #: and tilted to either side [deg].
-LOWEST, HIGHEST = (0.27, -0.04, 0.08), (0.32, 0.0, 0.11)
-YAW, TILT = 20.0, 15.0
+AREA, TILT = Box((0.27, -0.04, 0.08), (0.32, 0.0, 0.11), 20.0), 15.0
 #: Half the sides of the sponge on the right palm, in the hand's frame, and its stiffness at
 #: each corner [1/s^2] and damping [1/s], as MuJoCo takes them.
 SPONGE = (0.025, 0.01, 0.025)
@@ -77,36 +73,19 @@ class Wipe(SuiteTask):
     description = "steady the board with the left hand, wipe it with the right"
     objects = SUITE["wipe"]
     foot = FOOT
-    phases: ClassVar[Mapping[str, float]] = MappingProxyType(
-        {
-            "reach": 2.0,
-            "close": 1.5,
-            "press": 1.2,
-            "wipe": 6.0,
-            "lift": 1.0,
-            "away": 1.5,
-            "rest": 0.4,
-        }
-    )
-    grasp = "close"
+    phases: ClassVar = {
+        "reach": 2.0, "close": 1.5, "press": 1.2, "wipe": 6.0, "lift": 1.0, "away": 1.5,
+        "rest": 0.4,
+    }  # fmt: skip
+    grasp, box = "close", AREA
     #: Nobody carries a board that stands fast.
     holds = ()
-    limits: ClassVar[Mapping[str, tuple[float, float]]] = MappingProxyType(
-        {
-            "coverage": (0.9, math.inf),
-            "force": (4.0, 20.0),
-            "off_s": (0.0, 0.3),
-            "edge_mm": (0.0, 10.0),
-        }
-    )
-    headings: ClassVar[Mapping[str, tuple[str, int]]] = MappingProxyType(
-        {
-            "coverage": ("wiped", 2),
-            "force": ("mean force [N]", 1),
-            "off_s": ("without contact [s]", 2),
-            "edge_mm": ("left palm from the edge [mm]", 1),
-        }
-    )
+    figures: ClassVar = {
+        "coverage": Figure("wiped", 2, low=0.9),
+        "force": Figure("mean force [N]", 1, 4.0, 20.0),
+        "off_s": Figure("without contact [s]", 2, high=0.3),
+        "edge_mm": Figure("left palm from the edge [mm]", 1, high=10.0),
+    }
 
     def furnish(self, spec: mujoco.MjSpec) -> None:
         """A board on a foot, its edge, and a sponge on the right palm."""
@@ -117,83 +96,60 @@ class Wipe(SuiteTask):
             "edge": ((long, 1e-3, thick), (0.0, wide - 1e-3, -thick), 0, (0.3, 0.3, 0.3, 1)),
         }
         for name, (size, place, collides, colour) in shapes.items():
-            board.add_geom(
-                name=name,
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=size,
-                pos=place,
-                contype=0,
-                conaffinity=collides,
-                rgba=colour,
-            )
-        spec.body("r_hand").add_geom(
-            name="sponge",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=SPONGE,
-            pos=(0.0, 0.01 + SPONGE[1], 0.0),
-            mass=0.02,
-            contype=PALM,
-            conaffinity=0,
-            priority=1,
-            # it slides: with a pyramid of friction, normal forces grow with the speed
-            condim=1,
-            solref=(-STIFFNESS, -DAMPING),
-            solimp=(0.5, 0.5, 0.001, 0.5, 2.0),
-            rgba=(0.95, 0.85, 0.3, 1),
-        )
+            look = {"name": name, "pos": place, "rgba": colour}
+            add_geom(board, BOX, size, conaffinity=collides, **look)
+        place = (0.0, 0.01 + SPONGE[1], 0.0)
+        look = {"name": "sponge", "pos": place, "rgba": (0.95, 0.85, 0.3, 1)}
+        # it slides: with a pyramid of friction, normal forces grow with the speed
+        soft = {"contype": PALM, "priority": 1, "condim": 1, "solref": (-STIFFNESS, -DAMPING)}
+        impedance = (0.5, 0.5, 0.001, 0.5, 2.0)
+        add_geom(spec.body("r_hand"), BOX, SPONGE, mass=0.02, solimp=impedance, **look, **soft)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Pose]:
         """A board before the robot, turned and tilted."""
-        position = rng.uniform(LOWEST, HIGHEST)
-        largest = np.radians((TILT, TILT, YAW))
+        position = rng.uniform(AREA.lowest, AREA.highest)
+        largest = np.radians((TILT, TILT, AREA.yaw))
         roll, pitch, yaw = rng.uniform(-largest, largest)
         turn, tilt = (
-            quaternions.exp(torch.tensor(vector, dtype=torch.float64))
-            for vector in ((0.0, 0.0, yaw), (roll, pitch, 0.0))
+            quaternions.exp(vector(angles)) for angles in ((0.0, 0.0, yaw), (roll, pitch, 0.0))
         )
         return {"board": np.concatenate((position, quaternions.product(turn, tilt).numpy()))}
 
     def usual(self, pose: Pose) -> bool:
         """Whether it may have been drawn, but for rounding."""
-        inside = np.all(
-            (np.subtract(LOWEST, 1e-9) <= pose[:3]) & (pose[:3] <= np.add(HIGHEST, 1e-9))
-        )
         orientation = torch.from_numpy(np.asarray(pose[3:], dtype=np.float64))
         yaw = 2 * math.atan2(float(orientation[3]), float(orientation[0]))
-        turn = quaternions.exp(torch.tensor((0.0, 0.0, yaw), dtype=torch.float64))
+        turn = quaternions.exp(vector((0.0, 0.0, yaw)))
         tilt = quaternions.log(quaternions.product(quaternions.conjugate(turn), orientation))
-        turned = abs((math.degrees(yaw) + 180) % 360 - 180) <= YAW + 1e-6
-        return bool(inside) and turned and math.degrees(float(tilt.abs().max())) <= TILT + 1e-6
+        turned = abs((math.degrees(yaw) + 180) % 360 - 180) <= AREA.yaw + 1e-6
+        level = math.degrees(float(tilt.abs().max())) <= TILT + 1e-6
+        return AREA.surrounds(pose) and turned and level
 
     def legs(
         self, starts: Mapping[str, Frame], poses: Mapping[str, Frame], style: Style
     ) -> Mapping[str, Sequence[Leg]]:
         """Left to the edge and back; right to the board, over it in a zigzag, and back."""
         board = poses["board"]
-        aside = {hand: style.aim[:, i] for i, hand in enumerate(("l_hand", "r_hand"))}
+        left, right = style.aim.unbind(1)
         n = len(board.position)
-
-        def near(pose: Frame, hand: str) -> Frame:
-            return Frame(pose.position + aside[hand], pose.orientation)
 
         def zigzag(done: Tensor) -> Frame:
             return _on(board, _zigzag(done), -PRESS)
 
         first, last = (torch.full((n,), share, dtype=torch.float64) for share in (0.0, 1.0))
-        place = torch.tensor(BEHIND[:2], dtype=torch.float64).expand(n, 2)
-        behind = near(_on(board, place, BEHIND[2]), "r_hand")
+        behind = moved(_on(board, vector(BEHIND[:2]).expand(n, 2), BEHIND[2]), right)
         return {
             "l_hand": [
-                Leg("reach", near(_beside(board, WAIT), "l_hand"), free=True),
+                Leg("reach", moved(_beside(board, WAIT), left), free=True),
                 Leg("close", _beside(board, EDGE)),
-                Leg("away", near(_beside(board, WAIT), "l_hand"), free=True),
+                Leg("away", moved(_beside(board, WAIT), left), free=True),
             ],
             "r_hand": [
                 Leg("reach", behind, free=True),
-                Leg("close", near(_on(board, _zigzag(first), HOVER), "r_hand"), free=True),
+                Leg("close", moved(_on(board, _zigzag(first), HOVER), right), free=True),
                 Leg("press", zigzag(first)),
                 Leg("wipe", zigzag),
-                Leg("lift", near(_on(board, _zigzag(last), HOVER), "r_hand")),
+                Leg("lift", moved(_on(board, _zigzag(last), HOVER), right)),
                 Leg("away", behind, free=True),
             ],
         }
@@ -204,10 +160,7 @@ class Wipe(SuiteTask):
 
     def operators(self, orientation: bool = True, held: bool = True) -> list[Operator]:
         """Both hands seen from the board; the joints. Nothing is carried."""
-        kinds = (RelativePosition, RelativeOrientation)[: 1 + orientation]
-        return [
-            Stack(*(kind(hand, "board") for kind in kinds)) for hand in ("l_hand", "r_hand")
-        ] + [Canonical()]
+        return [*(seen(hand, "board", orientation) for hand in HANDS), Canonical()]
 
 
 def _zigzag(done: Tensor) -> Tensor:
@@ -221,7 +174,7 @@ def _zigzag(done: Tensor) -> Tensor:
 
 def _beside(board: Frame, point: tuple[float, ...]) -> Frame:
     """The left hand (n,) with its palm to the edge, at a point of the board's frame."""
-    return _turned(board, torch.tensor(point, dtype=torch.float64), (0.0, PITCH, 0.0))
+    return _turned(board, vector(point), (0.0, PITCH, 0.0))
 
 
 def _on(board: Frame, place: Tensor, height: float) -> Frame:
@@ -235,8 +188,7 @@ def _turned(board: Frame, point: Tensor, *turns: tuple[float, ...]) -> Frame:
     """A hand that is turned in the board's frame by rotation vectors, one after the other."""
     orientation = board.orientation
     for turn in turns:
-        vector = torch.tensor(turn, dtype=torch.float64)
-        orientation = quaternions.product(orientation, quaternions.exp(vector))
+        orientation = quaternions.product(orientation, quaternions.exp(vector(turn)))
     return attached(Frame(board.transform(point), orientation), (0.0, 0.0, 0.0))
 
 

@@ -19,8 +19,7 @@ COLUMNS = ["env", "policy", "demonstrations", "training_seed", "condition", "eva
 
 def criterion(benchmark: Benchmark, key: str) -> str:
     """A figure and the bounds between which it lies in a success."""
-    heading, _ = benchmark.figures.get(key, (key, 0))
-    low, high = benchmark.criteria[key]
+    heading, _, low, high = benchmark.figures[key]
     if low == high:
         return f"{heading} = {low:g}"
     if not math.isfinite(high):
@@ -38,8 +37,8 @@ def missed(episode: Mapping[str, Any], benchmark: Benchmark) -> list[str]:
     """
     return [
         key
-        for key, (low, high) in benchmark.criteria.items()
-        if not low <= episode.get(key, math.nan) <= high
+        for key, figure in benchmark.criteria.items()
+        if not figure.low <= episode.get(key, math.nan) <= figure.high
     ]
 
 
@@ -70,8 +69,8 @@ def failed_episodes(
         ]
         if not benchmark.criteria:
             texts = [
-                f"{heading}: {row[key]:.3g}"
-                for key, (heading, _) in benchmark.figures.items()
+                f"{figure.heading}: {row[key]:.3g}"
+                for key, figure in benchmark.figures.items()
                 if key in row
             ]
         told = "; ".join(texts) or "all of them are met, but not in time"

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib import rc_context
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Sheet
 from matplotlib.ticker import PercentFormatter
 
+from lerobot_env_bimanual.bottle.measures import Figure
 from tpgmm_evaluation.jobs import POLICIES
 from tpgmm_evaluation.report.panels import (
     add_legend,
@@ -99,7 +100,7 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
     heights = [len(table) for table in rates.values()]
     conditions = list(next(iter(rates.values())).columns)
     size = (max(4.0, 0.36 * len(conditions) + 2.2), 0.3 * sum(heights) + 0.4 * len(rates) + 1.2)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Sheet(figsize=size, layout="constrained")
     panels = figure.subplots(
         len(rates), 1, squeeze=False, sharex=True, height_ratios=[h + 0.5 for h in heights]
     )[:, 0]
@@ -122,14 +123,12 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
 @rc_context(STYLE)
 def draw_errors(
     episodes: pd.DataFrame,
-    figures: Mapping[str, tuple[str, int]],
-    criteria: Mapping[str, tuple[float, float]],
+    figures: Mapping[str, Figure],
     path: Path,
 ) -> None:
     """Median and quartiles of each figure over the number of demonstrations.
 
-    All episodes are of one condition; ``figures`` and ``criteria`` as in :class:`Benchmark`.
-    ``path`` has no suffix.
+    All episodes are of one condition; ``path`` has no suffix.
     """
     shown = [key for key in figures if key in episodes]
     figure, grid = panels_for(len(shown))
@@ -144,11 +143,11 @@ def draw_errors(
             # no bar where a quartile is infinite
             gaps = np.array((middle - low, high - middle))
             axes.errorbar(x, middle, yerr=gaps, capsize=1.5, elinewidth=0.8, **look)
-        for bound in criteria.get(key, ()):
+        for bound in figures[key][2:]:
             if 0 < bound < np.inf:
                 axes.axhline(bound, color="0.3", linestyle=":", linewidth=1)
         over_demonstrations(axes, episodes)
-        axes.set_title(figures[key][0], fontsize="medium")
+        axes.set_title(figures[key].heading, fontsize="medium")
         positive = episodes[key][episodes[key] > 0]
         if len(positive) and positive.max() > 30 * positive.median():
             axes.set_yscale("log")
@@ -170,7 +169,7 @@ def draw_curves(trainings: Iterable[Mapping[str, Any]], path: Path) -> None:
     trainings = list(trainings)
     policies = list(dict.fromkeys(item["policy"] for item in trainings))
     counts = sorted({item["demonstrations"] for item in trainings})
-    figure = Figure(figsize=(2.2 * len(policies) + 1.2, 4.4), layout="constrained")
+    figure = Sheet(figsize=(2.2 * len(policies) + 1.2, 4.4), layout="constrained")
     grid = figure.subplots(2, len(policies), squeeze=False, sharey="row")
     for item in trainings:
         column = policies.index(item["policy"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,59 +12,13 @@ import pandas as pd
 
 from lerobot_env_bimanual.disturbances import NOMINAL, parse_condition
 from tpgmm_evaluation.cells import Cell
-from tpgmm_evaluation.jobs import POLICIES
-from tpgmm_evaluation.report import markdown
+from tpgmm_evaluation.report import pages
 from tpgmm_evaluation.report.failures import criterion, evaluation_command
-from tpgmm_evaluation.report.figures import (
-    draw_curves,
-    draw_errors,
-    draw_success,
-)
-from tpgmm_evaluation.report.tables import (
-    cell_table,
-    demonstration_table,
-    episode_table,
-    wilson,
-)
+from tpgmm_evaluation.report.figures import draw_curves, draw_errors, draw_success
+from tpgmm_evaluation.report.tables import cell_table, demonstration_table, episode_table
 from tpgmm_evaluation.settings import Settings
-from tpgmm_evaluation.variants import EVEN_CLOCK, OPEN_LOOP, Variant
-from tpgmm_torch.atomic import replacing
 
-__all__ = ["ordered", "write_report"]
-
-#: What each policy is, in the order of the report.
-DESCRIPTIONS = {
-    "tpgmm": "task-parameterised Gaussian mixture: the hands' poses seen from the objects, "
-    "and the joints",
-    OPEN_LOOP: "the same, played by the clock with what is seen at the start, as in 0.1.0",
-    EVEN_CLOCK: "the same, watching the scene, but by the clock, wherever the robot is",
-    "tpgmm-places": "the same, learned and played with all objects as places: where they were "
-    "at the beginning, whoever holds them later",
-    "tpgmm-position-only": "the same without the orientation of the hands",
-    "tpgmm-no-joints": "the same without the joints as a subspace: the hands' poses alone",
-    "tpgmm-auto": "the same with the subspaces chosen by itself, operators='auto'",
-    "key-poses": "inverse kinematics to the hands' key poses, each seen from where "
-    "demonstrations differ least, along minimum-jerk paths with the mean timing",
-    "key-poses-posture": "the same with the mean demonstrated posture in the null space",
-    "dmp": "dynamical movement primitives of the joints, one for each move, whose goals are "
-    "the key poses by inverse kinematics",
-    "promp": "a probabilistic movement primitive of the joints, conditioned on the present "
-    "posture and on the key poses by inverse kinematics",
-    "act": "LeRobot's Action Chunking Transformer on joints and object poses",
-    "act-phase": "the same, informed of the time and learning from episodes on a common clock",
-    "act-large": "it again, with LeRobot's own sizes: forty million weights",
-    "act-large-phase": "the same, informed of the time and learning from episodes on a common "
-    "clock",
-    "diffusion": "LeRobot's Diffusion Policy on joints and object poses",
-    "diffusion-phase": "the same, informed of the time and learning from episodes on a common "
-    "clock",
-    "mlp": "a perceptron on joints and object poses, which predicts the next actions",
-    "mlp-phase": "the same, informed of the time and learning from episodes on a common clock",
-    "knn": "nearest-neighbour regression on joints and object poses to the next actions",
-    "knn-phase": "the same, informed of the time and learning from episodes on a common clock",
-    "nearest": "replays the demonstration whose objects stood nearest: the naive floor",
-    "mean": "replays the mean of the aligned demonstrations, wherever the objects are",
-}
+__all__ = ["write_report"]
 
 
 def write_report(
@@ -94,13 +48,8 @@ def write_report(
     if results:
         cells, episodes = cell_table(results), episode_table(results)
         paragraphs += _Sections(out, settings, results, cells, episodes)
-    if failures:
-        reasons = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
-        paragraphs += ["## Cells that failed", "\n".join(reasons)]
-    path = out / "report.md"
-    with replacing(path) as file:
-        file.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
-    return path
+    paragraphs += pages.failed_cells("Cells that failed", failures)
+    return pages.write_page(out / "report.md", paragraphs)
 
 
 class _Sections:
@@ -128,7 +77,7 @@ class _Sections:
         self.cells, self.episodes = cells, episodes
         self.nominal = episodes[episodes.condition == NOMINAL]
         self.benchmark = settings.benchmark()
-        self.policies = ordered(cells.policy)
+        self.policies = pages.ordered(cells.policy)
         self.counts = sorted(set(cells.demonstrations))
         self.trainings = {
             (r["cell"]["policy"], r["cell"]["demonstrations"], r["cell"]["seed"]): r["training"]
@@ -144,20 +93,20 @@ class _Sections:
         yield from self._conditions()
         yield from self._baselines()
         yield from self._recipes()
-        yield from self._cost()
+        yield from pages.cost_table(self.cells)
         yield "## What to keep in mind"
-        yield "\n".join(f"- {text}" for text in self._remarks())
+        yield pages.bullets(self._remarks())
         yield from self._settings()
 
     def _introduction(self) -> Iterator[str]:
-        seeds, counts = self.settings.seeds, markdown.listed(self.counts)
+        seeds, counts = self.settings.seeds, pages.listed(self.counts)
         yield (
             f"Every policy learned from the same first {counts} recorded episodes of "
             f"`{self.benchmark.env}` ({self._drawn()}) and was rolled out, through LeRobot's "
             f"own rollout, in the same {len(seeds)} situations that no episode shows (seeds "
             f"{seeds[0]} to {seeds[-1]})."
         )
-        yield "\n".join(f"- **{name}**: {_description(name)}" for name in self.policies)
+        yield pages.bullets(f"**{name}**: {pages.described(name)}" for name in self.policies)
 
     def _drawn(self) -> str:
         """Which demonstrations they are."""
@@ -169,16 +118,10 @@ class _Sections:
     def _success(self) -> Iterator[str]:
         yield "## Success"
         yield "Successful episodes, and the 95 % interval of their share (Wilson)."
-        # policies down, numbers of demonstrations across
-        yield markdown.table(
-            ["policy", *(f"{count} demonstrations" for count in self.counts)],
-            [
-                [policy, *(markdown.rate(rows[rows.demonstrations == n]) for n in self.counts)]
-                for policy, rows in self._by_policy(self.nominal)
-            ],
-        )
+        head = ["policy", *(f"{count} demonstrations" for count in self.counts)]
+        yield pages.table(head, pages.success_rows(self.nominal, self.counts))
         if self.nominal.policy.nunique() > 1:
-            draw_success(self.nominal, self._picture("success_nominal"))
+            draw_success(self.nominal, pages.picture(self.out, "success_nominal"))
             yield "![Success over demonstrations](figures/success_nominal.webp)"
 
     def _conditions(self) -> Iterator[str]:
@@ -195,20 +138,16 @@ class _Sections:
             "95th percentile of the figures over the episodes. Every condition has the same "
             "situations; the moments of what goes wrong are drawn from the episode's seed."
         )
-        yield "\n".join(f"- `{name}`: {self._described(name)}" for name in conditions)
-        figures = {k: v for k, v in self.benchmark.figures.items() if k in self.episodes}
-        headings = ["condition", "policy", "success", *(name for name, _ in figures.values())]
+        yield pages.bullets(f"`{name}`: {self._described(name)}" for name in conditions)
+        figures = pages.known(self.benchmark.figures, self.episodes)
         for count, part in self.episodes.groupby("demonstrations"):
             yield f"From {count} demonstrations:"
-            table = []
-            for condition in conditions:
-                chosen = part[part.condition == condition]
-                for policy, rows in self._by_policy(chosen):
-                    spreads = [
-                        markdown.spread(rows[k], digits) for k, (_, digits) in figures.items()
-                    ]
-                    table.append([condition, policy, markdown.rate(rows), *spreads])
-            yield markdown.table(headings, table)
+            groups = (
+                ([condition, policy, pages.rate(rows)], rows)
+                for condition in conditions
+                for policy, rows in pages.by_policy(part[part.condition == condition])
+            )
+            yield pages.figure_table(["condition", "policy", "success"], groups, figures)
 
     def _described(self, condition: str) -> str:
         """What goes wrong, in the words of those who make it go wrong."""
@@ -232,27 +171,24 @@ class _Sections:
         yield "## What succeeds and what fails"
         yield f"Share of the episodes that meet each criterion, {most} demonstrations."
         table = []
-        for policy, rows in self._by_policy(self.nominal[self.nominal.demonstrations == most]):
-            met = [rows[key].between(*bounds).mean() for key, bounds in criteria.items()]
+        for policy, rows in pages.by_policy(self.nominal[self.nominal.demonstrations == most]):
+            met = (rows[key].between(f.low, f.high).mean() for key, f in criteria.items())
             table.append([policy, *(f"{100 * share:.0f} %" for share in met)])
-        yield markdown.table(
+        yield pages.table(
             ["policy", *(criterion(self.benchmark, key) for key in criteria)], table
         )
 
     def _errors(self) -> Iterator[str]:
-        figures = {k: v for k, v in self.benchmark.figures.items() if k in self.nominal}
+        figures = pages.known(self.benchmark.figures, self.nominal)
         yield "## Errors"
         yield "Median / 95th percentile over the episodes, nominal condition."
-        table = []
-        for count, part in self.nominal.groupby("demonstrations"):
-            for policy, rows in self._by_policy(part):
-                spreads = [
-                    markdown.spread(rows[key], digits) for key, (_, digits) in figures.items()
-                ]
-                table.append([count, policy, *spreads])
-        headings = (heading for heading, _ in figures.values())
-        yield markdown.table(["demonstrations", "policy", *headings], table)
-        draw_errors(self.nominal, figures, self.benchmark.criteria, self._picture("errors"))
+        groups = (
+            ([count, policy], rows)
+            for count, part in self.nominal.groupby("demonstrations")
+            for policy, rows in pages.by_policy(part)
+        )
+        yield pages.figure_table(["demonstrations", "policy"], groups, figures)
+        draw_errors(self.nominal, figures, pages.picture(self.out, "errors"))
         yield "Dotted: what a success allows."
         yield "![Median and quartiles of the errors](figures/errors.webp)"
 
@@ -280,61 +216,23 @@ class _Sections:
             steps, at = curve[-1]["step"], best["step"]
             rows.append([*key, steps, f"{minutes:.1f}", f"{error:.2f}", at, item["outcome"]])
         columns = ("steps", "minutes", "least error [mrad]", "at step", "why it ended")
-        yield markdown.table(["policy", "demonstrations", "seed", *columns], rows)
+        yield pages.table(["policy", "demonstrations", "seed", *columns], rows)
         draw_curves(
             [
                 {"policy": p, "demonstrations": n, "seed": s, "curve": item["curve"]}
                 for (p, n, s), item in trained.items()
             ],
-            self._picture("learning_curves"),
+            pages.picture(self.out, "learning_curves"),
         )
         yield "![Learning curves](figures/learning_curves.webp)"
 
     def _recipes(self) -> Iterator[str]:
         """Everything that was chosen for a policy, and what it found in the demonstrations."""
         recipes = {p: item["recipe"] for (p, _, _), item in self.trainings.items()}
-        told = [f"- {p}: `{json.dumps(recipes[p])}`" for p in self.policies if recipes.get(p)]
+        told = [f"{p}: `{json.dumps(recipes[p])}`" for p in self.policies if recipes.get(p)]
         if told:
             yield "## Recipes"
-            yield "\n".join(told)
-
-    def _cost(self) -> Iterator[str]:
-        yield "## What it costs"
-        yield (
-            "With the most demonstrations. An action is everything from the raw observation to "
-            "the joint references for one robot, on one thread; policies that predict chunks "
-            "compute one every so many steps and take its actions from memory in between."
-        )
-        columns = (
-            "policy",
-            "training [s]",
-            "parameters",
-            "on disk [MB]",
-            "rate [Hz]",
-            "step, median / 99 % [ms]",
-            "steps per chunk",
-            "chunk, median / 99 % [ms]",
-            "evaluation, CPU [s/episode]",
-        )
-        rows = self.cells.sort_values("demonstrations").groupby("policy").tail(1)
-        yield markdown.table(
-            columns,
-            [
-                [
-                    row.policy,
-                    f"{row.training_seconds:.0f}",
-                    f"{row.parameters:,}".replace(",", " "),
-                    f"{row.bytes / 1e6:.1f}",
-                    row.fps,
-                    f"{row.step_median_ms:.2f} / {row.step_p99_ms:.2f}",
-                    f"{row.chunk_size:.0f}",
-                    f"{row.chunk_median_ms:.2f} / {row.chunk_p99_ms:.2f}",
-                    f"{row.evaluation_cpu_seconds / row.episodes:.2f}",
-                ]
-                for _, part in self._by_policy(rows)
-                for row in part.itertuples()
-            ],
-        )
+            yield pages.bullets(told)
 
     def _remarks(self) -> Iterator[str]:
         """What the data say about themselves."""
@@ -343,12 +241,7 @@ class _Sections:
                 f"By the environment's own criteria {row.succeed} of {row.tried} attempts at "
                 f"demonstrations of seed {row.seed} succeed; the others are not learned from."
             )
-        trials = self.settings.episodes
-        low, high = wilson(trials // 2, trials)
-        yield (
-            f"With {trials} episodes a rate around one half is known to "
-            f"{50 * (high - low):.0f} percentage points, either way."
-        )
+        yield pages.uncertainty(self.settings.episodes)
         seeds = self.cells.seed.nunique()
         if seeds == 1:
             yield (
@@ -375,7 +268,7 @@ class _Sections:
         processors = {result["machine"]["processors"] for result in self.results}
         yield (
             "Latencies were measured while other cells ran beside, on a machine of "
-            f"{markdown.listed(processors)} processors; compare them with one another, not "
+            f"{pages.listed(processors)} processors; compare them with one another, not "
             "with a robot's computer."
         )
 
@@ -383,11 +276,11 @@ class _Sections:
         yield "## Settings"
         settings = asdict(self.settings)
         rows = [[key.replace("_", " "), f"`{json.dumps(v)}`"] for key, v in settings.items()]
-        rows.append(["training seeds", markdown.listed(set(self.cells.seed))])
+        rows.append(["training seeds", pages.listed(set(self.cells.seed))])
         for name in ("versions", "machine"):
             distinct = sorted({json.dumps(item[name]) for item in self.results})
             rows += [[name, f"`{text}`"] for text in distinct]
-        yield markdown.table(["setting", "value"], rows)
+        yield pages.table(["setting", "value"], rows)
         yield (
             "`policies/` holds what was trained; all but `nearest` run in LeRobot's own "
             "evaluation, at the rate of the table above:"
@@ -396,40 +289,7 @@ class _Sections:
         command = evaluation_command(
             self.settings, NOMINAL, "policies/NAME", "RATE", first, trials
         )
-        yield f"```\n{command}\n```"
-
-    def _by_policy(self, table: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
-        """The rows of each policy that has some, in the order of the report."""
-        for policy in self.policies:
-            rows = table[table.policy == policy]
-            if len(rows):
-                yield policy, rows
-
-    def _picture(self, name: str) -> Path:
-        folder = self.out / "figures"
-        folder.mkdir(exist_ok=True)
-        return folder / name
-
-
-def ordered(policies: Iterable[str]) -> list[str]:
-    """Each policy once, in the order of the report."""
-    return sorted(set(policies), key=_place)
-
-
-def _place(policy: str) -> tuple[int, str]:
-    """The order of the report: variants behind what they vary."""
-    names = [*DESCRIPTIONS, *(name for name in POLICIES if name not in DESCRIPTIONS)]
-    base = policy if policy in names else Variant.parse(policy).base
-    return names.index(base), "" if policy in names else policy
-
-
-def _description(policy: str) -> str:
-    if policy in DESCRIPTIONS:
-        return DESCRIPTIONS[policy]
-    variant = Variant.parse(policy)
-    if not variant.overrides:
-        return f"`{policy}`"
-    return f"{variant.base} with {', '.join(f'`{item}`' for item in variant.overrides)}"
+        yield pages.block([command])
 
 
 def _late_gain(curve: Sequence[Mapping[str, float]]) -> float:

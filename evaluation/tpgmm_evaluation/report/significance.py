@@ -12,7 +12,9 @@ from scipy.stats import binomtest, wilcoxon
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["LEVEL", "REFERENCE", "holm", "mcnemar", "over_tasks", "paired", "verdict"]
+__all__ = [
+    "LEVEL", "PAIR", "PLACE", "REFERENCE", "holm", "mcnemar", "over_tasks", "paired", "verdict",
+]  # fmt: skip
 
 #: The policy with which the others are compared.
 REFERENCE = "tpgmm"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ import pandas as pd
 
 from lerobot_env_bimanual.disturbances import NOMINAL
 from tpgmm_evaluation.cells import Cell
-from tpgmm_evaluation.report import markdown
+from tpgmm_evaluation.report import pages
 from tpgmm_evaluation.report.failures import (
     criterion,
     evaluation_command,
@@ -19,10 +20,11 @@ from tpgmm_evaluation.report.failures import (
     missed,
 )
 from tpgmm_evaluation.report.figures import draw_conditions, draw_success
-from tpgmm_evaluation.report.report import ordered, write_report
+from tpgmm_evaluation.report.report import write_report
 from tpgmm_evaluation.report.significance import (
     LEVEL,
     PAIR,
+    PLACE,
     REFERENCE,
     paired,
 )
@@ -95,16 +97,11 @@ def write_summary(
     paragraphs = ["# What demonstrations buy"]
     if any(task.results for task in tasks):
         paragraphs += _Summary(out, [task for task in tasks if task.results])
-    if failures:
-        reasons = [f"- `{cell.key}`: {reason}" for cell, reason in failures.items()]
-        paragraphs += ["## Cells that could not be run", "\n".join(reasons)]
+    paragraphs += pages.failed_cells("Cells that could not be run", failures)
     commands = _commands(out / "commands.txt", command)
     if commands:
-        paragraphs += ["## Commands", "\n".join(("```", *commands, "```"))]
-    path = out / "report.md"
-    with replacing(path) as file:
-        file.write_text("\n\n".join(paragraphs) + "\n", encoding="utf-8")
-    return path
+        paragraphs += ["## Commands", pages.block(commands)]
+    return pages.write_page(out / "report.md", paragraphs)
 
 
 def _commands(path: Path, command: str) -> list[str]:
@@ -163,7 +160,7 @@ class _Summary:
         results = [result for task in tasks for result in task.results]
         self.cells, self.episodes = cell_table(results), episode_table(results)
         self.nominal = self.episodes[self.episodes.condition == NOMINAL]
-        self.policies = ordered(self.cells.policy)
+        self.policies = pages.ordered(self.cells.policy)
         self.counts = sorted(set(self.cells.demonstrations))
         self.comparisons = paired(self.episodes)
         ours = self.episodes[self.episodes.policy == REFERENCE]
@@ -188,10 +185,10 @@ class _Summary:
         yield from self._success()
         yield from self._conditions()
         yield from self._errors()
-        yield from self._cost()
+        yield from pages.cost_table(self.cells[self.cells.condition == NOMINAL])
         yield from self._demonstrations()
         yield "## What to keep in mind"
-        yield "\n".join(f"- {text}" for text in self._remarks())
+        yield pages.bullets(self._remarks())
         yield self._files()
 
     def _introduction(self) -> str:
@@ -199,7 +196,7 @@ class _Summary:
         seeds = self.cells.seed.nunique()
         return (
             f"Tasks: {names}. Policies: {', '.join(self.policies)}. Every policy learned from "
-            f"the same {markdown.listed(self.counts)} demonstrations, in {seeds} training "
+            f"the same {pages.listed(self.counts)} demonstrations, in {seeds} training "
             f"seed{'s' * (seeds > 1)}, and was rolled out in the same situations, which no "
             "demonstration shows. Each task's page says what the policies are, and what they "
             "missed."
@@ -232,54 +229,37 @@ class _Summary:
             f"{worse} of them significantly so."
         )
         lost = lost.sort_values(["p_holm", "p"], kind="stable")
-        yield markdown.table(
+        head = ["task", "demonstrations", "condition", "other policy", REFERENCE, "other"]
+        head += [f"solved by other / {REFERENCE} alone", "seeds", "p", "p (Holm)", "verdict"]
+        rows = [
             [
-                *("task", "demonstrations", "condition", "other policy", REFERENCE, "other"),
-                f"solved by other / {REFERENCE} alone",
-                *("seeds", "p", "p (Holm)", "verdict"),
-            ],
-            [
-                [
-                    row.env,
-                    row.demonstrations,
-                    row.condition,
-                    row.policy,
-                    markdown.share(row.successes, row.pairs),
-                    markdown.share(row.other_successes, row.pairs),
-                    f"{row.only_other} / {row.only_reference}",
-                    f"{row.seeds_worse} of {row.seeds}",
-                    f"{row.p:.2g}",
-                    f"{row.p_holm:.2g}",
-                    row.verdict,
-                ]
-                for row in lost.itertuples()
-            ],
-        )
+                *(row.env, row.demonstrations, row.condition, row.policy),
+                *(pages.share(n, row.pairs) for n in (row.successes, row.other_successes)),
+                f"{row.only_other} / {row.only_reference}",
+                f"{row.seeds_worse} of {row.seeds}",
+                *(f"{row.p:.2g}", f"{row.p_holm:.2g}", row.verdict),
+            ]
+            for row in lost.itertuples()
+        ]
+        yield pages.table(head, rows)
         yield f"What {REFERENCE} missed in the episodes that the other policy alone solves:"
-        yield "\n".join(f"- {self._reason(row)}" for row in lost.itertuples())
+        yield pages.bullets(map(self._reason, lost.itertuples()))
 
     def _reason(self, row: Any) -> str:
         """Which criteria decided a lost comparison."""
-        episodes, benchmark = self.episodes, self.benchmarks[row.env]
-        place = (
-            (episodes.env == row.env)
-            & (episodes.demonstrations == row.demonstrations)
-            & (episodes.condition == row.condition)
-        )
-        ours = episodes[place & (episodes.policy == REFERENCE) & ~episodes.success.astype(bool)]
-        theirs = episodes[
-            place & (episodes.policy == row.policy) & episodes.success.astype(bool)
-        ]
+        benchmark, episodes = self.benchmarks[row.env], self.episodes
+        place = (episodes[PLACE] == [getattr(row, key) for key in PLACE]).all(axis=1)
+        solved = episodes.success.astype(bool)
+        ours = episodes[place & (episodes.policy == REFERENCE) & ~solved]
+        theirs = episodes[place & (episodes.policy == row.policy) & solved]
         both = ours.merge(theirs[PAIR], on=PAIR)
-        counts: dict[str, int] = {}
-        for episode in both.to_dict("records"):
-            for key in missed(episode, benchmark):
-                counts[key] = counts.get(key, 0) + 1
+        counts = Counter(
+            key for episode in both.to_dict("records") for key in missed(episode, benchmark)
+        )
         told = [
-            f"{criterion(benchmark, key)} in {count}"
-            for key, count in sorted(counts.items(), key=lambda item: -item[1])
+            f"{criterion(benchmark, key)} in {count}" for key, count in counts.most_common()
         ]
-        seeds = markdown.listed(set(both.evaluation_seed))
+        seeds = pages.listed(set(both.evaluation_seed))
         where = "" if row.condition == NOMINAL else f", {row.condition}"
         return (
             f"{row.env}, {row.demonstrations} demonstrations{where}, {row.policy}: "
@@ -299,27 +279,10 @@ class _Summary:
             f"{len(self.failed)} of {trials}; {shown} of them here, all in `failures.csv`. In "
             "brackets what came of it."
         )
-        yield markdown.table(
-            [
-                "task",
-                "demonstrations",
-                "training seed",
-                "condition",
-                "evaluation seed",
-                "missed",
-            ],
-            [
-                [
-                    row.env,
-                    row.demonstrations,
-                    row.training_seed,
-                    row.condition,
-                    row.evaluation_seed,
-                    row.missed,
-                ]
-                for row in self.failed.head(SHOWN).itertuples()
-            ],
-        )
+        head = ("task", "demonstrations", "training seed", "condition", "evaluation seed")
+        keys = ["env", "demonstrations", "training_seed", "condition", "evaluation_seed"]
+        rows = self.failed.head(SHOWN)[[*keys, "missed"]].itertuples(index=False)
+        yield pages.table([*head, "missed"], rows)
         yield "The first of each task and condition again, in the folder of this report:"
         commands = []
         for row in self.failed.drop_duplicates(["env", "condition"]).itertuples():
@@ -332,7 +295,7 @@ class _Summary:
                     settings, row.condition, directory, rate.iloc[0], row.evaluation_seed, 1
                 )
             )
-        yield "\n".join(("```", *commands, "```"))
+        yield pages.block(commands)
 
     def _statements(self) -> Iterator[str]:
         """Better, level or worse than the strongest of the others."""
@@ -345,41 +308,31 @@ class _Summary:
             "Without disturbances. Which of the others is best is seen afterwards, which the "
             "correction allows for: it counts the comparisons with all of them."
         )
-        rows = []
-        for env in self.tasks:
-            line = []
-            for count in self.counts:
-                found = best[(best.env == env) & (best.demonstrations == count)]
-                line.append(_statement(found.iloc[0]) if len(found) else "-")
-            rows.append([env, *line])
-        yield markdown.table(["task", *(f"{n} demonstrations" for n in self.counts)], rows)
-        told = []
-        for count in self.counts:
-            verdicts = best[best.demonstrations == count].verdict
-            if len(verdicts):
-                told.append(
-                    f"- From {count} demonstrations {REFERENCE} is significantly better than "
-                    f"the best of the others on {(verdicts == 'better').sum()} of "
-                    f"{len(verdicts)} tasks, significantly worse on "
-                    f"{(verdicts == 'worse').sum()}."
-                )
-        yield "\n".join(told)
+        told = {(row.env, row.demonstrations): _statement(row) for row in best.itertuples()}
+        rows = [[env, *(told.get((env, n), "-") for n in self.counts)] for env in self.tasks]
+        yield pages.table(["task", *self._headings()], rows)
+        yield pages.bullets(
+            f"From {count} demonstrations {REFERENCE} is significantly better than the best of "
+            f"the others on {(verdicts == 'better').sum()} of {len(verdicts)} tasks, "
+            f"significantly worse on {(verdicts == 'worse').sum()}."
+            for count, verdicts in best.groupby("demonstrations").verdict
+        )
+
+    def _headings(self) -> list[str]:
+        return [f"{count} demonstrations" for count in self.counts]
 
     def _success(self) -> Iterator[str]:
         if self.nominal.empty:
             return
         yield "## Success"
         yield "Successful episodes, and the 95 % interval of their share (Wilson)."
-        headings = [f"{count} demonstrations" for count in self.counts]
-        rows: list[list[object]] = []
-        for env in self.tasks:
-            part = self.nominal[self.nominal.env == env]
-            for policy in ordered(part.policy):
-                chosen = part[part.policy == policy]
-                by_count = [chosen[chosen.demonstrations == count] for count in self.counts]
-                rows.append([env, policy, *map(markdown.rate, by_count)])
-        yield markdown.table(["task", "policy", *headings], rows)
-        draw_success(self.nominal, self._picture("success"))
+        rows = [
+            [env, *row]
+            for env in self.tasks
+            for row in pages.success_rows(self.nominal[self.nominal.env == env], self.counts)
+        ]
+        yield pages.table(["task", "policy", *self._headings()], rows)
+        draw_success(self.nominal, pages.picture(self.out, "success"))
         yield ("![Success over demonstrations, a panel for each task](figures/success.webp)")
         yield "Small dots: the training seeds, each with demonstrations of its own."
         yield from self._means()
@@ -390,21 +343,16 @@ class _Summary:
             return
         yield "Mean of the tasks, its lowest, and on how many it has 95 % or more:"
         rates = self.nominal.groupby(["policy", "demonstrations", "env"]).success.mean()
-        rows: list[list[object]] = []
-        for policy in ordered(self.nominal.policy):
-            line = []
-            for count in self.counts:
-                key = (policy, count)
-                if key not in rates.index.droplevel("env"):
-                    line.append("-")
-                    continue
-                part = rates.loc[key]
-                line.append(
-                    f"{100 * part.mean():.0f} % ({100 * part.min():.0f} %; "
-                    f"{(part >= 0.95).sum()} of {len(part)})"
-                )
-            rows.append([policy, *line])
-        yield markdown.table(["policy", *(f"{n} demonstrations" for n in self.counts)], rows)
+        told = {
+            place: f"{100 * part.mean():.0f} % ({100 * part.min():.0f} %; "
+            f"{(part >= 0.95).sum()} of {len(part)})"
+            for place, part in rates.groupby(["policy", "demonstrations"])
+        }
+        rows = [
+            [policy, *(told.get((policy, count), "-") for count in self.counts)]
+            for policy in pages.ordered(self.nominal.policy)
+        ]
+        yield pages.table(["policy", *self._headings()], rows)
 
     def _conditions(self) -> Iterator[str]:
         """Where something goes wrong, with the most demonstrations that it was tried with."""
@@ -414,7 +362,7 @@ class _Summary:
         most = disturbed.demonstrations.max()
         part = self.episodes[self.episodes.demonstrations == most]
         disturbed = disturbed[disturbed.demonstrations == most]
-        policies = ordered(disturbed.policy)
+        policies = pages.ordered(disturbed.policy)
         known = [c for b in self.benchmarks.values() for c in b.all_conditions]
         found = set(part.condition)
         conditions = [name for name in dict.fromkeys(known) if name in found]
@@ -434,12 +382,12 @@ class _Summary:
             for env in envs:
                 cells = [_count(grid, env, condition) for condition in conditions]
                 theirs = disturbed[(disturbed.policy == policy) & (disturbed.env == env)]
-                rows.append([env, *cells, markdown.rate(theirs)])
+                rows.append([env, *cells, pages.rate(theirs)])
             yield f"{policy}:"
-            yield markdown.table(["task", *conditions, "disturbed"], rows)
+            yield pages.table(["task", *conditions, "disturbed"], rows)
             shares = chosen.pivot_table(values="success", index="env", columns="condition")
             maps[policy] = shares.astype(float).reindex(index=envs, columns=conditions)
-        draw_conditions(dict(list(maps.items())[:MAPS]), self._picture("conditions"))
+        draw_conditions(dict(list(maps.items())[:MAPS]), pages.picture(self.out, "conditions"))
         yield "![Success in percent, by task and condition](figures/conditions.webp)"
 
     def _errors(self) -> Iterator[str]:
@@ -455,49 +403,17 @@ class _Summary:
         for env, benchmark in self.benchmarks.items():
             # figures that only other tasks have are all NaN here
             part = self.nominal[self.nominal.env == env].dropna(axis=1, how="all")
-            figures = {k: v for k, v in benchmark.figures.items() if k in part}
             rivals = best[(best.env == env) & (best.condition == NOMINAL)]
-            rows: list[list[object]] = []
-            for count, chosen in part.groupby("demonstrations"):
-                rival = rivals.policy[rivals.demonstrations == count]
-                for policy in (REFERENCE, *rival):
-                    episodes = chosen[chosen.policy == policy]
-                    if len(episodes):
-                        spreads = [
-                            markdown.spread(episodes[key], digits)
-                            for key, (_, digits) in figures.items()
-                        ]
-                        rows.append([count, policy, *spreads])
-            if rows:
+            groups = [
+                ((count, policy), chosen[chosen.policy == policy])
+                for count, chosen in part.groupby("demonstrations")
+                for policy in (REFERENCE, *rivals.policy[rivals.demonstrations == count])
+                if policy in set(chosen.policy)
+            ]
+            if groups:
                 yield f"{env}:"
-                headings = (heading for heading, _ in figures.values())
-                yield markdown.table(["demonstrations", "policy", *headings], rows)
-
-    def _cost(self) -> Iterator[str]:
-        yield "## What it costs"
-        yield (
-            "Medians over the tasks, with the most demonstrations of each; in brackets the "
-            "smallest and the largest. An action is everything from the raw observation to the "
-            "joint references for one robot, on one thread, median and 99th percentile."
-        )
-        cells = self.cells[self.cells.condition == NOMINAL]
-        most = cells.groupby(["env", "policy"]).demonstrations.transform("max")
-        cells = cells[cells.demonstrations == most]
-        cells = cells.assign(per_episode=cells.evaluation_cpu_seconds / cells.episodes)
-        columns = {
-            "training [CPU s]": ("training_seconds", 1),
-            "parameters": ("parameters", 0),
-            "action, median [ms]": ("step_median_ms", 2),
-            "99 % [ms]": ("step_p99_ms", 2),
-            "chunk, median [ms]": ("chunk_median_ms", 2),
-            "evaluation [CPU s/episode]": ("per_episode", 2),
-        }
-        rows = []
-        for policy in ordered(cells.policy):
-            part = cells[cells.policy == policy]
-            ranges = [_range(part[key], digits) for key, digits in columns.values()]
-            rows.append([policy, *ranges])
-        yield markdown.table(["policy", *columns], rows)
+                figures = pages.known(benchmark.figures, part)
+                yield pages.figure_table(["demonstrations", "policy"], groups, figures)
 
     def _demonstrations(self) -> Iterator[str]:
         yield "## Demonstrations"
@@ -513,19 +429,14 @@ class _Summary:
                 rows.append([env, "-", "not at hand", "-"])
                 continue
             low, high = wilson(succeed, tried)
-            share = markdown.share(succeed, tried)
+            share = pages.share(succeed, tried)
             met = "yes" if succeed >= ASKED * tried else "**no**"
             text = f"{succeed}/{tried} = {share} ({100 * low:.0f} to {100 * high:.0f} %)"
-            rows.append([env, markdown.listed(table.seed), text, met])
-        yield markdown.table(["task", "seeds", "succeed", "as asked"], rows)
+            rows.append([env, pages.listed(table.seed), text, met])
+        yield pages.table(["task", "seeds", "succeed", "as asked"], rows)
 
     def _remarks(self) -> Iterator[str]:
-        trials = sorted({task.settings.episodes for task in self.tasks.values()})
-        low, high = wilson(trials[0] // 2, trials[0])
-        yield (
-            f"With {trials[0]} episodes a rate around one half is known to "
-            f"{50 * (high - low):.0f} percentage points, either way."
-        )
+        yield pages.uncertainty(min(task.settings.episodes for task in self.tasks.values()))
         fixed = [
             e for e, task in self.tasks.items() if task.settings.demonstration_seed is not None
         ]
@@ -555,21 +466,11 @@ class _Summary:
             "DIR` writes this page again from the cells."
         )
 
-    def _picture(self, name: str) -> Path:
-        folder = self.out / "figures"
-        folder.mkdir(exist_ok=True)
-        return folder / name
 
-
-def _statement(row: pd.Series[Any]) -> str:
-    ours, theirs = (
-        markdown.share(int(row[key]), int(row.pairs))
-        for key in ("successes", "other_successes")
-    )
-    told = row.verdict
-    if row.only_reference + row.only_other:
-        told += f", p = {row.p_holm:.2g}"
-    return f"{told} ({ours}; {row.policy} {theirs})"
+def _statement(row: Any) -> str:
+    ours, theirs = (pages.share(n, row.pairs) for n in (row.successes, row.other_successes))
+    tested = f", p = {row.p_holm:.2g}" if row.only_reference + row.only_other else ""
+    return f"{row.verdict}{tested} ({ours}; {row.policy} {theirs})"
 
 
 def _count(grid: pd.DataFrame, env: str, condition: str) -> str:
@@ -577,14 +478,3 @@ def _count(grid: pd.DataFrame, env: str, condition: str) -> str:
         return "-"
     row = grid.loc[(env, condition)]
     return f"{int(row['sum'])}/{int(row['count'])}"
-
-
-def _range(values: pd.Series[Any], digits: int) -> str:
-    values = values.dropna()
-    if values.empty:
-        return "-"
-    middle, low, high = (
-        f"{value:,.{digits}f}".replace(",", " ")
-        for value in (values.median(), values.min(), values.max())
-    )
-    return middle if low == high else f"{middle} ({low} to {high})"

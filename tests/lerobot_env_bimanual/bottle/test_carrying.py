@@ -63,14 +63,14 @@ def test_the_bottle_slides_is_held_and_put_down(mode):
     seen, _ = follow(env, path, 15)
     start, poses = env._start, np.array([o["environment_state"] for o in seen])
     bottle, tray = poses[:, :7], poses[:, 7:]
-    np.testing.assert_array_equal(tray, np.broadcast_to(start.tray, tray.shape))
+    np.testing.assert_array_equal(tray, np.broadcast_to(start.poses["tray"], tray.shape))
     # while the hands close it slides in its own direction, and no more while it is carried
-    forwards = Frame(start.bottle[:3], start.bottle[3:]).inverse_transform(
+    forwards = Frame(start.poses["bottle"][:3], start.poses["bottle"][3:]).inverse_transform(
         Frame(bottle[:, :3], bottle[:, 3:]).position
     )
     assert forwards[round(4.0 * FPS), 0] == pytest.approx(0, abs=1e-3)
     assert forwards[round(4.7 * FPS), 0] == pytest.approx(start.slide[0], abs=1e-3)
-    height = bottle[:, 2] - start.bottle[2]
+    height = bottle[:, 2] - start.poses["bottle"][2]
     # under position control the arms give way by 1 to 3 mm under its weight
     assert height[round(7 * FPS)] == pytest.approx(0.05, abs=3e-3)
     assert height[-1] == pytest.approx(0, abs=1e-3)
@@ -153,12 +153,12 @@ def test_situations_are_those_of_the_generator():
     env.reset(seed=7)
     [situation] = carrying().situations(1, seed=7)
     np.testing.assert_array_equal(env._start.joints, situation.joints)
-    np.testing.assert_array_equal(env._start.bottle[:3], situation.frames["bottle"].position)
+    np.testing.assert_array_equal(env._start.poses["bottle"][:3], situation.frames["bottle"].position)
     slides = []
     for seed in range(100):
         env.reset(seed=seed)
         slides.append(env._start.slide)
-        tray = env._start.tray
-        assert tray[2] == pytest.approx(env._start.bottle[2] - 0.11)
+        tray = env._start.poses["tray"]
+        assert tray[2] == pytest.approx(env._start.poses["bottle"][2] - 0.11)
     spread = np.ptp(slides, axis=0)
     assert 0.055 < spread[0] <= 0.06 and np.radians(18) < spread[1] <= np.radians(20)

@@ -105,7 +105,7 @@ def test_an_episode_starts_midway():
     observation, _ = env.reset(seed=0)
     path = nominal(env)
     assert np.abs(path[round(6.5 * FPS)] - observation["agent_pos"]).max() < 0.01
-    np.testing.assert_array_equal(observation["environment_state"], env._start.bottle)
+    np.testing.assert_array_equal(observation["environment_state"], env._start.poses["bottle"])
     assert env._scene.held and apart(env) < 1e-3
     for k in range(round(6.5 * FPS), len(path)):
         observation, *_ = env.step(path[k])
@@ -117,7 +117,7 @@ def test_a_bottle_is_moved_and_seen_where_it_is():
         env = made(Moved(seconds=seconds, moment=1.0))
         seen, _ = follow(env, 2.4)
         poses = np.array([observation["environment_state"] for observation in seen])
-        wanted = displaced(env._start.bottle, env._drawn[0].step)
+        wanted = displaced(env._start.poses["bottle"], env._drawn[0].step)
         np.testing.assert_allclose(poses[-1], wanted, atol=2e-3)
         assert skill().usual(Frame(wanted[:3], wanted[3:]))
         largest = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max()
@@ -172,7 +172,7 @@ def test_the_same_seed_is_the_same_episode_in_every_condition():
     for condition in ("nominal", "stopped-3", "moved+live", "started-midway"):
         env = BottleShakingEnv(fps=FPS, condition=condition)
         env.reset(seed=5)
-        poses.append((*env._start.bottle, *env._start.joints, env._start.mass))
+        poses.append((*env._start.poses["bottle"], *env._start.joints, env._start.mass))
         drawn = env._drawn
         env.reset(seed=6)
         env.reset(seed=5)

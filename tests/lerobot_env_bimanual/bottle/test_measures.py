@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_env_bimanual.bottle.measures import (
-    LIMITS,
+    FIGURES,
     Closing,
     find_shaking,
     successful,
@@ -111,9 +111,9 @@ def test_less_than_two_periods_are_too_short(steps):
 
 
 def test_success_needs_every_figure():
-    good = {name: high if low == 0 else low for name, (low, high) in LIMITS.items()}
+    good = {name: f.high if f.low == 0 else f.low for name, f in FIGURES.items()}
     assert successful({**good, "frequency_hz": 0.0})
-    for name, (low, high) in LIMITS.items():
-        beyond = math.nextafter(high, math.inf) if low == 0 else math.nextafter(low, 0)
+    for name, f in FIGURES.items():
+        beyond = math.nextafter(f.high, math.inf) if f.low == 0 else math.nextafter(f.low, 0)
         assert not successful({**good, name: beyond})
         assert not successful({**good, name: math.nan})

@@ -144,7 +144,7 @@ def test_a_tracked_bottle_is_seen_where_it_is():
     env._scene.data.qvel[17] = 0.3  # it slides forward
     observation, *_ = env.step(observation["agent_pos"])
     np.testing.assert_array_equal(observation["environment_state"], env._scene.bottle)
-    assert observation["environment_state"][0] > env._start.bottle[0] + 1e-3
+    assert observation["environment_state"][0] > env._start.poses["bottle"][0] + 1e-3
 
 
 def test_a_push_moves_an_arm_for_a_moment():

@@ -71,7 +71,7 @@ def test_lerobot_makes_each_task(name, robot):
     for _ in range(2):
         *_, truncated, info = envs.step(observation["agent_pos"].astype(np.float32))
     assert truncated.all() and not info["final_info"]["is_success"].any()
-    assert {*suite_task(name).limits, "peak_speed"} <= set(info["final_info"])
+    assert {*suite_task(name).figures, "peak_speed"} <= set(info["final_info"])
     envs.close()
 
 

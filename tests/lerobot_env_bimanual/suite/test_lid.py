@@ -6,7 +6,7 @@ import torch
 
 from lerobot_env_bimanual.bottle.measures import successful
 from lerobot_env_bimanual.suite.env import SuiteEnv
-from lerobot_env_bimanual.suite.lid import HIGHEST, LOWEST
+from lerobot_env_bimanual.suite.lid import AREA
 from lerobot_env_bimanual.suite.tasks import suite_task
 from tests.support.suite_expert import replay
 from tpgmm_torch import Demonstration
@@ -23,7 +23,7 @@ def shown() -> list[Demonstration]:
 def done(motion: Demonstration, joints=None) -> dict[str, float]:
     """The figures of an episode that follows a motion, or other joints in its place."""
     info = replay(SuiteEnv("lid", fps=RATE), motion, joints)
-    assert info["is_success"] == successful(info, TASK.limits)
+    assert info["is_success"] == successful(info, TASK.figures)
     return info
 
 
@@ -87,6 +87,6 @@ def test_boxes_stand_where_the_task_is_meant_for_them_and_the_seed_says_where():
     drawn = [TASK.draw(rng)["box"] for _ in range(50)]
     assert all(map(TASK.usual, drawn)) and not TASK.usual(drawn[0] + np.eye(7)[1])
     positions = np.array(drawn)[:, :3]
-    assert (np.ptp(positions, axis=0) > 0.8 * np.subtract(HIGHEST, LOWEST)).all()
+    assert (np.ptp(positions, axis=0) > 0.8 * np.subtract(AREA.highest, AREA.lowest)).all()
     again = TASK.draw(np.random.default_rng(0))["box"]
     np.testing.assert_array_equal(again, drawn[0])

@@ -33,7 +33,7 @@ def env():
 
 def failing(info):
     """The criteria that are not met."""
-    return {name for name, (low, high) in TASK.limits.items() if not low <= info[name] <= high}
+    return {name for name, f in TASK.figures.items() if not f.low <= info[name] <= f.high}
 
 
 def test_experts_pour_all_of_it(motions, env):

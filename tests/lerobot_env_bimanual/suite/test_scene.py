@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from lerobot_env_bimanual.bottle.conditions import skill
-from lerobot_env_bimanual.robot_scene import robot_spec
+from lerobot_env_bimanual.robot_scene import TABLE, add_table, robot_spec
 from lerobot_env_bimanual.suite.scene import (
     OBJECT,
-    TABLE,
     Hold,
     SuiteScene,
     add_thing,
-    table_spec,
 )
 
 LEFT = Hold("l_hand", "rod", "rod")
@@ -29,7 +27,8 @@ def at(*position):
 
 def made():
     """A thin rod, and a cube on a shelf that cannot be moved, far from the table."""
-    spec = table_spec(robot_spec())
+    spec = robot_spec()
+    add_table(spec, 0.7)
     add_thing(spec, "rod").add_geom(
         name="rod",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,

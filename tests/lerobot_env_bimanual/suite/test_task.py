@@ -14,11 +14,10 @@ from lerobot_env_bimanual.suite.task import (
     BOW,
     START,
     STRETCH,
+    Box,
     Leg,
     Style,
     hands_along,
-    stands_in,
-    upright_pose,
 )
 from lerobot_env_bimanual.suite.tasks import TASKS, suite_task
 from tests.support.suite_expert import TRIED
@@ -35,7 +34,7 @@ TOTALS = {
     "pour": 1125.6969080842707,
     "wipe": 1182.953066188302,
 }
-BOX = (0.2, -0.1, 0.1), (0.3, 0.1, 0.2), 20.0
+BOX = Box((0.2, -0.1, 0.1), (0.3, 0.1, 0.2), 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -64,9 +63,7 @@ def test_a_task_hangs_together(name, robot):
     assert task.name == name and task.objects == SUITE[name]
     assert set(task.draw(np.random.default_rng(0))) == set(task.objects)
     assert task.grasp in task.phases
-    figures = env.figures()
-    assert set(task.limits) <= set(figures) and set(task.limits) <= set(task.headings)
-    assert set(task.headings) <= set(figures)
+    assert set(task.figures) == set(env.figures())
     for hold in task.holds:
         # what is held may be a part of an object, like a lid
         assert hold.hand in HANDS and env._scene.gap(hold) > 0.02
@@ -235,8 +232,8 @@ def test_a_leg_can_be_a_way():
 
 def test_upright_poses_stand_in_their_box_and_others_do_not():
     rng = np.random.default_rng(0)
-    poses = np.array([upright_pose(rng, *BOX) for _ in range(200)])
-    assert all(stands_in(pose, *BOX) for pose in poses)
+    poses = np.array([BOX.draw(rng) for _ in range(200)])
+    assert all(BOX.contains(pose) for pose in poses)
     low, high = np.array(BOX[:2])
     assert np.all(poses[:, :3].min(0) < low + 0.1 * (high - low))
     assert np.all(poses[:, :3].max(0) > high - 0.1 * (high - low))
@@ -244,12 +241,12 @@ def test_upright_poses_stand_in_their_box_and_others_do_not():
     turn = np.degrees(2 * np.arcsin(poses[:, 6]))
     assert -20 <= turn.min() < -17 and 17 < turn.max() <= 20 and not poses[:, 4:6].any()
     pose = np.array((0.25, 0.0, 0.15, 1.0, 0.0, 0.0, 0.0))
-    assert stands_in(pose, *BOX)
-    assert stands_in(pose * ([1] * 3 + [-1] * 4), *BOX)  # the same orientation
+    assert BOX.contains(pose)
+    assert BOX.contains(pose * ([1] * 3 + [-1] * 4))  # the same orientation
     for index, value in ((0, 0.31), (1, -0.11), (2, 0.21)):
-        assert not stands_in(np.where(np.arange(7) == index, value, pose), *BOX)
+        assert not BOX.contains(np.where(np.arange(7) == index, value, pose))
     for axis, angle in ((6, 21.0), (6, -21.0), (6, 180.0), (4, 1.0), (5, 1.0)):
         turned = pose.copy()
         half = math.radians(angle) / 2
         turned[3], turned[axis] = math.cos(half), math.sin(half)
-        assert not stands_in(turned, *BOX)
+        assert not BOX.contains(turned)

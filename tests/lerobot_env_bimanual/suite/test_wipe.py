@@ -27,7 +27,7 @@ def env():
 
 def failing(info):
     """The criteria that are not met."""
-    return {name for name, (low, high) in TASK.limits.items() if not low <= info[name] <= high}
+    return {name for name, f in TASK.figures.items() if not f.low <= info[name] <= f.high}
 
 
 def shifted(board, *offset):

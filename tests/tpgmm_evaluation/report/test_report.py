@@ -44,7 +44,7 @@ def report(tmp_path_factory):
         "| 10 | act | 1.0 / inf | ",
         # training
         "| act | 5 | 0 | 600 | 0.5 | 20.00 | 400 | it stopped falling |",
-        "| act | 12 | 1 234 567 | 5.0 | 10 | 0.50 / 0.50 | 8 | 0.50 / 0.50 |",
+        "| act | 12.0 | 1 234 567 | 5.0 | 10 | 0.50 | 0.50 | 8 | 0.50 | 0.50 | ",
         # remarks
         "- The budget ended the training of act (10: the error fell by 67 %); in brackets",
         "- Each policy was trained with one seed",
