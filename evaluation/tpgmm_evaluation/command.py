@@ -6,20 +6,18 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from tpgmm_tools.cli import options
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["app"]
 
 app = typer.Typer(add_completion=False)
 
-EXAMPLES = """Examples:
-
-tpgmm compare --env suite --demonstrations 3,10 --policies quick --episodes 10 --workers 2
---out out/compare (a quick look, as 'make compare')
+EXAMPLES = """tpgmm compare --env suite --demonstrations 3,10 --policies quick --episodes 10
+--workers 2 --out out/compare (a quick look, as 'make compare')
 
 tpgmm compare --env all --demonstrations 3,10 --seeds 0,1,2 --episodes 100 --conditions all
 --budget 30 --workers 8 --out out/evidence (everything)
@@ -36,80 +34,20 @@ tpgmm compare --report-only --out out/two
 """
 
 
-@app.command(epilog=EXAMPLES)
+@options.command(app, EXAMPLES)
 def compare(
-    env: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME,...",
-            help="Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), "
-            "aloha_insertion, ... (a wrong name lists them); suite: all of the upper body; "
-            "suite-viperx: its tasks on gym-aloha's arms (lid-viperx, ...), suite-g1: on a "
-            "Unitree G1; all.",
-        ),
-    ] = "bottle_shaking",
-    policies: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME,...",
-            help="Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, "
-            "as in 0.1.0), tpgmm-even-clock, tpgmm-places (objects are where they were at "
-            "first), tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, "
-            "key-poses-posture, dmp, promp; act, act-large (LeRobot's sizes), diffusion, mlp, "
-            "knn, each also told the time, -phase; nearest, mean; all, of tpgmm with all parts "
-            "and without orientation, of act the small one; or "
-            "quick: of these, all that no gradient trains. A "
-            "tpgmm may have settings: 'tpgmm --policy.FIELD=VALUE'. Beside disturbances the "
-            "open loop is always there.",
-        ),
-    ] = "all",
-    demonstrations: Annotated[
-        str, typer.Option(metavar="N,...", help="Numbers of demonstrations to learn from.")
-    ] = "5,10",
-    seeds: Annotated[
-        str,
-        typer.Option(
-            metavar="N,...", help="Of the training and of the demonstrations it learns from."
-        ),
-    ] = "0",
-    demonstration_seed: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            help="The same demonstrations for all seeds, as in 0.1.0 (there: 0); the intervals "
-            "then do not tell how much others would change.",
-        ),
-    ] = None,
-    conditions: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME,...",
-            help="Of the evaluation: nominal, or disturbances of the environment joined by +: "
-            "pushes, noise, and what --env.condition takes (stopped-3, pushed-back, moved, "
-            "pose-lost, ...); or all.",
-        ),
-    ] = "nominal",
-    episodes: Annotated[
-        int, typer.Option(min=1, help="Evaluation episodes, the same for all.")
-    ] = 50,
-    budget: Annotated[
-        float,
-        typer.Option(
-            min=0,
-            help="Minutes of one processor after which the training of a baseline ends even "
-            "if its validation error still falls.",
-        ),
-    ] = 6.0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes, of one thread each.")] = 1,
-    out: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where everything goes, and is found again.")
-    ] = Path("out/compare"),
-    report_only: Annotated[
-        bool,
-        typer.Option(
-            "--report-only", help="Write the report again from what is in --out; run nothing."
-        ),
-    ] = False,
+    *,
+    env: str = "bottle_shaking",
+    policies: str = "all",
+    demonstrations: str = "5,10",
+    seeds: str = "0",
+    demonstration_seed: int | None = None,
+    conditions: str = "nominal",
+    episodes: int = 50,
+    budget: float = 6.0,
+    workers: int = 1,
+    out: Path = Path("out/compare"),
+    report_only: bool = False,
 ) -> None:
     """Compare TP-GMM with ACT, Diffusion Policy and a naive floor in simulation.
 
@@ -121,6 +59,43 @@ def compare(
     with a row for each episode, and for each environment a folder with its episodes (LeRobot
     data sets), trained policies (for lerobot-eval --policy.path), and a page of its own. What
     is finished there is not run again, so a run that was stopped goes on, and a grid can grow.
+
+    Parameters
+    ----------
+    env : ``NAME,...``
+        Tasks: bottle_shaking, carry_and_put, aloha_state (cube transfer), aloha_insertion, ...
+        (a wrong name lists them); suite: all of the upper body; suite-viperx: its tasks on
+        gym-aloha's arms (lid-viperx, ...), suite-g1: on a Unitree G1; all.
+    policies : ``NAME,...``
+        Among tpgmm; it without one of its parts, tpgmm-open-loop (by the clock, as in 0.1.0),
+        tpgmm-even-clock, tpgmm-places (objects are where they were at first),
+        tpgmm-position-only, tpgmm-no-joints, tpgmm-auto; key-poses, key-poses-posture, dmp,
+        promp; act, act-large (LeRobot's sizes), diffusion, mlp, knn, each also told the time,
+        -phase; nearest, mean; all, of tpgmm with all parts and without orientation, of act the
+        small one; or quick: of these, all that no gradient trains. A tpgmm may have settings:
+        'tpgmm --policy.FIELD=VALUE'. Beside disturbances the open loop is always there.
+    demonstrations : ``N,...``
+        Numbers of demonstrations to learn from.
+    seeds : ``N,...``
+        Of the training and of the demonstrations it learns from.
+    demonstration_seed : int >= 0
+        The same demonstrations for all seeds; the intervals then do not tell how much others
+        would change.
+    conditions : ``NAME,...``
+        Of the evaluation: nominal, or disturbances of the environment joined by +: pushes,
+        noise, and what --env.condition takes (stopped-3, pushed-back, moved, pose-lost, ...);
+        or all.
+    episodes : int >= 1
+        Evaluation episodes, the same for all.
+    budget : float >= 0
+        Minutes of one processor after which the training of a baseline ends even if its
+        validation error still falls.
+    workers : int >= 1
+        Processes, of one thread each.
+    out : ``DIR``
+        Where everything goes, and is found again.
+    report_only : bool
+        Write the report again from what is in --out; run nothing.
     """
     from lerobot_env_bimanual.disturbances import NOMINAL
     from tpgmm_evaluation import compare as module

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 import typer
@@ -35,8 +35,9 @@ from tpgmm_evaluation.metaworld.summary import (
     task_table,
 )
 from tpgmm_evaluation.metaworld.trials import trials
+from tpgmm_evaluation.report.pages import write_page
 from tpgmm_evaluation.report.tables import episode_table, write_table
-from tpgmm_torch.atomic import replacing
+from tpgmm_tools.cli import options
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = ["app"]
@@ -47,29 +48,42 @@ app = typer.Typer(add_completion=False)
 PACKAGES = ("metaworld", "mujoco", "numpy", "torch", "scikit-learn", "lerobot", "diffusers")
 
 
-@app.command()
+@options.command(app, "python -m tpgmm_evaluation.metaworld --tasks reach-v3 --seeds 0,1")
 def run(
-    tasks: Annotated[str, typer.Option(metavar="NAME,...", help="Or all.")] = "all",
-    demonstrations: Annotated[str, typer.Option(metavar="N,...")] = "1,3,5,10",
-    seeds: Annotated[
-        str, typer.Option(metavar="N,...", help="Each has demonstrations of its own.")
-    ] = "0",
-    episodes: Annotated[int, typer.Option(min=1, help="In each cell.")] = 50,
-    policies: Annotated[
-        str, typer.Option(metavar="NAME,...", help=f"Among {', '.join(LEARNERS)}.")
-    ] = ",".join(LEARNERS),
-    record: Annotated[
-        int, typer.Option(min=1, help="Episodes of the expert at least; more where it fails.")
-    ] = 12,
-    budget: Annotated[
-        float, typer.Option(min=0, help="Minutes of the processor for each network at most.")
-    ] = Network.budget / 60,
-    tuning: Annotated[
-        bool, typer.Option(help="Try in other situations than those that are reported.")
-    ] = False,
-    out: Annotated[Path, typer.Option(help="Where results are.")] = Path("out/metaworld"),
+    *,
+    tasks: str = "all",
+    demonstrations: str = "1,3,5,10",
+    seeds: str = "0",
+    episodes: int = 50,
+    policies: str = ",".join(LEARNERS),
+    record: int = 12,
+    budget: float = Network.budget / 60,
+    tuning: bool = False,
+    out: Path = Path("out/metaworld"),
 ) -> None:
-    """Record experts, learn from them, and try what was learned in unseen situations."""
+    """Record experts, learn from them, and try what was learned in unseen situations.
+
+    Parameters
+    ----------
+    tasks : ``NAME,...``
+        Tasks, or all.
+    demonstrations : ``N,...``
+        Numbers of demonstrations.
+    seeds : ``N,...``
+        Each has demonstrations of its own.
+    episodes : int >= 1
+        In each cell.
+    policies : ``NAME,...``
+        Among tpgmm, perceptron, act and diffusion.
+    record : int >= 1
+        Episodes of the expert at least; more where it fails.
+    budget : float >= 0
+        Minutes of the processor for each network at most.
+    tuning : bool
+        Try in other situations than those that are reported.
+    out : ``DIR``
+        Where results are.
+    """
     torch.set_num_threads(1)
     names = TASKS if tasks == "all" else [check_task(name) for name in tasks.split(",")]
     chosen = policies.split(",")
@@ -189,24 +203,18 @@ def report(results: Results, out: Path) -> None:
     rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]
     episodes = episode_table(rows)
     successes_by_group = summary(found)
-    text = "\n".join(
-        [
-            "# Meta-World: successes in per cent",
-            "",
-            f"The scripted experts solved {solved} of {asked} situations.",
-            "",
-            successes_by_group,
-            "![Success over demonstrations, a panel for each group of tasks](success.webp)",
-            "",
-            comparison_table(episodes),
-            task_table(found),
-            cost_table(found),
-        ]
+    paragraphs = (
+        "# Meta-World: successes in per cent",
+        f"The scripted experts solved {solved} of {asked} situations.",
+        successes_by_group,
+        "![Success over demonstrations, a panel for each group of tasks](success.webp)",
+        comparison_table(episodes),
+        task_table(found),
+        cost_table(found),
     )
     draw_groups(episodes, out / "success")
     write_table(episodes, out / "episodes")
-    with replacing(out / "results.md") as file:
-        file.write_text(text, encoding="utf-8")
+    write_page(out / "results.md", filter(None, paragraphs))
     typer.echo(successes_by_group)
 
 

@@ -16,20 +16,15 @@ from lerobot_env_bimanual.metaworld.tasks import (
     TUNED,
     difficulty,
 )
+from tpgmm_evaluation.report.pages import table
 from tpgmm_evaluation.report.panels import line_of, success_panels, write
 from tpgmm_evaluation.report.significance import REFERENCE, over_tasks
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, PURPLE, VERMILION
 
 __all__ = [
-    "GROUPS",
-    "LOOKS",
-    "comparison_table",
-    "cost_table",
-    "draw_groups",
-    "summary",
-    "task_table",
-]
+    "GROUPS", "LOOKS", "comparison_table", "cost_table", "draw_groups", "summary", "task_table",
+]  # fmt: skip
 
 #: Rows of the summary, and the tasks that they are about.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -63,36 +58,29 @@ def summary(results: Iterable[Result]) -> str:
         Finished cells, as :class:`~tpgmm_evaluation.cells.Results` reads them.
     """
     results = list(results)
-    columns = _columns(results)
-    lines = [_line(["tasks", *(f"{policy}, {n}" for policy, n in columns)])]
-    lines.append(_line(["---"] * (1 + len(columns))))
+    columns, rows = _columns(results), []
     for group, tasks in GROUPS.items():
+        here = [result for result in results if result["cell"]["env"] in tasks]
         cells = [
-            _entry(
-                [r for r in results if _place(r) == place and r["cell"]["env"] in tasks],
-                len(tasks),
-            )
+            _entry([result for result in here if _place(result) == place], len(tasks))
             for place in columns
         ]
         if any(cells):
-            lines.append(_line([f"{group} ({len(tasks)})", *cells]))
-    return "\n".join(lines) + "\n"
+            rows.append([f"{group} ({len(tasks)})", *cells])
+    return table(["tasks", *(f"{policy}, {n}" for policy, n in columns)], rows)
 
 
 def task_table(results: Iterable[Result]) -> str:
     """Successes of episodes in finished cells, ``results``, task by task, as Markdown."""
     results = list(results)
-    columns = _columns(results)
-    lines = [_line(["task", "", *(f"{policy}, {n}" for policy, n in columns)])]
-    lines.append(_line(["---"] * (2 + len(columns))))
+    columns, rows = _columns(results), []
     for task in TASKS:
         here = [r for r in results if r["cell"]["env"] == task]
-        if not here:
-            continue
-        entries = [_counts([r for r in here if _place(r) == place]) for place in columns]
-        half = "tuned" if task in TUNED else "held"
-        lines.append(_line([task, f"{difficulty(task)}, {half}", *entries]))
-    return "\n".join(lines) + "\n"
+        if here:
+            entries = [_counts([r for r in here if _place(r) == place]) for place in columns]
+            half = "tuned" if task in TUNED else "held"
+            rows.append([task, f"{difficulty(task)}, {half}", *entries])
+    return table(["task", "", *(f"{policy}, {n}" for policy, n in columns)], rows)
 
 
 def cost_table(results: Iterable[Result]) -> str:
@@ -102,23 +90,18 @@ def cost_table(results: Iterable[Result]) -> str:
     in milliseconds for an action.
     """
     results = list(results)
-    lines = [_line(["", "trainings", "training [s]", "action [ms]", "why trainings ended"])]
-    lines.append(_line(["---"] * 5))
+    rows: list[list[object]] = []
     for policy, n in _columns(results):
         here = [r for r in results if _place(r) == (policy, n)]
+        training = np.median([result["training_seconds"] for result in here])
+        action = np.median([_action_seconds(result) for result in here])
         ends = Counter(result["training_outcome"] for result in here)
-        lines.append(
-            _line(
-                [
-                    f"{policy}, {n}",
-                    str(len(here)),
-                    f"{np.median([result['training_seconds'] for result in here]):.3g}",
-                    f"{1e3 * np.median([_action_seconds(result) for result in here]):.3g}",
-                    "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common()),
-                ]
-            )
+        told = "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common())
+        rows.append(
+            [f"{policy}, {n}", len(here), f"{training:.3g}", f"{1e3 * action:.3g}", told]
         )
-    return "\n".join(lines) + "\n"
+    head = ["", "trainings", "training [s]", "action [ms]", "why trainings ended"]
+    return table(head, rows)
 
 
 def comparison_table(episodes: pd.DataFrame) -> str:
@@ -129,26 +112,24 @@ def comparison_table(episodes: pd.DataFrame) -> str:
     episodes : DataFrame
         As :func:`~tpgmm_evaluation.report.tables.episode_table` makes it.
     """
-    heading = ["beside", "tasks", "TP-GMM", "other", "difference", "better", "worse", "p"]
-    lines = [_line([*heading, "loses most"]), _line(["---"] * (len(heading) + 1))]
+    head = ["beside", "tasks", "TP-GMM", "other", "difference", "better", "worse", "p"]
+    rows = []
     for row in over_tasks(episodes).itertuples():
-        lost = row.differences[row.differences < 0].sort_values().head(NAMED)
-        lines.append(
-            _line(
-                [
-                    f"{row.policy}, {row.demonstrations}",
-                    str(len(row.differences)),
-                    f"{100 * row.success:.1f}",
-                    f"{100 * row.other_success:.1f}",
-                    f"{100 * row.difference:.1f} ({100 * row.low:.0f} to {100 * row.high:.0f})",
-                    str(int((row.differences > 0).sum())),
-                    str(int((row.differences < 0).sum())),
-                    f"{row.p:.2g}",
-                    ", ".join(f"{task} {100 * by:.0f}" for task, by in lost.items()),
-                ]
-            )
+        lost = row.differences[row.differences < 0].sort_values()
+        rows.append(
+            [
+                f"{row.policy}, {row.demonstrations}",
+                len(row.differences),
+                f"{100 * row.success:.1f}",
+                f"{100 * row.other_success:.1f}",
+                f"{100 * row.difference:.1f} ({100 * row.low:.0f} to {100 * row.high:.0f})",
+                int((row.differences > 0).sum()),
+                len(lost),
+                f"{row.p:.2g}",
+                ", ".join(f"{task} {100 * by:.0f}" for task, by in lost.head(NAMED).items()),
+            ]
         )
-    return "\n".join(lines) + "\n" if len(lines) > 2 else ""
+    return table([*head, "loses most"], rows) if rows else ""
 
 
 def draw_groups(episodes: pd.DataFrame, path: Path) -> None:
@@ -195,15 +176,10 @@ def _entry(results: Sequence[Result], tasks: int) -> str:
     if not successes:
         return ""
     # each task counts alike, however many of its episodes there are
-    by_task: dict[str, list[bool]] = {}
-    for result in results:
-        by_task.setdefault(result["cell"]["env"], []).extend(_episodes([result]))
-    mean = float(np.mean([np.mean(values) for values in by_task.values()]))
+    by_task, of_seed = (_grouped(results, key) for key in ("env", "seed"))
+    mean = float(np.mean([np.mean(_episodes(here)) for here in by_task.values()]))
     low, high = wilson(round(mean * len(successes)), len(successes))
     text = f"{100 * mean:.1f} ({100 * low:.0f} to {100 * high:.0f})"
-    of_seed: dict[int, list[Result]] = {}
-    for result in results:
-        of_seed.setdefault(result["cell"]["seed"], []).append(result)
     # figures of fewer tasks are no figures of the same
     whole = [of_seed[seed] for seed in sorted(of_seed) if len(of_seed[seed]) == len(by_task)]
     if len(whole) > 1:
@@ -212,10 +188,14 @@ def _entry(results: Sequence[Result], tasks: int) -> str:
     return text if len(by_task) == tasks else f"{text}, in {len(by_task)} of {tasks}"
 
 
+def _grouped(results: Sequence[Result], key: str) -> dict[Any, list[Result]]:
+    """By what their cells have at a key."""
+    groups: dict[Any, list[Result]] = {}
+    for result in results:
+        groups.setdefault(result["cell"][key], []).append(result)
+    return groups
+
+
 def _counts(results: Sequence[Result]) -> str:
     successes = _episodes(results)
     return f"{sum(successes)}/{len(successes)}" if successes else ""
-
-
-def _line(entries: Iterable[str]) -> str:
-    return "| " + " | ".join(entries) + " |"

@@ -9,7 +9,6 @@ from typing import Any, Self
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.optim import SGDConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from sklearn.neighbors import KNeighborsRegressor
 from torch import Tensor
@@ -50,10 +49,6 @@ class NeighboursConfig(ChunkedConfig):
     time_weight: float = 0.0
     environment_weight: float = 1.0
     n_rows: int = 1
-
-    def get_optimizer_preset(self) -> SGDConfig:
-        """Nothing is trained by gradient."""
-        return SGDConfig()
 
 
 class NeighboursPolicy(ChunkedPolicy):
@@ -152,11 +147,3 @@ class NeighboursPolicy(ChunkedPolicy):
         found = self._regression.predict((seen * self.scale).numpy()).astype(np.float32)
         actions = torch.from_numpy(found).unflatten(1, self.actions.shape[1:])
         return actions + batch[OBS_STATE].float()[:, None] if self.config.relative else actions
-
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, Any]]:
-        """There is no loss."""
-        raise NotImplementedError(f"{self.name} is fitted at once, not by gradient")
-
-    def get_optim_params(self) -> Any:
-        """No parameters."""
-        return []

@@ -20,13 +20,9 @@ from tpgmm_torch.persistence import decode, encode
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "ChunkedConfig",
-    "ChunkedPolicy",
-    "PlannedConfig",
-    "PlannedPolicy",
-    "SituatedConfig",
-    "SituatedPolicy",
-]
+    "ChunkedConfig", "ChunkedPolicy", "Observed", "PlannedConfig", "PlannedPolicy",
+    "SituatedConfig", "SituatedPolicy",
+]  # fmt: skip
 
 
 @dataclass
@@ -57,11 +53,16 @@ class PlannedPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def __init__(self, config: PlannedConfig, **unused: Any) -> None:
         super().__init__(config)
         self.config = config
+        PlannedPolicy.reset(self)
 
     @property
     def looks(self) -> tuple[int, ...]:
         """The steps at which it looks and plans, from the first, 0, on."""
         return (0,)
+
+    def due(self, step: int) -> bool:
+        """Whether it plans at a step."""
+        return step in self.looks
 
     @abstractmethod
     def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
@@ -83,7 +84,7 @@ class PlannedPolicy(PreTrainedPolicy):  # type: ignore[misc]
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
         """The next action."""
-        if self._plan is None or self._step in self.looks:
+        if self._plan is None or self.due(self._step):
             self._plan, self._planned = self.plan(batch, self._step), self._step
         row = min(self._step - self._planned, self._plan.shape[1] - 1)
         self._step += 1
@@ -147,6 +148,29 @@ class SituatedConfig(PlannedConfig):
         )
 
 
+@dataclass(frozen=True)
+class Observed:
+    """What the plan of one robot is made from.
+
+    Parameters
+    ----------
+    joints : Tensor of shape (n_joints,)
+        Where the references go on from: the last one; at first the measured posture [rad].
+    measured : Tensor of shape (n_joints,)
+        The measured posture [rad].
+    frames, first : dict of str to Frame
+        Where the objects are now, and where they were at first.
+    step : int
+        One of the policy's ``looks``.
+    """
+
+    joints: Tensor
+    measured: Tensor
+    frames: dict[str, Frame]
+    first: dict[str, Frame]
+    step: int
+
+
 class SituatedPolicy(PlannedPolicy):
     """Plans for each robot by itself: from its joints, and from where the objects are.
 
@@ -180,9 +204,15 @@ class SituatedPolicy(PlannedPolicy):
         self.reset()
 
     @classmethod
-    @abstractmethod
     def fit(cls, aligned: Aligned, **options: Any) -> Self:
         """Learn from aligned demonstrations; ``options`` are fields of the configuration."""
+        policy = cls(cls.config_class.of(aligned, **options))
+        policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
+        policy.learn(aligned)
+        return policy.eval()
+
+    def learn(self, aligned: Aligned) -> None:
+        """Learn what is more than the mean: nothing."""
 
     def recipe(self) -> dict[str, Any]:
         """How it was made, for the record."""
@@ -195,27 +225,8 @@ class SituatedPolicy(PlannedPolicy):
         self._last: Tensor | None = None
 
     @abstractmethod
-    def references(
-        self,
-        joints: Tensor,
-        measured: Tensor,
-        frames: dict[str, Frame],
-        first: dict[str, Frame],
-        step: int,
-    ) -> Tensor:
-        """Joint references (n, n_joints) of one robot from a step on.
-
-        Parameters
-        ----------
-        joints : Tensor of shape (n_joints,)
-            Where the references go on from: the last one; at first the measured posture.
-        measured : Tensor of shape (n_joints,)
-            The measured posture.
-        frames, first : dict of str to Frame
-            Where the objects are now, and where they were at first.
-        step : int
-            One of ``looks``.
-        """
+    def references(self, seen: Observed) -> Tensor:
+        """Joint references (n, n_joints) of one robot from a step on."""
 
     def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
         """Actions from a step on, one robot after the other."""
@@ -226,7 +237,7 @@ class SituatedPolicy(PlannedPolicy):
             self._first = every
         joints = measured if self._last is None else self._last
         plans = [
-            self.references(joints[i], measured[i], every[i], self._first[i], step)
+            self.references(Observed(joints[i], measured[i], every[i], self._first[i], step))
             for i in range(len(measured))
         ]
         planned = torch.stack(plans).clamp(self.robot.lower, self.robot.upper)
@@ -235,7 +246,7 @@ class SituatedPolicy(PlannedPolicy):
 
 
 @dataclass
-class ChunkedConfig(StatePolicyConfig):
+class ChunkedConfig(PlannedConfig):
     """Configuration of a :class:`ChunkedPolicy`.
 
     Parameters
@@ -246,16 +257,13 @@ class ChunkedConfig(StatePolicyConfig):
 
     n_action_steps: int = 8
 
-    def validate_features(self) -> None:
-        """Nothing to check."""
-
     @property
     def action_delta_indices(self) -> list[int]:  # type: ignore[override]
         """The steps whose actions are predicted."""
         return list(range(self.n_action_steps))
 
 
-class ChunkedPolicy(PreTrainedPolicy):  # type: ignore[misc]
+class ChunkedPolicy(PlannedPolicy):
     """Takes the actions of a prediction one after the other, then predicts again.
 
     Parameters
@@ -266,24 +274,17 @@ class ChunkedPolicy(PreTrainedPolicy):  # type: ignore[misc]
     """
 
     config_class = ChunkedConfig
+    config: ChunkedConfig
     name = "chunked"
 
-    def __init__(self, config: ChunkedConfig, **unused: Any) -> None:
-        super().__init__(config)
-        self.config = config
-        self.reset()
+    def due(self, step: int) -> bool:
+        """Whether all predicted actions were taken."""
+        return step % self.config.n_action_steps == 0
 
     @abstractmethod
     def predict_action_chunk(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
         """The next actions, shape (B, n_action_steps, n_action)."""
 
-    def reset(self) -> None:
-        """Begin a new episode with the next observation."""
-        self._left: list[Tensor] = []
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
-        """The next action."""
-        if not self._left:
-            self._left = list(self.predict_action_chunk(batch).unbind(1))
-        return self._left.pop(0)
+    def plan(self, batch: dict[str, Tensor], step: int) -> Tensor:
+        """The prediction."""
+        return self.predict_action_chunk(batch)

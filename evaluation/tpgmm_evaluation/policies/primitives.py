@@ -16,8 +16,8 @@ from torch import Tensor
 
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_evaluation.policies.key_poses import Move
+from tpgmm_evaluation.policies.planned import Observed
 from tpgmm_evaluation.policies.situated import MovesConfig, MovesPolicy
-from tpgmm_torch import Frame
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.exceptions import DependencyError
 
@@ -41,11 +41,9 @@ class _PrimitivePolicy(MovesPolicy):
     config_class = MovesConfig
     name = "primitive"
 
-    def postures(
-        self, move: Move, measured: Tensor, frames: dict[str, Frame], first: dict[str, Frame]
-    ) -> list[Tensor]:
+    def postures(self, move: Move, seen: Observed) -> list[Tensor]:
         """At each key pose of a move, the posture near the mean one in which links have it."""
-        targets = self.targets(move, measured, frames, first)
+        targets = self.targets(move, seen)
         return [
             self.posture_at(step, {link: poses[i] for link, poses in targets.items()})
             for i, step in enumerate(move.steps)
@@ -108,23 +106,16 @@ class DMPPolicy(_PrimitivePolicy):
             primitive.imitate(np.arange(len(way)) / self.config.fps, way)
             self.weights[index] = torch.from_numpy(np.ravel(primitive.get_weights()))
 
-    def references(
-        self,
-        joints: Tensor,
-        measured: Tensor,
-        frames: dict[str, Frame],
-        first: dict[str, Frame],
-        step: int,
-    ) -> Tensor:
+    def references(self, seen: Observed) -> Tensor:
         """The move that begins now, and the posture at its end until the next."""
-        move = self.move_at(step)
-        goal = self.postures(move, measured, frames, first)[-1]
+        move = self.move_at(seen.step)
+        goal = self.postures(move, seen)[-1]
         goal[self.free] = self.mean[move.arrive, self.free]
         primitive = self._primitive(move)
         primitive.set_weights(as_array(self.weights[self.moves.index(move)]))
-        primitive.configure(start_y=as_array(joints), goal_y=as_array(goal))
+        primitive.configure(start_y=as_array(seen.joints), goal_y=as_array(goal))
         _, way = primitive.open_loop()
-        rows = (np.arange(step, move.end) - move.begin).clip(0, len(way) - 1)
+        rows = (np.arange(seen.step, move.end) - move.begin).clip(0, len(way) - 1)
         return torch.from_numpy(np.asarray(way)[rows])
 
 
@@ -205,24 +196,17 @@ class ProMPPolicy(_PrimitivePolicy):
         phase: Array = np.linspace(0, 1, self.config.n_steps).astype(np.float64)
         return phase
 
-    def references(
-        self,
-        joints: Tensor,
-        measured: Tensor,
-        frames: dict[str, Frame],
-        first: dict[str, Frame],
-        step: int,
-    ) -> Tensor:
+    def references(self, seen: Observed) -> Tensor:
         """The conditioned mean, until the next move begins."""
-        move = self.move_at(step)
+        move, step = self.move_at(seen.step), seen.step
         n, width = self.robot.n_joints, self.config.n_weights
         primitive = (
             _library()
             .promp.ProMP(n, width)
             .from_weight_distribution(as_array(self.weight_mean), as_array(self.weight_cov))
         )
-        postures = self.postures(move, measured, frames, first)
-        passed = [(step, joints), *zip(move.steps, postures, strict=True)]
+        postures = self.postures(move, seen)
+        passed = [(step, seen.joints), *zip(move.steps, postures, strict=True)]
         if move.end < self.config.n_steps:  # and rests there, until the next move
             passed.append((move.end, postures[-1]))
         for at, posture in passed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +19,7 @@ from tpgmm_evaluation.policies.key_poses import (
     find_moves,
     minimum_jerk_path,
 )
-from tpgmm_evaluation.policies.planned import SituatedConfig, SituatedPolicy
+from tpgmm_evaluation.policies.planned import Observed, SituatedConfig, SituatedPolicy
 from tpgmm_torch import Frame
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.motion.inverse_kinematics import follow_poses
@@ -59,23 +59,9 @@ class MeanPolicy(SituatedPolicy):
     config_class = MeanConfig
     name = "mean_demonstration"
 
-    @classmethod
-    def fit(cls, aligned: Aligned, **options: Any) -> Self:
-        """Keep the mean."""
-        policy = cls(MeanConfig.of(aligned, **options))
-        policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
-        return policy.eval()
-
-    def references(
-        self,
-        joints: Tensor,
-        measured: Tensor,
-        frames: dict[str, Frame],
-        first: dict[str, Frame],
-        step: int,
-    ) -> Tensor:
+    def references(self, seen: Observed) -> Tensor:
         """The mean, into which the present posture fades within a second."""
-        return faded(joints, self.mean, self.start, self.config.fps)
+        return faded(seen.joints, self.mean, self.start, self.config.fps)
 
 
 @dataclass
@@ -129,12 +115,9 @@ class MovesPolicy(SituatedPolicy):
         DataError
             As :func:`find_moves`.
         """
-        config = cls.config_class.of(aligned, **options)
-        moves = find_moves(aligned, config.tolerance)
-        policy = cls(replace(config, moves=[move.config() for move in moves]))
-        policy.mean[:], policy.start[:] = aligned.mean, aligned.starts.mean(0)
-        policy.learn(aligned)
-        return policy.eval()
+        tolerance = options.get("tolerance", cls.config_class.tolerance)
+        moves = [move.config() for move in find_moves(aligned, tolerance)]
+        return super().fit(aligned, moves=moves, **options)
 
     def recipe(self) -> dict[str, Any]:
         """What was chosen, and what was found in the demonstrations."""
@@ -147,9 +130,6 @@ class MovesPolicy(SituatedPolicy):
             for pose in at
         ]
         return {**{name: getattr(self.config, name) for name in chosen}, "key_poses": frames}
-
-    def learn(self, aligned: Aligned) -> None:
-        """Learn what is more than moves and the mean: nothing."""
 
     @property
     def looks(self) -> tuple[int, ...]:
@@ -166,15 +146,9 @@ class MovesPolicy(SituatedPolicy):
         moved = {frame.joint for frame in self.robot.tree.frames}
         return [i for i in range(self.robot.n_joints) if i not in moved]
 
-    def targets(
-        self,
-        move: Move,
-        measured: Tensor,
-        frames: Mapping[str, Frame],
-        first: Mapping[str, Frame],
-    ) -> dict[str, list[Frame]]:
+    def targets(self, move: Move, seen: Observed) -> dict[str, list[Frame]]:
         """Of each link, its key poses of a move in the base frame, by what is seen now."""
-        return move.targets(self.poses(measured), frames, first)
+        return move.targets(self.poses(seen.measured), seen.frames, seen.first)
 
     def poses(self, joints: Tensor) -> dict[str, Frame]:
         """Where the links are."""
@@ -220,16 +194,9 @@ class KeyPosesPolicy(MovesPolicy):
     config: KeyPosesConfig
     name = "key_poses"
 
-    def references(
-        self,
-        joints: Tensor,
-        measured: Tensor,
-        frames: dict[str, Frame],
-        first: dict[str, Frame],
-        step: int,
-    ) -> Tensor:
+    def references(self, seen: Observed) -> Tensor:
         """The move that begins now, and what is left of it until the next."""
-        move = self.move_at(step)
+        move, joints, step = self.move_at(seen.step), seen.joints, seen.step
         fps, length = self.config.fps, move.arrive - move.begin
         start = joints.clamp(self.robot.lower, self.robot.upper)
         count = max(2, round(length * SOLVED / fps) + 1)
@@ -238,7 +205,7 @@ class KeyPosesPolicy(MovesPolicy):
         steps = [at - move.begin for at in move.steps]
         paths = {
             link: minimum_jerk_path(here[link], poses, steps, rows)
-            for link, poses in self.targets(move, measured, frames, first).items()
+            for link, poses in self.targets(move, seen).items()
         }
         wanted = faded(joints, self.mean[move.begin :], self.mean[move.begin], fps)
         posture = wanted[np.round(rows).astype(int)] if self.config.posture else start
