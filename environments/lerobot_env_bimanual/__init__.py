@@ -20,13 +20,9 @@ from lerobot_env_bimanual.suite.names import ROBOTS, SUITE, UPPER_BODY
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = [
-    "AlohaStateConfig",
-    "BimanualConfig",
-    "BottleShakingConfig",
-    "BottleTorqueConfig",
-    "CarryAndPutConfig",
-    "MetaworldStateConfig",
-]
+    "AlohaStateConfig", "BimanualConfig", "BottleShakingConfig", "BottleTorqueConfig",
+    "CarryAndPutConfig", "MetaworldStateConfig",
+]  # fmt: skip
 
 _PACKAGE = "lerobot_env_bimanual"
 

@@ -21,22 +21,10 @@ from numpy.typing import NDArray
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = [
-    "CONDITIONS",
-    "NOMINAL",
-    "Course",
-    "Displaced",
-    "Disturbance",
-    "IrregularTicks",
-    "Live",
-    "Moved",
-    "NoisyPose",
-    "PoseLost",
-    "StartedMidway",
-    "Stopped",
-    "displaced",
-    "generators",
+    "CONDITIONS", "NOMINAL", "Course", "Displaced", "Disturbance", "IrregularTicks", "Live",
+    "Moved", "NoisyPose", "PoseLost", "StartedMidway", "Stopped", "displaced", "generators",
     "parse_condition",
-]
+]  # fmt: skip
 
 Vector = NDArray[np.float64]
 #: The condition without disturbances.

@@ -202,15 +202,12 @@ class _HandlingBenchmark(Benchmark):
 
     def _start(self, motion: Demonstration) -> dict[str, Any]:
         """The options with which an episode begins as a demonstration does."""
-        poses = {name: motion.frame(name) for name in self.objects}
-        firsts = {name: pose[0] if pose.batch_shape else pose for name, pose in poses.items()}
-        return {
-            "joints": motion.joints[0].numpy(),
-            **{
-                name: torch.cat((f.position, f.orientation)).numpy()
-                for name, f in firsts.items()
-            },
-        }
+        start = {"joints": motion.joints[0].numpy()}
+        for name in self.objects:
+            pose = motion.frame(name)
+            pose = pose[0] if pose.batch_shape else pose
+            start[name] = torch.cat((pose.position, pose.orientation)).numpy()
+        return start
 
     def _follow(self, env: Any, seed: int, motion: Demonstration) -> tuple[Demonstration, bool]:
         """What is measured while the environment follows a motion; whether it succeeds."""
@@ -236,48 +233,44 @@ class _HandlingBenchmark(Benchmark):
         return Demonstration(motion.time, joints, frames, names), bool(info["is_success"])
 
 
-class BottleBenchmark(_HandlingBenchmark):
-    """Reach a bottle with both hands, grasp it, bring it, shake it."""
+class _BottleTask(_HandlingBenchmark):
+    """A task whose demonstrations are those of a generator of the data sets."""
 
-    env = "bottle_shaking"
-    gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
-    figures: Mapping[str, Figure] = {**FIGURES, **PEAKS}
+    generator: Callable[..., BottleShaking | CarryAndPut]
 
     def __init__(
         self, rate: int | None = None, options: Mapping[str, Any] | None = None
     ) -> None:
         super().__init__(rate, options)
-        self.skill = BottleShaking(rate=self.rate, steady_rhythm=True)
+        self.skill = type(self).generator(rate=self.rate)
         self.robot = self.skill.robot
 
     def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
         """Of the skill's generator."""
         pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
         return [pool[number] for number in numbers]
+
+
+class BottleBenchmark(_BottleTask):
+    """Reach a bottle with both hands, grasp it, bring it, shake it."""
+
+    env = "bottle_shaking"
+    gym_id, task, objects = "BottleShaking-v0", TASK, ("bottle",)
+    figures: Mapping[str, Figure] = {**FIGURES, **PEAKS}
+    generator = partial(BottleShaking, steady_rhythm=True)
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle, and the joints."""
         return bottle_operators(orientation)
 
 
-class CarryBenchmark(_HandlingBenchmark):
+class CarryBenchmark(_BottleTask):
     """Reach a bottle with both hands, grasp it, put it on a tray."""
 
     env = "carry_and_put"
     gym_id, task, objects = "CarryAndPut-v0", CARRY, ("bottle", "tray")
     figures: Mapping[str, Figure] = {**PUT_FIGURES, **PEAKS}
-
-    def __init__(
-        self, rate: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> None:
-        super().__init__(rate, options)
-        self.skill = CarryAndPut(rate=self.rate)
-        self.robot = self.skill.robot
-
-    def motions(self, numbers: Sequence[int], seed: int) -> list[Demonstration]:
-        """Of the skill's generator."""
-        pool = self.skill.demonstrations(self.POOL + self.RESERVED, seed)
-        return [pool[number] for number in numbers]
+    generator = CarryAndPut
 
     def operators(self, orientation: bool, held: bool = True) -> list[Operator]:
         """Both hands seen from the bottle and the tray, and the joints.

@@ -92,21 +92,14 @@ def compare(
         If the folder holds results of other settings.
     """
     tasks = (settings,) if isinstance(settings, Settings) else tuple(settings)
-    _refuse_old_layout(out)
     grids = _grids(tasks, policies, demonstrations, seeds, conditions, say)
     for task in tasks:
         task.keep(out / task.env / "settings.json")
-    finished = {
-        cell
-        for cells in grids
-        for cell in cells
-        if _finished(Results(out / cell.env / "cells"), cell, say)
-    }
-    total = sum(map(len, grids))
-    say(f"{total} cells, {len(finished)} of them finished before")
-    groups = []
+    groups, finished = [], 0
     for task, cells in zip(tasks, grids, strict=True):
-        pending = [cell for cell in cells if cell not in finished]
+        results = Results(out / task.env / "cells")
+        pending = [cell for cell in cells if not _finished(results, cell, say)]
+        finished += len(cells) - len(pending)
         for seed in sorted({cell.seed for cell in pending}):
             say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
             record(out / task.env, task, max(cell.demonstrations for cell in cells), seed)
@@ -115,6 +108,8 @@ def compare(
             (out / task.env, task, list(same))
             for _, same in groupby(pending, key=lambda cell: cell.training)
         ]
+    total = sum(map(len, grids))
+    say(f"{total} cells, {finished} of them finished before")
     failures = _run(groups, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
@@ -141,7 +136,6 @@ def rewrite_report(out: Path, say: Callable[[str], None] = print) -> Path:
     DataError
         If no comparison is there.
     """
-    _refuse_old_layout(out)
     if not _kept(out):
         raise DataError(
             f"{out} holds no comparison: there is no ENVIRONMENT/settings.json in it. Give the "
@@ -165,18 +159,6 @@ def _report(
         for path in _kept(out)
     ]
     return write_summary(out, tasks, failures, command)
-
-
-def _refuse_old_layout(out: Path) -> None:
-    """Version 0.1.0 compared in one environment, without a folder for it."""
-    old = out / "settings.json"
-    if old.exists():
-        env = Settings.read(old).env
-        raise DataError(
-            f"{out} holds a comparison in the layout of 0.1.0, without a folder for its "
-            f"environment. Move all of it to {out / env}, and go on with it with "
-            "--demonstration-seed 0; or take another folder"
-        )
 
 
 def _grids(

@@ -156,11 +156,7 @@ def _neighbours(episodes: Path, settings: Settings, cell: Cell, timed: bool) -> 
 
 
 def _situated(
-    episodes: Path,
-    settings: Settings,
-    cell: Cell,
-    kind: type[SituatedPolicy],
-    **options: Any,
+    episodes: Path, settings: Settings, cell: Cell, kind: type[SituatedPolicy], **options: Any
 ) -> Training:
     """Fit what plans in joints to the aligned references."""
     benchmark = settings.benchmark()

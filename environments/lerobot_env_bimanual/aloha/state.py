@@ -17,13 +17,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_env_bimanual.aloha.robot import (
-    ARM_JOINTS,
-    HOW_TO_INSTALL,
-    JOINTS,
-    OBJECTS,
-    SIDES,
-)
+from lerobot_env_bimanual.aloha.robot import ARM_JOINTS, HOW_TO_INSTALL, JOINTS, OBJECTS, SIDES
 from lerobot_env_bimanual.base import Observation, StateEnv, finite_vector
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 

@@ -90,11 +90,7 @@ class BottleShakingEnv(BottleEnv):
     task_description = "take the bottle with both hands, lift it and shake it"
 
     def __init__(
-        self,
-        *,
-        frequency: float = FREQUENCY,
-        amplitude: float = AMPLITUDE,
-        **options: Any,
+        self, *, frequency: float = FREQUENCY, amplitude: float = AMPLITUDE, **options: Any
     ) -> None:
         self.frequency, self.amplitude = frequency, amplitude
         super().__init__(BottleScene(), DURATION, COURSE, **options)

@@ -11,10 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_env_bimanual.metaworld.hand import FPS, FRAMES, JOINTS, opening
-from lerobot_env_bimanual.metaworld.state import (
-    MetaworldStateEnv,
-    metaworld_library,
-)
+from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv, metaworld_library
 from tpgmm_torch import Demonstration, Frame
 from tpgmm_torch.exceptions import DataError
 

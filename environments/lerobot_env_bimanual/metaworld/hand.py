@@ -17,16 +17,9 @@ from tpgmm_torch.robots.urdf import UrdfJoint
 from tpgmm_torch.robots.urdf_writer import write_urdf
 
 __all__ = [
-    "ACTION_SCALE",
-    "FPS",
-    "FRAMES",
-    "JOINTS",
-    "displacement",
-    "effort",
-    "metaworld_operators",
-    "metaworld_robot",
-    "opening",
-]
+    "ACTION_SCALE", "FPS", "FRAMES", "JOINTS", "displacement", "effort", "metaworld_operators",
+    "metaworld_robot", "opening",
+]  # fmt: skip
 
 #: Actions per second: five steps of 2.5 ms each.
 FPS = 80

@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_env_bimanual.base import Observation, StateEnv, finite_vector
-from lerobot_env_bimanual.metaworld.hand import (
-    FPS,
-    FRAMES,
-    JOINTS,
-    displacement,
-    effort,
-)
+from lerobot_env_bimanual.metaworld.hand import FPS, FRAMES, JOINTS, displacement, effort
 from lerobot_env_bimanual.metaworld.tasks import check_task
 from tpgmm_torch.exceptions import DataError, DependencyError
 

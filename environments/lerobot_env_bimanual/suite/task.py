@@ -237,11 +237,7 @@ class SuiteTask(ABC):
         return np.clip(posture, self.robot.lower.numpy(), self.robot.upper.numpy())
 
     def demonstrations(
-        self,
-        n: int,
-        seed: int = 0,
-        rate: float = 100.0,
-        only: Sequence[int] | None = None,
+        self, n: int, seed: int = 0, rate: float = 100.0, only: Sequence[int] | None = None
     ) -> list[Demonstration]:
         """Demonstrations with different objects, start postures, timing and style.
 

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_env_bimanual.metaworld.demonstrations import (
-    Recorded,
-    record_metaworld,
-)
+from lerobot_env_bimanual.metaworld.demonstrations import Recorded, record_metaworld
 from lerobot_env_bimanual.metaworld.state import MetaworldStateEnv
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "demonstration_seeds",
-    "evaluation_seeds",
-    "read",
-    "recorded",
-    "successes",
-    "validation",
-    "validation_seeds",
-    "write",
-]
+    "demonstration_seeds", "evaluation_seeds", "read", "recorded", "successes", "validation",
+    "validation_seeds", "write",
+]  # fmt: skip
 
 #: Demonstrations of training seed s are of the situations ``STRIDE * s`` and on.
 STRIDE = 1000

@@ -10,14 +10,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lerobot_env_bimanual.metaworld.tasks import (
-    DIFFICULTIES,
-    TASKS,
-    TUNED,
-    difficulty,
-)
+from lerobot_env_bimanual.metaworld.tasks import DIFFICULTIES, TASKS, TUNED, difficulty
+from tpgmm_evaluation.report.figures import line_of, success_panels, write
 from tpgmm_evaluation.report.pages import table
-from tpgmm_evaluation.report.panels import line_of, success_panels, write
 from tpgmm_evaluation.report.significance import REFERENCE, over_tasks
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, PURPLE, VERMILION

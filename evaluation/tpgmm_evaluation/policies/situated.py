@@ -14,11 +14,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from tpgmm_evaluation.policies.aligned import Aligned
-from tpgmm_evaluation.policies.key_poses import (
-    Move,
-    find_moves,
-    minimum_jerk_path,
-)
+from tpgmm_evaluation.policies.key_poses import Move, find_moves, minimum_jerk_path
 from tpgmm_evaluation.policies.planned import Observed, SituatedConfig, SituatedPolicy
 from tpgmm_torch import Frame
 from tpgmm_torch.data.arrays import Array, as_array
@@ -27,13 +23,9 @@ from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.robots.robot import Robot
 
 __all__ = [
-    "KeyPosesConfig",
-    "KeyPosesPolicy",
-    "MeanConfig",
-    "MeanPolicy",
-    "MovesConfig",
+    "KeyPosesConfig", "KeyPosesPolicy", "MeanConfig", "MeanPolicy", "MovesConfig",
     "MovesPolicy",
-]
+]  # fmt: skip
 
 #: For how long the present posture fades into the mean motion [s].
 FADE = 1.0

@@ -68,9 +68,7 @@ GOLDENS: Mapping[str, Callable[[Plan], Measured]] = {
 
 
 def _golden(
-    model: TaskParameterizedGMM,
-    shown: Sequence[Demonstration],
-    situations: Sequence[Situation],
+    model: TaskParameterizedGMM, shown: Sequence[Demonstration], situations: Sequence[Situation]
 ) -> Measured:
     """What was learned, its likelihood, references, and a batch of single steps."""
     model.fit(shown)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,25 +11,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Sheet
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
 from lerobot_env_bimanual.bottle.measures import Figure
 from tpgmm_evaluation.jobs import POLICIES
-from tpgmm_evaluation.report.panels import (
-    add_legend,
-    line_of,
-    over_demonstrations,
-    panels_for,
-    spread,
-    success_panels,
-    write,
-)
 from tpgmm_evaluation.report.significance import REFERENCE
-from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION
+from tpgmm_evaluation.report.tables import wilson
+from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION, save
 
-__all__ = ["draw_conditions", "draw_curves", "draw_errors", "draw_success"]
+__all__ = [
+    "draw_conditions", "draw_curves", "draw_errors", "draw_success", "line_of",
+    "success_panels", "write",
+]  # fmt: skip
 
+#: What is written of each figure: vectors for print, and something small for pages.
+FORMATS = (".pdf", ".webp")
+#: Panels side by side.
+COLUMNS = 4
 #: Colours of the families of policies beside TP-GMM: Okabe and Ito's, black and grey.
 COLOURS = (BLUE, GREEN, PURPLE, SKY, ORANGE, "0.1", "0.55")
 #: Markers and lines differ too, for readers without colours.
@@ -121,11 +122,7 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
 
 
 @rc_context(STYLE)
-def draw_errors(
-    episodes: pd.DataFrame,
-    figures: Mapping[str, Figure],
-    path: Path,
-) -> None:
+def draw_errors(episodes: pd.DataFrame, figures: Mapping[str, Figure], path: Path) -> None:
     """Median and quartiles of each figure over the number of demonstrations.
 
     All episodes are of one condition; ``path`` has no suffix.
@@ -197,3 +194,118 @@ def draw_curves(trainings: Iterable[Mapping[str, Any]], path: Path) -> None:
         grid[0, 0].plot([], [], color=colour, label=f"{count} demonstrations")
     figure.legend(loc="outside upper center", ncols=len(counts))
     write(figure, path)
+
+
+def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, Any]:
+    """What all lines of a policy look like."""
+    return {
+        "color": colour,
+        "marker": marker,
+        "markersize": 4.5,
+        "linestyle": line,
+        "linewidth": 1.2,
+        "label": label,
+    }
+
+
+def panels_for(
+    count: int, *, narrowest: float = 0.0, sharey: bool = False
+) -> tuple[Sheet, list[Axes]]:
+    """A figure of so many panels, row by row, of at least a width [inch]."""
+    columns = min(COLUMNS, count)
+    rows = math.ceil(count / columns)
+    size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
+    figure = Sheet(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey).ravel()
+    for axes in grid[count:]:
+        axes.remove()
+    return figure, list(grid[:count])
+
+
+@rc_context(STYLE)
+def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Sheet:
+    """Success over the number of demonstrations: a panel for each environment.
+
+    Lines join the shares of all episodes with their 95 % intervals (Wilson), small dots are the
+    shares of each training seed, where there are several.
+
+    Parameters
+    ----------
+    episodes : DataFrame
+        Of one condition, as of
+        :func:`~tpgmm_evaluation.report.tables.episode_table`.
+    looks : mapping of str to mapping
+        The policies in their order, each with what :func:`line_of` gives.
+
+    Returns
+    -------
+    Sheet
+    """
+    tasks = list(dict.fromkeys(episodes.env))
+    figure, grid = panels_for(len(tasks), narrowest=4.2, sharey=True)
+    for axes, task in zip(grid, tasks, strict=True):
+        part = episodes[episodes.env == task]
+        for index, (policy, look) in enumerate(looks.items()):
+            chosen = part[part.policy == policy]
+            if len(chosen):
+                counts = sorted(set(chosen.demonstrations))
+                _success_line(axes, chosen, spread(counts, index, len(looks)), look)
+        over_demonstrations(axes, part)
+        axes.set_title(task, fontsize="medium")
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        axes.set_ylim(-0.05, 1.05)
+    for axes in grid[::COLUMNS]:
+        axes.set_ylabel("success")
+    add_legend(figure, grid, looks)
+    return figure
+
+
+def _success_line(
+    axes: Axes, episodes: pd.DataFrame, x: np.ndarray[Any, Any], look: Mapping[str, Any]
+) -> None:
+    groups = episodes.groupby("demonstrations").success
+    rates = groups.mean()
+    bounds = np.array([wilson(int(group.sum()), len(group)) for _, group in groups]).T
+    gaps = np.abs(bounds - rates.to_numpy())
+    axes.errorbar(x, rates, yerr=gaps, capsize=1.5, elinewidth=0.8, **look)
+    places = dict(zip(rates.index, x, strict=True))
+    seeds = episodes.groupby(["demonstrations", "training_seed"]).success.mean()
+    if len(seeds) > len(rates):
+        at = [places[count] for count, _ in seeds.index]
+        axes.plot(at, seeds, ".", color=look["color"], markersize=3, alpha=0.6)
+
+
+def spread(counts: Sequence[int], index: int, total: int) -> np.ndarray[Any, Any]:
+    """Numbers of demonstrations, moved a little so that policies do not hide one another."""
+    width = min(0.04, 0.3 / total)
+    return np.asarray(counts) * (1 + width) ** (index - (total - 1) / 2)
+
+
+def over_demonstrations(axes: Axes, table: pd.DataFrame) -> None:
+    """Make the horizontal axis that of a table's numbers of demonstrations."""
+    counts = sorted(set(table.demonstrations))
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(FixedLocator(counts))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.set_xticklabels([str(count) for count in counts])
+    axes.set_xlim(counts[0] / 1.3, counts[-1] * 1.3)
+    axes.set_xlabel("demonstrations")
+    axes.grid(alpha=0.3)
+
+
+def add_legend(
+    figure: Sheet, panels: Iterable[Axes], looks: Mapping[str, Mapping[str, Any]]
+) -> None:
+    """Each policy that is drawn once, below the panels, in the order of ``looks``."""
+    shown: dict[str, Any] = {}
+    for axes in panels:
+        handles, labels = axes.get_legend_handles_labels()
+        shown |= dict(zip(labels, handles, strict=True))
+    order = [look["label"] for look in looks.values() if look["label"] in shown]
+    figure.legend([shown[label] for label in order], order, loc="outside lower center", ncols=4)
+
+
+def write(figure: Sheet, path: Path) -> None:
+    """Write a figure in all formats; ``path`` has no suffix."""
+    for suffix in FORMATS:
+        save(figure, path.with_name(path.name + suffix))

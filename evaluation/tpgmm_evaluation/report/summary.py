@@ -21,13 +21,7 @@ from tpgmm_evaluation.report.failures import (
 )
 from tpgmm_evaluation.report.figures import draw_conditions, draw_success
 from tpgmm_evaluation.report.report import write_report
-from tpgmm_evaluation.report.significance import (
-    LEVEL,
-    PAIR,
-    PLACE,
-    REFERENCE,
-    paired,
-)
+from tpgmm_evaluation.report.significance import LEVEL, PAIR, PLACE, REFERENCE, paired
 from tpgmm_evaluation.report.tables import (
     cell_table,
     demonstration_table,

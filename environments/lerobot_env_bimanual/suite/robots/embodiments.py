@@ -13,11 +13,7 @@ from lerobot_env_bimanual.bottle.conditions import skill
 from lerobot_env_bimanual.robot_scene import robot_spec
 from lerobot_env_bimanual.suite.names import UPPER_BODY
 from lerobot_env_bimanual.suite.robots.g1 import g1_posture, g1_robot, g1_spec
-from lerobot_env_bimanual.suite.robots.viperx import (
-    viperx_posture,
-    viperx_robot,
-    viperx_spec,
-)
+from lerobot_env_bimanual.suite.robots.viperx import viperx_posture, viperx_robot, viperx_spec
 from tpgmm_torch import Robot
 from tpgmm_torch.exceptions import UnknownNameError
 
