@@ -169,13 +169,13 @@ class ControlledEnv(StateEnv):
     def _displace(self, step: NDArray[np.float64]) -> None:
         """Put the first object where it stood at the start, displaced, unless it is held."""
 
-    @abstractmethod
     def _put_on_path(self, instant: float) -> None:
         """Continue the task at an instant of its nominal path, at rest."""
+        raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
-    @abstractmethod
     def _instant(self) -> float:
         """Where on the nominal path the robot is [s]."""
+        raise NotImplementedError("no disturbance of this task puts the robot ahead")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -20,7 +20,7 @@ from tpgmm_evaluation.rollouts import Runner
 from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.variants import OPEN_LOOP
 from tpgmm_torch import Canonical
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.exceptions import UnknownNameError
 
 SETTINGS = Settings(
     options={"mode": "kinematic"},
@@ -101,20 +101,6 @@ def test_the_report_can_be_written_again(whole, tmp_path):
     path = rewrite_report(out, [].append)
     assert path.read_text() == before
     assert len(pd.read_parquet(out / "results.parquet")) == 4
-
-
-def test_a_folder_of_0_1_0_is_refused_and_taken_when_it_is_moved(folder, tmp_path):
-    old = replace(SETTINGS, demonstration_seed=0)
-    old.keep(tmp_path / "settings.json")
-    for call in (compared, rewrite_report):
-        with pytest.raises(DataError, match=r"layout of 0\.1\.0.*--demonstration-seed 0"):
-            call(tmp_path)
-    shutil.copytree(folder, tmp_path / SETTINGS.env)
-    (tmp_path / "settings.json").replace(tmp_path / SETTINGS.env / "settings.json")
-    with pytest.raises(DataError, match="demonstration_seed was 0, now None"):
-        compared(tmp_path)
-    policies = [NEAREST.policy, TPGMM.policy]
-    assert compare(old, tmp_path, policies, [3], say=[].append) == Comparison(2, {})
 
 
 def test_seeds_learn_from_demonstrations_of_their_own(whole, tmp_path):

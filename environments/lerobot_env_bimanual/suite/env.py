@@ -162,9 +162,3 @@ class SuiteEnv(ControlledEnv):
         self._scene.restore(snapshot)
         self._judge = copy.deepcopy(judge)
         self._watch_hands()
-
-    def _put_on_path(self, instant: float) -> None:
-        raise NotImplementedError("no disturbance of these tasks puts the robot ahead")
-
-    def _instant(self) -> float:
-        raise NotImplementedError("no disturbance of these tasks puts the robot ahead")

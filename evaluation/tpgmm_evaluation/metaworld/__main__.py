@@ -6,6 +6,7 @@ one with more episodes adds those that are new.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -131,7 +132,8 @@ def _limited(learner: Learner, budget: float) -> Learner:
 
 def settings_of(learner: Learner) -> dict[str, Any]:
     """All settings of a learner, as JSON holds them."""
-    return {key: _plain(value) for key, value in asdict(learner).items()}
+    text = json.dumps(asdict(learner), default=lambda kind: kind.__name__)
+    return dict(json.loads(text))
 
 
 def _kept(
@@ -141,20 +143,9 @@ def _kept(
     found = results.read(cell)
     if found is None or found["settings"] != settings:
         return []
-    episodes = found["episodes"]
-    seeds = [episode["seed"] for episode in episodes]
-    if seeds[: len(situations)] != [*situations][: len(seeds)]:
-        return []
-    return list(episodes)
-
-
-def _plain(value: Any) -> Any:
-    """What JSON makes of a value."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, type):
-        return value.__name__
-    return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value
+    seeds = [episode["seed"] for episode in found["episodes"]]
+    same = seeds[: len(situations)] == [*situations][: len(seeds)]
+    return list(found["episodes"]) if same else []
 
 
 def _measure(
@@ -196,8 +187,9 @@ def report(results: Results, out: Path) -> None:
     if not found:
         return
     experts = {(one["cell"]["env"], one["cell"]["seed"]): one["expert"] for one in found}
-    asked = sum(expert["episodes"] for expert in experts.values())
-    solved = sum(expert["successes"] for expert in experts.values())
+    asked, solved = (
+        sum(expert[key] for expert in experts.values()) for key in ("episodes", "successes")
+    )
     # its demonstrations are those of the training seed
     shown = [{"demonstration_seed": one["cell"]["seed"], **one["settings"]} for one in found]
     rows = [{**one, "settings": settings} for one, settings in zip(found, shown, strict=True)]

@@ -23,8 +23,7 @@ from lerobot_env_bimanual.metaworld.hand import (
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.settings import ControlConfig
 from tpgmm_evaluation.metaworld.nearness import Nearness
-from tpgmm_evaluation.metaworld.networks import NETWORKS, Network
-from tpgmm_evaluation.metaworld.perceptron import Perceptron
+from tpgmm_evaluation.metaworld.networks import NETWORKS, Network, Perceptron
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
 from tpgmm_torch.training.hold_detection import with_holds

@@ -12,18 +12,16 @@ import numpy as np
 import pandas as pd
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure as Sheet
+from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, PercentFormatter
 
-from lerobot_env_bimanual.bottle.measures import Figure
 from tpgmm_evaluation.jobs import POLICIES
 from tpgmm_evaluation.report.significance import REFERENCE
 from tpgmm_evaluation.report.tables import wilson
 from tpgmm_tools.plotting import BLUE, GREEN, ORANGE, PURPLE, SKY, STYLE, VERMILION, save
 
 __all__ = [
-    "draw_conditions", "draw_curves", "draw_errors", "draw_success", "line_of",
-    "success_panels", "write",
+    "draw_conditions", "draw_success", "line_of", "success_panels", "write",
 ]  # fmt: skip
 
 #: What is written of each figure: vectors for print, and something small for pages.
@@ -101,7 +99,7 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
     heights = [len(table) for table in rates.values()]
     conditions = list(next(iter(rates.values())).columns)
     size = (max(4.0, 0.36 * len(conditions) + 2.2), 0.3 * sum(heights) + 0.4 * len(rates) + 1.2)
-    figure = Sheet(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(
         len(rates), 1, squeeze=False, sharex=True, height_ratios=[h + 0.5 for h in heights]
     )[:, 0]
@@ -121,81 +119,6 @@ def draw_conditions(rates: Mapping[str, pd.DataFrame], path: Path) -> None:
     write(figure, path)
 
 
-@rc_context(STYLE)
-def draw_errors(episodes: pd.DataFrame, figures: Mapping[str, Figure], path: Path) -> None:
-    """Median and quartiles of each figure over the number of demonstrations.
-
-    All episodes are of one condition; ``path`` has no suffix.
-    """
-    shown = [key for key in figures if key in episodes]
-    figure, grid = panels_for(len(shown))
-    looks = _looks(episodes)
-    for axes, key in zip(grid, shown, strict=True):
-        for index, (policy, look) in enumerate(looks.items()):
-            groups = episodes[episodes.policy == policy].groupby("demonstrations")[key]
-            low, middle, high = (
-                groups.quantile(share, interpolation="nearest") for share in (0.25, 0.5, 0.75)
-            )
-            x = spread(list(middle.index), index, len(looks))
-            # no bar where a quartile is infinite
-            gaps = np.array((middle - low, high - middle))
-            axes.errorbar(x, middle, yerr=gaps, capsize=1.5, elinewidth=0.8, **look)
-        for bound in figures[key][2:]:
-            if 0 < bound < np.inf:
-                axes.axhline(bound, color="0.3", linestyle=":", linewidth=1)
-        over_demonstrations(axes, episodes)
-        axes.set_title(figures[key].heading, fontsize="medium")
-        positive = episodes[key][episodes[key] > 0]
-        if len(positive) and positive.max() > 30 * positive.median():
-            axes.set_yscale("log")
-    add_legend(figure, grid, looks)
-    write(figure, path)
-
-
-@rc_context(STYLE)
-def draw_curves(trainings: Iterable[Mapping[str, Any]], path: Path) -> None:
-    """Learning curves: losses over steps, and the error of the actions over time.
-
-    Parameters
-    ----------
-    trainings : iterable of mapping
-        ``policy``, ``demonstrations``, ``seed`` and ``curve``.
-    path : Path
-        Without suffix.
-    """
-    trainings = list(trainings)
-    policies = list(dict.fromkeys(item["policy"] for item in trainings))
-    counts = sorted({item["demonstrations"] for item in trainings})
-    figure = Sheet(figsize=(2.2 * len(policies) + 1.2, 4.4), layout="constrained")
-    grid = figure.subplots(2, len(policies), squeeze=False, sharey="row")
-    for item in trainings:
-        column = policies.index(item["policy"])
-        colour = COLOURS[counts.index(item["demonstrations"]) % len(COLOURS)]
-        curve = pd.DataFrame(item["curve"])
-        upper, lower = grid[0, column], grid[1, column]
-        upper.plot(curve.step, curve.train_loss, ":", color=colour)
-        upper.plot(curve.step, curve.validation_loss, "-", color=colour)
-        errors = 1e3 * curve.validation_error
-        lower.plot(curve.seconds / 60, errors, color=colour)
-        best = errors.idxmin()
-        lower.plot(curve.seconds[best] / 60, errors[best], "o", color=colour, markersize=5)
-    for column, policy in enumerate(policies):
-        grid[0, column].set_title(policy, fontsize="medium")
-        grid[0, column].set_xlabel("training steps")
-        grid[1, column].set_xlabel("minutes of one processor")
-        grid[0, column].set_yscale("log")
-        grid[1, column].set_ylim(bottom=0)
-        for axes in grid[:, column]:
-            axes.grid(alpha=0.3)
-    grid[0, 0].set_ylabel("loss (dotted: training,\nsolid: held-out episodes)")
-    grid[1, 0].set_ylabel("error of the actions,\nheld-out episodes [mrad]")
-    for index, count in enumerate(counts):
-        colour = COLOURS[index % len(COLOURS)]
-        grid[0, 0].plot([], [], color=colour, label=f"{count} demonstrations")
-    figure.legend(loc="outside upper center", ncols=len(counts))
-    write(figure, path)
-
-
 def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, Any]:
     """What all lines of a policy look like."""
     return {
@@ -210,12 +133,12 @@ def line_of(label: str, colour: str, marker: str, line: Any = "-") -> dict[str, 
 
 def panels_for(
     count: int, *, narrowest: float = 0.0, sharey: bool = False
-) -> tuple[Sheet, list[Axes]]:
+) -> tuple[Figure, list[Axes]]:
     """A figure of so many panels, row by row, of at least a width [inch]."""
     columns = min(COLUMNS, count)
     rows = math.ceil(count / columns)
     size = (max(narrowest, 1.9 * columns + 0.6), 2.1 * rows + 0.8)
-    figure = Sheet(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False, sharey=sharey).ravel()
     for axes in grid[count:]:
         axes.remove()
@@ -223,7 +146,7 @@ def panels_for(
 
 
 @rc_context(STYLE)
-def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Sheet:
+def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Success over the number of demonstrations: a panel for each environment.
 
     Lines join the shares of all episodes with their 95 % intervals (Wilson), small dots are the
@@ -239,7 +162,7 @@ def success_panels(episodes: pd.DataFrame, looks: Mapping[str, Mapping[str, Any]
 
     Returns
     -------
-    Sheet
+    Figure
     """
     tasks = list(dict.fromkeys(episodes.env))
     figure, grid = panels_for(len(tasks), narrowest=4.2, sharey=True)
@@ -294,7 +217,7 @@ def over_demonstrations(axes: Axes, table: pd.DataFrame) -> None:
 
 
 def add_legend(
-    figure: Sheet, panels: Iterable[Axes], looks: Mapping[str, Mapping[str, Any]]
+    figure: Figure, panels: Iterable[Axes], looks: Mapping[str, Mapping[str, Any]]
 ) -> None:
     """Each policy that is drawn once, below the panels, in the order of ``looks``."""
     shown: dict[str, Any] = {}
@@ -305,7 +228,7 @@ def add_legend(
     figure.legend([shown[label] for label in order], order, loc="outside lower center", ncols=4)
 
 
-def write(figure: Sheet, path: Path) -> None:
+def write(figure: Figure, path: Path) -> None:
     """Write a figure in all formats; ``path`` has no suffix."""
     for suffix in FORMATS:
         save(figure, path.with_name(path.name + suffix))

@@ -8,14 +8,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from lerobot_env_bimanual.disturbances import NOMINAL, parse_condition
 from tpgmm_evaluation.cells import Cell
 from tpgmm_evaluation.report import pages
 from tpgmm_evaluation.report.failures import criterion, evaluation_command
-from tpgmm_evaluation.report.figures import draw_curves, draw_errors, draw_success
-from tpgmm_evaluation.report.tables import cell_table, demonstration_table, episode_table
+from tpgmm_evaluation.report.tables import cell_table, episode_table
 from tpgmm_evaluation.settings import Settings
 
 __all__ = ["write_report"]
@@ -27,7 +24,7 @@ def write_report(
     results: Sequence[Mapping[str, Any]],
     failures: Mapping[Cell, str],
 ) -> Path:
-    """Write tables, figures and ``report.md``.
+    """Write ``report.md``.
 
     Parameters
     ----------
@@ -46,35 +43,24 @@ def write_report(
     out.mkdir(parents=True, exist_ok=True)
     paragraphs = [f"# What demonstrations buy: {settings.env}"]
     if results:
-        cells, episodes = cell_table(results), episode_table(results)
-        paragraphs += _Sections(out, settings, results, cells, episodes)
+        paragraphs += _Sections(settings, results)
     paragraphs += pages.failed_cells("Cells that failed", failures)
     return pages.write_page(out / "report.md", paragraphs)
 
 
 class _Sections:
-    """Text and pictures of a comparison: its paragraphs, in Markdown.
+    """Paragraphs of a comparison in one environment, in Markdown.
 
     Parameters
     ----------
-    out : Path
-        Where pictures go, in the folder ``figures``.
     results : sequence of mapping
         Of all finished cells.
-    cells, episodes : DataFrame
-        The same as tables.
     """
 
-    def __init__(
-        self,
-        out: Path,
-        settings: Settings,
-        results: Sequence[Mapping[str, Any]],
-        cells: pd.DataFrame,
-        episodes: pd.DataFrame,
-    ) -> None:
-        self.out, self.settings, self.results = out, settings, results
-        self.cells, self.episodes = cells, episodes
+    def __init__(self, settings: Settings, results: Sequence[Mapping[str, Any]]) -> None:
+        self.settings, self.results = settings, results
+        self.cells, self.episodes = cell_table(results), episode_table(results)
+        episodes, cells = self.episodes, self.cells
         self.nominal = episodes[episodes.condition == NOMINAL]
         self.benchmark = settings.benchmark()
         self.policies = pages.ordered(cells.policy)
@@ -87,13 +73,11 @@ class _Sections:
     def __iter__(self) -> Iterator[str]:
         yield from self._introduction()
         if len(self.nominal):
-            yield from self._success()
             yield from self._criteria()
             yield from self._errors()
         yield from self._conditions()
         yield from self._baselines()
         yield from self._recipes()
-        yield from pages.cost_table(self.cells)
         yield "## What to keep in mind"
         yield pages.bullets(self._remarks())
         yield from self._settings()
@@ -114,15 +98,6 @@ class _Sections:
         if seed is not None:
             return f"the LeRobot data set `episodes/s{seed}/training`"
         return "the LeRobot data sets `episodes/sS/training`, another draw for each seed S"
-
-    def _success(self) -> Iterator[str]:
-        yield "## Success"
-        yield "Successful episodes, and the 95 % interval of their share (Wilson)."
-        head = ["policy", *(f"{count} demonstrations" for count in self.counts)]
-        yield pages.table(head, pages.success_rows(self.nominal, self.counts))
-        if self.nominal.policy.nunique() > 1:
-            draw_success(self.nominal, pages.picture(self.out, "success_nominal"))
-            yield "![Success over demonstrations](figures/success_nominal.webp)"
 
     def _conditions(self) -> Iterator[str]:
         """Everything beside the nominal condition, in one table for each number."""
@@ -188,9 +163,6 @@ class _Sections:
             for policy, rows in pages.by_policy(part)
         )
         yield pages.figure_table(["demonstrations", "policy"], groups, figures)
-        draw_errors(self.nominal, figures, pages.picture(self.out, "errors"))
-        yield "Dotted: what a success allows."
-        yield "![Median and quartiles of the errors](figures/errors.webp)"
 
     def _baselines(self) -> Iterator[str]:
         trained = {key: item for key, item in self.trainings.items() if item["curve"]}
@@ -217,14 +189,6 @@ class _Sections:
             rows.append([*key, steps, f"{minutes:.1f}", f"{error:.2f}", at, item["outcome"]])
         columns = ("steps", "minutes", "least error [mrad]", "at step", "why it ended")
         yield pages.table(["policy", "demonstrations", "seed", *columns], rows)
-        draw_curves(
-            [
-                {"policy": p, "demonstrations": n, "seed": s, "curve": item["curve"]}
-                for (p, n, s), item in trained.items()
-            ],
-            pages.picture(self.out, "learning_curves"),
-        )
-        yield "![Learning curves](figures/learning_curves.webp)"
 
     def _recipes(self) -> Iterator[str]:
         """Everything that was chosen for a policy, and what it found in the demonstrations."""
@@ -236,25 +200,6 @@ class _Sections:
 
     def _remarks(self) -> Iterator[str]:
         """What the data say about themselves."""
-        for row in demonstration_table(self.out).itertuples():
-            yield (
-                f"By the environment's own criteria {row.succeed} of {row.tried} attempts at "
-                f"demonstrations of seed {row.seed} succeed; the others are not learned from."
-            )
-        yield pages.uncertainty(self.settings.episodes)
-        seeds = self.cells.seed.nunique()
-        if seeds == 1:
-            yield (
-                "Each policy was trained with one seed: the intervals say how much the choice "
-                "of situations matters, not how much other demonstrations or another training "
-                "would change."
-            )
-        else:
-            yield (
-                f"Episodes of {seeds} training seeds are taken together; the intervals treat "
-                "them as independent, which episodes of one training are not quite: look at "
-                "the dots of the figure too."
-            )
         ended = [
             f"{policy} ({count}: the error fell by {100 * _late_gain(item['curve']):.0f} %)"
             for (policy, count, _), item in self.trainings.items()

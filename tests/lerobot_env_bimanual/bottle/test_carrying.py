@@ -153,7 +153,9 @@ def test_situations_are_those_of_the_generator():
     env.reset(seed=7)
     [situation] = carrying().situations(1, seed=7)
     np.testing.assert_array_equal(env._start.joints, situation.joints)
-    np.testing.assert_array_equal(env._start.poses["bottle"][:3], situation.frames["bottle"].position)
+    np.testing.assert_array_equal(
+        env._start.poses["bottle"][:3], situation.frames["bottle"].position
+    )
     slides = []
     for seed in range(100):
         env.reset(seed=seed)

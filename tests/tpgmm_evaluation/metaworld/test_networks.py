@@ -9,7 +9,7 @@ import pytest
 from tests.support.reaching import reaching
 from tpgmm_evaluation.metaworld.__main__ import settings_of
 from tpgmm_evaluation.metaworld.learners import LEARNERS
-from tpgmm_evaluation.metaworld.perceptron import Perceptron, features
+from tpgmm_evaluation.metaworld.networks import Perceptron, features
 
 
 def test_networks_are_told_where_the_hand_is_as_seen_from_objects():

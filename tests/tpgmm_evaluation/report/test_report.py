@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.support.comparison import DISTURBED, RESULTS, result
+from tests.support.comparison import DISTURBED, RESULTS
 from tpgmm_evaluation.cells import Cell
 from tpgmm_evaluation.report.report import write_report
 from tpgmm_evaluation.settings import Settings
@@ -15,21 +15,12 @@ def report(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     failures = {Cell("bottle_shaking", "diffusion", 5, 0): "bad luck"}
     write_report(folder, SETTINGS, RESULTS + DISTURBED, failures)
-    text = (folder / "report.md").read_text()
-    pictures = [line.partition("(")[2][:-1] for line in text.splitlines() if line[:2] == "!["]
-    assert len(pictures) == 3
-    for picture in pictures:
-        assert (folder / picture).stat().st_size > 10_000
-        assert (folder / picture).with_suffix(".pdf").stat().st_size > 5_000
-    return text
+    return (folder / "report.md").read_text()
 
 
 @pytest.mark.parametrize(
     "line",
     [
-        "| tpgmm | 20/20 = 100 % (84 to 100 %) | 20/20 = 100 % (84 to 100 %) |",
-        "| act | 0/20 = 0 % (0 to 16 %) | 18/20 = 90 % (70 to 97 %) |",
-        "| nearest | 0/20 = 0 % (0 to 16 %) | - |",
         # conditions
         '- `pushes+noise`: `{"pushes": true}`. `{"noise": 1.0}`.',
         "- `stopped-3`: The drives stop, and hold the joints where they are: a protective",
@@ -44,23 +35,14 @@ def report(tmp_path_factory):
         "| 10 | act | 1.0 / inf | ",
         # training
         "| act | 5 | 0 | 600 | 0.5 | 20.00 | 400 | it stopped falling |",
-        "| act | 12.0 | 1 234 567 | 5.0 | 10 | 0.50 | 0.50 | 8 | 0.50 | 0.50 | ",
         # remarks
         "- The budget ended the training of act (10: the error fell by 67 %); in brackets",
-        "- Each policy was trained with one seed",
         "- `bottle_shaking-diffusion-n5-s0-nominal`: bad luck",
         "lerobot-eval --policy.path=policies/NAME --policy.device=cpu --env.type=bottle_",
     ],
 )
 def test_the_report_says(report, line):
     assert line in report
-
-
-def test_several_seeds_are_taken_together(tmp_path):
-    results = [result("tpgmm", 5, 20), result("tpgmm", 5, 10, seed=1)]
-    text = write_report(tmp_path, SETTINGS, results, {}).read_text()
-    assert "| tpgmm | 30/40 = 75 % (" in text
-    assert "Episodes of 2 training seeds are taken together" in text
 
 
 def test_a_report_names_the_cells_that_failed(tmp_path):
