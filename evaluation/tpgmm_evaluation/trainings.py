@@ -34,6 +34,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.structure.select_operators import SelectOperators
 
 __all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
 
@@ -64,15 +65,17 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     if not benchmark.synchronous:
         warping = DynamicTimeWarping(robot=benchmark.robot)
         demonstrations = warping.fit_transform(demonstrations)
-    model = TaskParameterizedGMM(
-        settings.n_components or benchmark.n_components,
-        operators_of(base, benchmark),
-        benchmark.robot,
-        random_state=cell.seed,
+    robot = benchmark.robot
+    operators = (
+        SelectOperators(robot=robot).fit(attach_holds(demonstrations, robot)).operators_
+        if base == "tpgmm-auto"
+        else operators_of(base, benchmark)
     )
-    kept = drop_outliers(demonstrations, operators_of(base, benchmark), benchmark.robot)
+    n_components = settings.n_components or benchmark.n_components
+    model = TaskParameterizedGMM(n_components, operators, robot, random_state=cell.seed)
+    kept = drop_outliers(demonstrations, operators, robot)
     policy = TPGMMPolicy.from_estimator(
-        model.fit(attach_holds(kept, benchmark.robot)),
+        model.fit(attach_holds(kept, robot)),
         fps=benchmark.rate,
         environment_names=_environment_names(episodes / "training"),
     )
@@ -82,7 +85,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
     return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)
 
 
-def operators_of(base: str, benchmark: Benchmark) -> list[Operator] | str:
+def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
     """What TP-GMM is told to learn in, when one of its parts is removed.
 
     Parameters
@@ -91,8 +94,6 @@ def operators_of(base: str, benchmark: Benchmark) -> list[Operator] | str:
         ``"tpgmm"`` or an ablation.
     benchmark : Benchmark
     """
-    if base == "tpgmm-auto":
-        return "auto"
     operators = benchmark.operators(
         orientation=base != "tpgmm-position-only", held=base != "tpgmm-places"
     )

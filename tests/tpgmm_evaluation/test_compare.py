@@ -253,4 +253,3 @@ def test_without_joints_grippers_keep_their_coordinate():
     assert joints.joints == ("left_arm_gripper", "right_arm_gripper")
     bottle = trainings.operators_of("tpgmm-no-joints", benchmark("bottle_shaking"))
     assert not [one for one in bottle if isinstance(one, Canonical)]
-    assert trainings.operators_of("tpgmm-auto", benchmark("bottle_shaking")) == "auto"
