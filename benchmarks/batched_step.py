@@ -31,13 +31,9 @@ def measure(settings: Settings) -> Iterator[Row]:
     measurements["one clock, compiled"] = per_call(work, 1)
     taken = medians(in_turns(measurements, rounds, warm_up=True))
     for name in measurements:
-        yield Row(
-            f"model.step, {n_robots} robots, {name}, float32, mean and covariance: per robot",
-            "us",
-            1e6 * taken[name] / n_robots,
-            asked=settings.asked("most", 14 if "compiled" in name else 25),
-            rounds=rounds,
-        )
+        work = f"model.step, {n_robots} robots, {name}, float32, mean and covariance: per robot"
+        asked = settings.asked("most", 14 if "compiled" in name else 25)
+        yield Row(work, "us", 1e6 * taken[name] / n_robots, asked=asked, rounds=rounds)
 
 
 def tick(

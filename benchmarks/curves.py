@@ -17,6 +17,7 @@ __all__ = ["measure"]
 
 COMPONENTS, WIDTH = 10, 16
 EM = "EM iteration [ms]"
+POINTS, NUMBERS = (650, 2_600, 10_400, 41_600, 166_400), (2, 5, 10, 20, 50)
 
 
 @dataclass(frozen=True)
@@ -50,27 +51,18 @@ def measure(settings: Settings) -> Iterator[Row]:
         return {"ours": 1e6 * taken / n_robots}
 
     two = (WIDTH, WIDTH)
+    k, at, width = f"K = {components}", f"N = {usual}", f"D = 2 x {WIDTH}"
     curves = [
+        _Curve(f"points N ({k}, {width})", POINTS, EM, lambda n: em(n, components, two)),
+        _Curve(f"components K ({at}, {width})", NUMBERS, EM, lambda n: em(usual, n, two)),
         _Curve(
-            f"points N (K = {components}, D = 2 x {WIDTH})",
-            (650, 2_600, 10_400, 41_600, 166_400),
-            EM,
-            lambda n: em(n, components, two),
-        ),
-        _Curve(
-            f"components K (N = {usual}, D = 2 x {WIDTH})",
-            (2, 5, 10, 20, 50),
-            EM,
-            lambda n: em(usual, n, two),
-        ),
-        _Curve(
-            f"columns D, half in each block (N = {usual}, K = {components})",
+            f"columns D, half in each block ({at}, {k})",
             (8, 16, 32, 64),
             EM,
             lambda n: em(usual, components, (n // 2, n // 2)),
         ),
         _Curve(
-            f"blocks P of {WIDTH} columns (N = {usual}, K = {components})",
+            f"blocks P of {WIDTH} columns ({at}, {k})",
             (1, 2, 3, 4),
             EM,
             lambda n: em(usual, components, (WIDTH,) * n),
@@ -84,14 +76,11 @@ def measure(settings: Settings) -> Iterator[Row]:
     _draw(curves, costs, settings)
     for curve, by_number in zip(curves, costs, strict=True):
         for number, cost in by_number.items():
-            yield Row(
-                f"{number} {curve.title}",
-                curve.ylabel.partition("[")[2].rstrip("]"),
-                cost["ours"],
-                "scikit-learn, full" if "scikit-learn" in cost else "",
-                cost.get("scikit-learn"),
-                rounds=rounds,
-            )
+            unit = curve.ylabel.partition("[")[2].rstrip("]")
+            theirs = cost.get("scikit-learn")
+            other = "" if theirs is None else "scikit-learn, full"
+            work = f"{number} {curve.title}"
+            yield Row(work, unit, cost["ours"], other, theirs, rounds=rounds)
 
 
 def _draw(

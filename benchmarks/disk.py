@@ -62,16 +62,11 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
         found = ask("disk", folder.resolve(), n_components, rounds, settings.seed)
     finally:
         shutil.rmtree(folder)
-    yield Row(
-        f"{work}: one pass",
-        "s",
-        found["ours"],
-        "pyarrow reads the same columns",
-        found["pyarrow"],
-        settings.asked("times", 4),
-        rounds=rounds,
-        note="files in the system's cache, read once into another",
-    )
+    note = "files in the system's cache, read once into another"
+    beside = ("pyarrow reads the same columns", found["pyarrow"])
+    asked = settings.asked("times", 4)
+    name = f"{work}: one pass"
+    yield Row(name, "s", found["ours"], *beside, asked, rounds=rounds, note=note)
     if found["peak"] is None:
         yield Omitted(f"{work}: peak memory", "it cannot be read on this system")
     else:
@@ -93,7 +88,6 @@ def _write(folder: Path, n_rows: int, seed: int) -> None:
 
 
 def _in_turns(folder: Path, n_components: int, rounds: int, seed: int) -> dict[str, object]:
-    peak = None
     try:
         reset_peak()
         peak_is_known = True
@@ -114,9 +108,7 @@ def _in_turns(folder: Path, n_components: int, rounds: int, seed: int) -> dict[s
 
     measurements = {"pyarrow": lambda: seconds(read), "ours": per_iteration(fit, 1, 4)}
     taken = medians(in_turns(measurements, rounds))
-    if peak_is_known:
-        peak = peak_memory() / 1e9
-    return {**taken, "peak": peak}
+    return {**taken, "peak": peak_memory() / 1e9 if peak_is_known else None}
 
 
 if __name__ == "__main__":

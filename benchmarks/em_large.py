@@ -16,9 +16,11 @@ __all__ = ["measure"]
 
 #: Number of components -> ratios asked for: dense, gated, gated in float32.
 ASKED = {10: (5, 7.5, 7), 50: (11, 34, 22)}
-NOTE = (
+#: Of rows that are not gated over time, and of those that are.
+NOTES = (
+    "times are shuffled, so that no component is left out",
     "points that are far in time from a component leave it out; the share of the peak counts "
-    "the arithmetic of all components"
+    "the arithmetic of all components",
 )
 
 
@@ -50,15 +52,10 @@ def _rows(settings: Settings, problem: Problem, asked: tuple[float, ...]) -> Ite
     taken = medians(every)
     for (name, (_, dtype)), figure in zip(fits.items(), asked, strict=True):
         flops = flops_of_iteration(n_points, n_components, BLOCKS)
-        yield Row(
-            f"EM iteration, N = {n_points}, K = {n_components}, {name}",
-            "s",
-            taken[name],
-            f"scikit-learn, full, {dtype}, {len(every[dtype])} round(s)",
-            taken[dtype],
-            settings.asked("faster", figure),
-            flops / taken[name] / peak(getattr(torch, dtype)),
-            len(every[name]),
-            NOTE if "gated" in name else "times are shuffled, so that no component is left out",
-        )
+        share = flops / taken[name] / peak(getattr(torch, dtype))
+        work = f"EM iteration, N = {n_points}, K = {n_components}, {name}"
+        other = f"scikit-learn, full, {dtype}, {len(every[dtype])} round(s)"
+        asked, n = settings.asked("faster", figure), len(every[name])
+        note = NOTES["gated" in name]
+        yield Row(work, "s", taken[name], other, taken[dtype], asked, share, n, note)
     gc.collect()

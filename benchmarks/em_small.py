@@ -21,13 +21,12 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     """One iteration from a given start, and one of each of ten starts."""
     n_points, n_components = settings.size(13_000, 650), settings.size(10, 3)
     problem = Problem.of(motions(n_points, seed=settings.seed), n_components)
-    ours, starts = mixtures.ours(problem), mixtures.restarts(problem, STARTS)
+    ours, starts = mixtures.ours(problem), mixtures.ours(problem, n_init=STARTS)
+    few, many = settings.iterations(2, 7), settings.iterations(2, 12)
     measurements: dict[str, Measurement] = {
-        "ours": per_iteration(ours, *settings.iterations(2, 12)),
-        "scikit-learn": per_iteration(
-            mixtures.scikit_learn(problem), *settings.iterations(2, 7)
-        ),
-        "restarts": per_iteration(starts, *settings.iterations(2, 12)),
+        "ours": per_iteration(ours, *many),
+        "scikit-learn": per_iteration(mixtures.scikit_learn(problem), *few),
+        "restarts": per_iteration(starts, *many),
     }
     for name, other in OTHERS.items():
         fit = _available(name, other, problem)
@@ -40,26 +39,11 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     flops = flops_of_iteration(n_points, n_components, BLOCKS) / peak(torch.float64)
     milli = {name: 1e3 * value for name, value in taken.items()}
     work = f"EM iteration, N = {n_points}, K = {n_components}, float64"
-    yield Row(
-        work,
-        "ms",
-        milli["ours"],
-        "scikit-learn, full",
-        milli["scikit-learn"],
-        settings.asked("faster", 4.5),
-        flops / taken["ours"],
-        rounds,
-    )
-    yield Row(
-        f"{work}, per start of {STARTS}",
-        "ms",
-        milli["restarts"] / STARTS,
-        "scikit-learn, full",
-        milli["scikit-learn"],
-        settings.asked("faster", 9),
-        flops * STARTS / taken["restarts"],
-        rounds,
-    )
+    theirs = ("scikit-learn, full", milli["scikit-learn"])
+    for name, starts, figure in (("", 1, 4.5), (f", per start of {STARTS}", STARTS, 9)):
+        each = (milli["restarts"] if name else milli["ours"]) / starts
+        asked, share = settings.asked("faster", figure), 1e3 * flops / each
+        yield Row(work + name, "ms", each, *theirs, asked, share, rounds)
     for name in OTHERS:
         if name in milli:
             yield Row(work, "ms", milli["ours"], f"{name}, full", milli[name], rounds=rounds)

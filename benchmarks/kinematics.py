@@ -27,37 +27,21 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
     postures = robot.lower + span * torch.rand(many, 17, dtype=span.dtype, generator=generator)
     rows = list(postures.numpy())
     calls, rounds = settings.size(300, 3), settings.rounds(9)
+    measurements = {
+        "one": per_call(lambda: robot.state(postures[0]), calls),
+        "one, theirs": per_call(lambda: theirs(rows[0]), calls),
+        "many": per_call(lambda: robot.state(postures), 1),
+        "many, theirs": per_call(lambda: list(map(theirs, rows)), 1),
+    }
     with torch.inference_mode():
-        taken = medians(
-            in_turns(
-                {
-                    "one": per_call(lambda: robot.state(postures[0]), calls),
-                    "one, theirs": per_call(lambda: theirs(rows[0]), calls),
-                    "many": per_call(lambda: robot.state(postures), 1),
-                    "many, theirs": per_call(lambda: list(map(theirs, rows)), 1),
-                },
-                rounds,
-                warm_up=settings.full,
-            )
-        )
+        taken = medians(in_turns(measurements, rounds, warm_up=settings.full))
     micro = {name: 1e6 * value for name, value in taken.items()}
     work = "Robot.state: poses and Jacobians of two hands, 17 joints, float64"
-    yield Row(
-        f"{work}, one posture",
-        "us",
-        micro["one"],
-        "pinocchio, in numpy",
-        micro["one, theirs"],
-        rounds=rounds,
-    )
-    yield Row(
-        f"{work}, {many} postures: per posture",
-        "us",
-        micro["many"] / many,
-        "pinocchio, one after the other",
-        micro["many, theirs"] / many,
-        rounds=rounds,
-    )
+    one = ("pinocchio, in numpy", micro["one, theirs"])
+    yield Row(f"{work}, one posture", "us", micro["one"], *one, rounds=rounds)
+    each = ("pinocchio, one after the other", micro["many, theirs"] / many)
+    work += f", {many} postures: per posture"
+    yield Row(work, "us", micro["many"] / many, *each, rounds=rounds)
 
 
 def _pinocchio() -> Callable[[object], object]:

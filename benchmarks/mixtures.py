@@ -15,34 +15,23 @@ from sklearn.mixture import GaussianMixture
 from benchmarks.points import Problem
 from tpgmm_torch import BlockGaussianMixture
 
-__all__ = ["gmr", "ours", "pomegranate", "restarts", "scikit_learn"]
+__all__ = ["gmr", "ours", "pomegranate", "scikit_learn"]
 
 Fit = Callable[[int], object]
 
 
-def ours(problem: Problem, dtype: str = "float64") -> Fit:
-    """Our own: blocks as they are."""
+def ours(problem: Problem, dtype: str = "float64", n_init: int = 1) -> Fit:
+    """Our own: blocks as they are, from the start given, or from so many others."""
     points = problem.points.astype(dtype, copy=False)
-
-    def fit(n: int) -> object:
-        settings = {"blocks": problem.blocks, "tol": 0.0, "max_iter": n, "dtype": dtype}
-        with warnings.catch_warnings(action="ignore", category=ConvergenceWarning):
-            mixture = BlockGaussianMixture(len(problem.weights), **settings)
-            return mixture.fit(points, start=problem.start)
-
-    return fit
-
-
-def restarts(problem: Problem, n_init: int, dtype: str = "float64") -> Fit:
-    """Our own with so many starts, each of n iterations."""
-    points = problem.points.astype(dtype, copy=False)
+    start = problem.start if n_init == 1 else None
 
     def fit(n: int) -> object:
         settings = {"blocks": problem.blocks, "tol": 0.0, "max_iter": n, "dtype": dtype}
         with warnings.catch_warnings(action="ignore"):
-            return BlockGaussianMixture(
+            mixture = BlockGaussianMixture(
                 len(problem.weights), n_init=n_init, random_state=0, **settings
-            ).fit(points)
+            )
+            return mixture.fit(points, start=start)
 
     return fit
 

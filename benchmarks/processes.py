@@ -33,24 +33,12 @@ def measure(settings: Settings) -> Iterator[Row | Omitted]:
         return
     arguments = (n_points, n_components, rounds, settings.seed)
     taken = ask("processes", *arguments, launcher=LAUNCHER)
-    yield Row(
-        work,
-        "s",
-        taken["two"][0],
-        "ours in one process",
-        taken["one"][0],
-        settings.asked("faster", 1.85),
-        rounds=rounds,
-    )
-    yield Row(
-        f"{work}: processor time of the busier",
-        "s",
-        taken["two"][1],
-        "ours in one process",
-        taken["one"][1],
-        rounds=rounds,
-        note="what is left when the other core is free: the row before needs two that are",
-    )
+    asked, other = settings.asked("faster", 1.85), "ours in one process"
+    (wall, busy), (alone, busy_alone) = taken["two"], taken["one"]
+    yield Row(work, "s", wall, other, alone, asked, rounds=rounds)
+    note = "what is left when the other core is free: the row before needs two that are"
+    work += ": processor time of the busier"
+    yield Row(work, "s", busy, other, busy_alone, rounds=rounds, note=note)
 
 
 def _in_turns(

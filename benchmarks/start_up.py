@@ -26,19 +26,14 @@ def measure(settings: Settings) -> Iterator[Row]:
         package += ask("start_up", "tpgmm_torch")
         parts.append(ask("start_up", *MODULES))
     torch = median(part[0] for part in parts)
+    note = "PyTorch and scikit-learn are loaded when first needed: the next rows"
+    asked, beside = settings.asked("times", 1.5), ("import torch", torch)
     yield Row(
-        "import tpgmm_torch",
-        "s",
-        median(package),
-        "import torch",
-        torch,
-        settings.asked("times", 1.5),
-        rounds=rounds,
-        note="PyTorch and scikit-learn are loaded when first needed: the next rows",
+        "import tpgmm_torch", "s", median(package), *beside, asked, rounds=rounds, note=note
     )
     whole = median(map(sum, parts))
     work = "from tpgmm_torch import TaskParameterizedGMM"
-    yield Row(work, "s", whole, "import torch", torch, rounds=rounds)
+    yield Row(work, "s", whole, *beside, rounds=rounds)
     both = median(part[0] + part[1] for part in parts)
     yield Row(work, "s", whole, "import torch, sklearn.base", both, rounds=rounds)
 

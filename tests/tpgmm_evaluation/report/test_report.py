@@ -27,7 +27,7 @@ def report(tmp_path_factory):
         "| nominal | tpgmm | 20/20 = 100 % (84 to 100 %) | 1.0 / 1.0 |",
         "| stopped-3 | tpgmm-open-loop | 2/20 = 10 % (3 to 30 %) | inf / inf |",
         "| pushes+noise | tpgmm | 17/20 = 85 % (64 to 95 %) | 1.0 / inf |",
-        "- **tpgmm --policy.control.blend=0**: tpgmm with `blend=0`",
+        "- **tpgmm --policy.control.blend=0**: tpgmm with `control.blend=0`",
         "played by the clock with what is seen at the start, as in 0.1.0",
         # criteria, at ten demonstrations
         "| act | 90 % | 100 % | 100 % | 100 % | 50 % |",
