@@ -61,8 +61,9 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("lerobot_format", "async_server"),
     ),
     "lerobot_env_bimanual": (
-        ("control_rate", "disturbances", "rendering", "start"),
+        ("control_rate", "disturbances", "rendering"),
         ("base", "robot_scene"),
+        ("start",),
         ("controlled",),
         ("aloha", "bottle"),
         ("metaworld", "suite"),

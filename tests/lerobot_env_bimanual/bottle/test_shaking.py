@@ -18,6 +18,7 @@ from lerobot_env_bimanual.bottle.shaking import (
     FREQUENCY,
     BottleShakingEnv,
 )
+from lerobot_env_bimanual.controlled import ControlledEnv
 from lerobot_env_bimanual.start import PUSHED
 from tpgmm_datasets.bottle.sinusoid import sinusoid
 from tpgmm_datasets.bottle.skill import SHOULDERS, BottleShaking
@@ -238,7 +239,10 @@ def test_lerobot_makes_fifty_of_them():
 
 
 def test_every_option_of_the_environment_is_one_of_the_configuration():
-    options = BottleShakingEnv.__init__.__kwdefaults__
+    options = {
+        **ControlledEnv.__init__.__kwdefaults__,
+        **BottleShakingEnv.__init__.__kwdefaults__,
+    }
     config = make_env_config("bottle_shaking", frequency=1.0, amplitude=0.1, episode_length=9)
     assert set(config.gym_kwargs) == set(options)
     chosen = made(**config.gym_kwargs)

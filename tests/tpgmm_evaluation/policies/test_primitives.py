@@ -7,6 +7,7 @@ import torch
 
 from tests.support.learned_sets import aligned, played, recorded, shaking
 from tpgmm_evaluation.policies.aligned import Aligned
+from tpgmm_evaluation.policies.planned import Observed
 from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
 from tpgmm_torch.exceptions import DependencyError
 
@@ -33,9 +34,8 @@ def test_a_promp_passes_through_the_posture_it_is_conditioned_on():
     [situation] = shaking().situations(1, seed=12)
     bottle, move = situation.frames["bottle"], policy.moves[0]
     frames = {"bottle": bottle}
-    vias = policy.postures(move, situation.joints, frames, frames)
-    args = situation.joints, situation.joints, frames, frames, 0
-    longer = policy.references(*args)
+    seen = Observed(situation.joints, situation.joints, frames, frames, 0)
+    vias, longer = policy.postures(move, seen), policy.references(seen)
     # the last one is that in which the next move begins
     on_the_way = list(zip(move.steps, vias, strict=True))[:-1]
     assert len(on_the_way) >= 2
@@ -63,5 +63,5 @@ def test_saved_and_from_one_demonstration(tmp_path):
 
 def test_a_missing_library(monkeypatch):
     monkeypatch.setitem(sys.modules, "movement_primitives.dmp", None)
-    with pytest.raises(DependencyError, match=r"lerobot_policy_tpgmm\[evaluation\]"):
+    with pytest.raises(DependencyError, match=r"tpgmm_evaluation\[compare\]"):
         DMPPolicy.fit(aligned(shaking()))

@@ -135,7 +135,7 @@ def test_alone_it_has_nothing_to_lose_to(tmp_path):
         ("Errors", "| 10 | nearest | 1.00 / 1.00 | 1.00 / 1.00 | 1 / 1 |"),
         (
             "What it costs",
-            "| tpgmm | 12.0 | 1 234 567 | 5.0 | 10 | 0.50 | 0.50 | 0 | 0.50 | 0.50 | - |",
+            "| tpgmm | 12.0 | 1 234 567 | 5.0 | 10 | 0.50 | 0.50 | 8 | 0.50 | 0.50 | - |",
         ),
         ("Demonstrations", "| bottle_shaking | 0 | 49/51 = 96 % (87 to 99 %) | **no** |"),
         ("Demonstrations", f"| {CARRY} | 0 | 50/50 = 100 % (93 to 100 %) | yes |"),
