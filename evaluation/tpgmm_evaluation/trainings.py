@@ -43,7 +43,6 @@ ABLATIONS = ("tpgmm-places", "tpgmm-position-only", "tpgmm-no-joints", "tpgmm-au
 #: How nearest-neighbour regression is set; chosen as all recipes, on other seeds.
 NEIGHBOURS: dict[str, Any] = {
     "n_neighbours": 3,
-    "relative": False,
     "environment_weight": 3.0,
     "n_action_steps": 8,
 }

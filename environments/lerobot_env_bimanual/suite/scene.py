@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_env_bimanual.robot_scene import RobotScene, add_weld
 
-__all__ = ["OBJECT", "Hold", "Snapshot", "SuiteScene", "add_thing"]
+__all__ = ["OBJECT", "Hold", "SuiteScene", "add_thing"]
 
 #: What objects collide with, as a bit, beside the table: one another, but no palms.
 OBJECT = 8
@@ -54,30 +55,6 @@ def add_thing(spec: mujoco.MjSpec, name: str, *, free: bool = True) -> mujoco.Mj
     if free:
         body.add_freejoint(name=name)
     return body
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Where everything is at an instant.
-
-    Parameters
-    ----------
-    positions : ndarray
-        Of all joints of the model.
-    held : frozenset of Hold
-        Who holds what, and has held it.
-    taken : frozenset of Hold
-    welds : ndarray
-        How what is held lies in the hands.
-    places : ndarray of shape (n_bodies, 7)
-        Where bodies are that cannot move by themselves.
-    """
-
-    positions: NDArray[np.float64]
-    held: frozenset[Hold]
-    taken: frozenset[Hold]
-    welds: NDArray[np.float64]
-    places: NDArray[np.float64]
 
 
 class SuiteScene(RobotScene):
@@ -217,18 +194,18 @@ class SuiteScene(RobotScene):
                 total += self._contact_force(index, pair == bodies)
         return total
 
-    def snapshot(self) -> Snapshot:
+    def snapshot(self) -> tuple[Any, ...]:
         """The state without velocities."""
-        model, held, taken = self.model, frozenset(self.held), frozenset(self.taken)
-        places = np.concatenate((model.body_pos, model.body_quat), axis=1)
-        return Snapshot(self.data.qpos.copy(), held, taken, model.eq_data.copy(), places)
+        model, held, taken = self.model, self.held.copy(), self.taken.copy()
+        places = model.body_pos.copy(), model.body_quat.copy()  # of what is not free
+        return self.data.qpos.copy(), held, taken, model.eq_data.copy(), *places
 
-    def restore(self, snapshot: Snapshot) -> None:
+    def restore(self, snapshot: tuple[Any, ...]) -> None:
         """Bring everything to where it was."""
-        self.data.qpos[:] = snapshot.positions
-        self.model.eq_data[:] = snapshot.welds
-        self.model.body_pos[:], self.model.body_quat[:] = np.split(snapshot.places, [3], axis=1)
-        self.held, self.taken = set(snapshot.held), set(snapshot.taken)
+        model = self.model
+        self.data.qpos[:], held, taken, model.eq_data[:], *places = snapshot
+        model.body_pos[:], model.body_quat[:] = places
+        self.held, self.taken = held.copy(), taken.copy()
         for hold, weld in self._welds.items():
             self.data.eq_active[weld] = hold in self.held
         mujoco.mj_kinematics(self.model, self.data)

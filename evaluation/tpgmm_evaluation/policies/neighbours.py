@@ -33,8 +33,6 @@ class NeighboursConfig(ChunkedConfig):
     ----------
     n_neighbours : int
         k, whose actions are weighted by the inverse of the distance.
-    relative : bool
-        Whether actions are taken relative to the state in which they were shown.
     time_weight : float
         How many standard deviations of a joint a second counts as; 0 where the time is not
         told.
@@ -45,7 +43,6 @@ class NeighboursConfig(ChunkedConfig):
     """
 
     n_neighbours: int = 5
-    relative: bool = True
     time_weight: float = 0.0
     environment_weight: float = 1.0
     n_rows: int = 1
@@ -96,22 +93,17 @@ class NeighboursPolicy(ChunkedPolicy):
         Raises
         ------
         DataError
-            If there are fewer rows than neighbours, states and actions are not of one size
-            where actions are relative, or the episodes' rate is no multiple of ``rate``.
+            If there are fewer rows than neighbours, or the episodes' rate is no multiple of
+            ``rate``.
         """
         settings: dict[str, Any] = {**state_features(*episodes.widths), **fields}
         config = NeighboursConfig(
             n_rows=episodes.bounds[-1], device="cpu", push_to_hub=False, **settings
         )
-        n_state, _, n_action = episodes.widths
+        n_state = episodes.widths[0]
         if config.n_rows < config.n_neighbours:
             raise DataError(
                 f"{config.n_neighbours} neighbours are asked for, of {config.n_rows} rows"
-            )
-        if config.relative and n_state != n_action:
-            raise DataError(
-                f"actions relative to the state need {n_state} entries as the state, got "
-                f"{n_action}: relative=False takes them as they are"
             )
         policy = cls(config)
         windows = Windows(
@@ -130,8 +122,7 @@ class NeighboursPolicy(ChunkedPolicy):
             scale[-timed:] = 0.0
             scale[-timed] = config.time_weight
         policy.scale[:], policy.states[:] = scale, states * scale
-        offset = rows[OBS_STATE][:, None] if config.relative else 0.0
-        policy.actions[:] = rows[ACTION] - offset
+        policy.actions[:] = rows[ACTION]
         return policy.eval()
 
     @cached_property
@@ -145,5 +136,4 @@ class NeighboursPolicy(ChunkedPolicy):
         keys = [key for key in (OBS_STATE, OBS_ENV_STATE) if key in self.config.input_features]
         seen = torch.cat([batch[key] for key in keys], dim=-1).float()
         found = self._regression.predict((seen * self.scale).numpy()).astype(np.float32)
-        actions = torch.from_numpy(found).unflatten(1, self.actions.shape[1:])
-        return actions + batch[OBS_STATE].float()[:, None] if self.config.relative else actions
+        return torch.from_numpy(found).unflatten(1, self.actions.shape[1:])

@@ -29,12 +29,9 @@ def batch(state, environment):
     }
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_what_was_shown_is_done_at_the_policys_rate(relative, tmp_path):
+def test_what_was_shown_is_done_at_the_policys_rate(tmp_path):
     shown = episodes(1.0, 2.0)
-    policy = NeighboursPolicy.fit(
-        shown, FPS // 2, n_neighbours=1, relative=relative, n_action_steps=3
-    )
+    policy = NeighboursPolicy.fit(shown, FPS // 2, n_neighbours=1, n_action_steps=3)
     policy.save_pretrained(tmp_path)
     policy = NeighboursPolicy.from_pretrained(tmp_path)
     (_, _, first), (_, _, second) = shown
@@ -50,7 +47,7 @@ def test_what_was_shown_is_done_at_the_policys_rate(relative, tmp_path):
 def test_neighbours_are_weighted_by_how_near_they_are():
     # of each episode the first row alone, so that the two neighbours are of both
     shown = Episodes.join(FPS, [tuple(c[:1] for c in one) for one in episodes(1.0, 2.0)])
-    policy = NeighboursPolicy.fit(shown, FPS, n_neighbours=2, relative=False, n_action_steps=1)
+    policy = NeighboursPolicy.fit(shown, FPS, n_neighbours=2, n_action_steps=1)
     between = [
         float(policy.predict_action_chunk(batch([0.0], [at]))[0, 0, 0]) for at in (1.2, 1.8)
     ]
@@ -64,7 +61,7 @@ def test_the_time_tells_equal_states_apart():
     shown = Episodes.join(FPS, [(still, still + 1, late.float())]).with_time()
     n_time = shown.columns[OBS_ENV_STATE].shape[1] - 1
     policy = NeighboursPolicy.fit(
-        shown, FPS, n_time, n_neighbours=1, relative=False, time_weight=1.0, n_action_steps=1
+        shown, FPS, n_time, n_neighbours=1, time_weight=1.0, n_action_steps=1
     )
     for row, wanted in ((5, 0.0), (25, 1.0)):
         one = {key: shown.columns[key][row : row + 1] for key in (OBS_STATE, OBS_ENV_STATE)}
@@ -76,6 +73,3 @@ def test_what_cannot_be_asked_for():
         NeighboursPolicy.fit(episodes(1.0), FPS, n_neighbours=50)
     with pytest.raises(DataError, match="no multiple of the policy's 7"):
         NeighboursPolicy.fit(episodes(1.0), 7)
-    shown = Episodes.join(FPS, [(torch.zeros(20, 2), torch.zeros(20, 1), torch.zeros(20, 1))])
-    with pytest.raises(DataError, match="relative=False takes them as they are"):
-        NeighboursPolicy.fit(shown, FPS)

@@ -46,22 +46,10 @@ class Embodiment:
     spec: Callable[[], mujoco.MjSpec]
 
 
-def _upper_body() -> Embodiment:
-    return Embodiment(skill().robot, skill().neutral_posture(), robot_spec)
-
-
-def _viperx() -> Embodiment:
-    return Embodiment(viperx_robot(), viperx_posture(), viperx_spec)
-
-
-def _g1() -> Embodiment:
-    return Embodiment(g1_robot(), g1_posture(), g1_spec)
-
-
 EMBODIMENTS: dict[str, Callable[[], Embodiment]] = {
-    UPPER_BODY: _upper_body,
-    "viperx": _viperx,
-    "g1": _g1,
+    UPPER_BODY: lambda: Embodiment(skill().robot, skill().neutral_posture(), robot_spec),
+    "viperx": lambda: Embodiment(viperx_robot(), viperx_posture(), viperx_spec),
+    "g1": lambda: Embodiment(g1_robot(), g1_posture(), g1_spec),
 }
 
 
