@@ -14,7 +14,7 @@ from tpgmm_evaluation.benchmarks import CarryBenchmark
 from tpgmm_evaluation.cells import Cell, Results
 from tpgmm_evaluation.settings import Settings
 from tpgmm_evaluation.trainings import TRAININGS
-from tpgmm_torch import TaskParameterizedGMM
+from tpgmm_torch import TaskParameterizedGMM, attach_holds
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.exceptions import DataError
@@ -116,7 +116,7 @@ def test_what_is_held_is_put_exactly_however_it_slid():
     )
     model = TaskParameterizedGMM(
         benchmark.n_components, benchmark.operators(orientation=True), benchmark.robot
-    ).fit(demonstrations)
+    ).fit(attach_holds(demonstrations, benchmark.robot))
     [hold] = model.holds_
     assert (hold.frame, hold.link) == ("bottle", "l_hand")
     policy = TPGMMPolicy.from_estimator(model, environment_names=NAMES)

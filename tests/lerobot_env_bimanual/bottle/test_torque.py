@@ -159,7 +159,7 @@ def test_its_force_is_what_the_robot_feels():
     mujoco.mj_rnePostConstraint(model, data)
     robot = range(1, model.body("table").id)
     felt = np.linalg.norm(sum(data.cfrc_ext[body, 3:] for body in robot))
-    assert felt == pytest.approx(env._scene._contact_force(), rel=1e-6)
+    assert felt == pytest.approx(env._scene._obstacle_force(), rel=1e-6)
 
 
 def test_options_and_actions_that_cannot_be_are_refused():
