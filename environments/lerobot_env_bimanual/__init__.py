@@ -185,7 +185,7 @@ class CarryAndPutConfig(_ControlledEnvConfig):
 
 @EnvConfig.register_subclass("bimanual")
 @dataclass
-class BimanualConfig(_TaskEnvConfig, _ControlledEnvConfig):
+class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
     """``--env.type=bimanual``: the tasks of the suite.
 
     Parameters
