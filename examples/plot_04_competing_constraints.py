@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import torch
 
 from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_tools.plotting import STYLE, plot_candidates
 from tpgmm_torch import (
     Canonical,
     RelativeOrientation,
@@ -21,7 +22,6 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.plotting import STYLE, plot_candidates
 
 torch.set_num_threads(1)  # the matrices are small
 

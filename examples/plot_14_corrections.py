@@ -2,12 +2,14 @@ r"""
 Correcting a skill
 ==================
 
-A fitted skill is changed in two ways without fitting it from the beginning: by a *via-point*, a
-posture that it shall pass through at one time, and by a *correction*, a segment that somebody
-showed and that is merged with the demonstrations.
+A fitted skill is changed in two ways: by a *via-point*, a posture that it shall pass through at
+one time, and by a *correction*, a segment that somebody showed and from which it is learned
+again, with the demonstrations.
 """
 
 # sphinx_gallery_thumbnail_number = 1
+import warnings
+
 import matplotlib.pyplot as plt
 import numpy as np
 from sklearn.base import clone
@@ -22,6 +24,7 @@ from tpgmm_torch import (
     rollout,
 )
 from tpgmm_torch.corrections import in_skill_time
+from tpgmm_torch.exceptions import PlausibilityWarning
 
 # %%
 # A skill of one joint
@@ -62,6 +65,7 @@ lower = np.sin(1.5 * part) - 0.4 * np.sin(np.pi * (part - 2.5)) ** 2
 shown = Demonstration(1.2 * (part - 2.5), lower[:, None])
 again = Demonstration(0.9 * (part - 2.5), lower[:, None] + 0.02)
 placed = in_skill_time(model, [shown, again])
+warnings.simplefilter("ignore", PlausibilityWarning)  # segments are shorter than the others
 corrected = clone(model).fit([*demonstrations[2:], *placed])
 [after] = corrected.predict([situation])
 print([f"{float(p.time[0]):.2f} to {float(p.time[-1]):.2f} s" for p in placed])

@@ -25,6 +25,7 @@ from tpgmm_torch import (
     Robot,
     Situation,
     TaskParameterizedGMM,
+    rollout,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
 
@@ -127,7 +128,7 @@ situations = [[Situation(REST, place_both(apart)) for _ in range(10)] for apart 
 found = {name: np.zeros((len(APART), 10, 3)) for name in models}
 for name, model in models.items():
     for row, some in enumerate(situations):
-        for column, t in enumerate(model.predict(some, candidates=False)):
+        for column, t in enumerate(rollout(model.skill, some, bounds="robot", blend=1.0)):
             speed = float(t.joints.diff(dim=0).abs().max() / time[1])
             found[name][row, column] = (*misses(t, some[column].frames), speed)
         tip, elbow, speed = np.median(found[name][row], axis=0)
@@ -161,7 +162,7 @@ def draw(joints, **style):
 
 draw(REST, color="0.75")
 for (name, model), color in zip(models.items(), (BLUE, VERMILION), strict=True):
-    [trajectory] = model.predict([one])
+    [trajectory] = rollout(model.skill, [one], bounds="robot", blend=1.0)
     draw(trajectory.joints[-1], color=color, label=name)
     for axes, values in ((tips, found[name][..., 0]), (speeds, found[name][..., 2])):
         distances = 100 * np.array(APART)

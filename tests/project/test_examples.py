@@ -98,16 +98,16 @@ CLAIMS = {
         lambda v: (
             v["segmentation"].reasons_ == ("stop", "stop")
             and v["off"] < 0.3
-            and [len(part.operators) for part in v["model"].parts_] == [2, 3, 2]
-            and v["model"].frame_names_ == ("cup", "tray")
+            and [len(part.operators) for part in v["skill"].skills] == [2, 3, 2]
+            and v["skill"].frame_names == ("cup", "tray")
             and max(v["least"].values()) < 10
         ),
     ),
     "plot_13_two_ways.py": (
         1,
         lambda v: (
-            v["model"].labels_.tolist() == [0, 1, 0, 0, 1, 1, 0, 1, 1, 0]
-            and min(v["passed"]["two modes"]) > 9
+            v["ways"].labels_.tolist() == [0, 1, 0, 0, 1, 1, 0, 1, 1, 0]
+            and min(v["passed"]["two ways"]) > 9
             and np.median(v["passed"]["single model"]) < 6
         ),
     ),
@@ -146,8 +146,8 @@ CLAIMS = {
             (v["inside"] > 1).mean() < 2 / 9
             and not v["fails"][v["novelty"] <= 1].any()
             and 0.05 < v["fails"][v["novelty"] > 1].mean() < 0.5
-            and v["told"][:20, 2].max() < 0.5
-            and v["told"][-1, 2] > 1.5
+            and v["record"][:20, 2].max() < 0.5
+            and v["record"][-1, 2] > 1.5
         ),
     ),
     "plot_18_which_goes_first.py": (
