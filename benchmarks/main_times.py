@@ -43,7 +43,7 @@ def measure(settings: Settings) -> Iterator[Row]:
     many, calls = settings.size(4096, 8), settings.size(300, 3)
     # at tiny sizes, what is asked is only whether it runs
     backend = "inductor" if settings.full else "aot_eager"
-    compiled = compile_skill(made.regression(), backend=backend).estimate
+    compiled = compile_skill(made.skill, backend=backend).estimate
     iterations = settings.iterations(2, 12), settings.iterations(1, 3)
     measurements = {
         "import tpgmm_torch": lambda: ask("start_up", "tpgmm_torch")[0],
