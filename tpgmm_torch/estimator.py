@@ -236,7 +236,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         ----------
         X : iterable of Demonstration, or of sequence of Demonstration
             In one list, or in batches of a set that is larger than memory, each read once;
-            the first decides on holds and mean orientations, and outliers are not looked for.
+            the first decides on holds and mean orientations.
         y : ignored
             Here for scikit-learn.
         interval : tuple of float, optional

@@ -19,6 +19,7 @@ from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import PART
 from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = ["rollout"]
 
@@ -57,6 +58,11 @@ def rollout(
     ------
     DataError, ShapeError, UnknownNameError, PlausibilityError
         If a situation does not fit the skill, or cannot be what it is taken for.
+
+    Warns
+    -----
+    PlausibilityWarning
+        Once, if references miss via-points, or situations are unlike the demonstrations.
     """
     known = completed_situations(skill, situations)
     trajectories: dict[int, Trajectory] = {}
@@ -65,6 +71,8 @@ def rollout(
         together = _run_together(skill, batch, bounds, blend, candidates)
         trajectories.update(zip(members, together, strict=True))
     done = [trajectories[index] for index in range(len(known))]
+    if isinstance(skill, ViaPoints):
+        skill.missed(known, done).act()
     return with_novelty(skill, known, done)
 
 

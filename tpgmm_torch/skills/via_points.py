@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
+from tpgmm_torch.checks.report import Finding, Report
+from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
@@ -22,8 +25,9 @@ __all__ = ["ViaPoints"]
 
 @dataclass(frozen=True, eq=False)
 class ConditionedEstimate(Estimate):
-    """An estimate given via-points, and where the next one starts from."""
+    """An estimate given via-points, the skill's own, and where the next one starts from."""
 
+    unconditioned: Estimate | None = None
     conditioning: Conditioning | None = None
 
 
@@ -99,7 +103,9 @@ class ViaPoints:
             given = holds(self.skill.kinematics.state(free))
         unconditioned = self.skill.estimate(time, given, frames, bounds)
         estimate, after = self.conditioning.advance(time, unconditioned, frames, bounds, holds)
-        return ConditionedEstimate(**vars(estimate), conditioning=after)
+        mean, covariance, activation = estimate.joints, estimate.covariance, estimate.activation
+        own = unconditioned.candidates
+        return ConditionedEstimate(mean, covariance, activation, own, unconditioned, after)
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
         """Conditioned on the same points; see :meth:`Skill.start`."""
@@ -109,9 +115,42 @@ class ViaPoints:
         """Go on from the last conditioned estimate; see :meth:`Skill.advance`."""
         if not isinstance(estimate, ConditionedEstimate) or estimate.conditioning is None:
             return self
+        assert estimate.unconditioned is not None
+        skill = self.skill.advance(estimate.unconditioned)
+        conditioning = replace(estimate.conditioning, regression=skill)
         other = object.__new__(type(self))
-        vars(other).update(vars(self), conditioning=estimate.conditioning)
+        vars(other).update(vars(self), skill=skill, conditioning=conditioning)
         return other
+
+    def missed(
+        self, situations: Sequence[Situation], trajectories: Sequence[Trajectory]
+    ) -> Report:
+        """Report the via-points that trajectories do not pass through.
+
+        Parameters
+        ----------
+        situations : sequence of Situation
+        trajectories : sequence of Trajectory
+            What was reproduced in each.
+        """
+        findings = [
+            Finding(
+                "via-points",
+                f"situation {n}: {point} is missed by {distance:.3g} m or rad",
+                "Can the robot reach it, in so short a time? A longer fade asks for less "
+                "speed, and bounds=None is for what no robot has to follow",
+                episodes=(n,),
+                value=distance,
+            )
+            for n, (there, done) in enumerate(zip(situations, trajectories, strict=True))
+            for point, distance in self.conditioning.missed(
+                done.time, done.joints, there.frames
+            )
+            if not self.skill.holds  # a frame that is held is not where the situation has it
+        ]
+        if isinstance(self.skill, ViaPoints):
+            findings += self.skill.missed(situations, trajectories)
+        return Report.of(findings, f"{len(situations)} situations with via-points")
 
     def posture_search(self) -> PostureSearch | None:
         """The skill's search where no via-point counts; see :meth:`Skill.posture_search`."""

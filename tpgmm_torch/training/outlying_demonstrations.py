@@ -7,6 +7,7 @@ demonstration widens the covariances of exactly those instants that the skill is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -48,6 +49,8 @@ CONSISTENT = 1.4826
 #: so long [s]. On real recordings: at most 6.1 of those who are not, at least 11.6 of those
 #: whose frame was taken at a wrong instant, 5 to 15 cm beside the right one.
 UNLIKE, LONG = 8.0, 0.5
+#: Demonstrations of more numbers than this (512 MB) are compared at fewer instants.
+LARGEST_TABLE = 2**26
 
 
 @dataclass(frozen=True)
@@ -234,18 +237,21 @@ def drop_outliers(
 
 
 def outliers_among(data: TrainingRows, kinematics: Kinematics) -> Iterator[Finding]:
-    """A finding, if there are demonstrations in memory unlike the others.
+    """A finding, if there are demonstrations unlike the others, of all batches and processes.
 
     Parameters
     ----------
     data : TrainingRows
     kinematics : Kinematics
     """
-    if data.parts:
-        rows = torch.stack([at_phases(part, len(data.time)) for part in data.parts])
-        outlying = outlying_rows(rows, data.time, data.operators, kinematics)
-        if outlying:
-            yield unlike_the_others(outlying, len(rows))
+    width = sum(1 + operator.dimension(kinematics) for operator in data.operators)
+    fewest = math.ceil(2 * float(data.time[-1] - data.time[0]) / LONG) + 1
+    most = LARGEST_TABLE // (data.n_demonstrations * width)
+    count = min(len(data.time), max(most, fewest))
+    time = at_phases(data.time, count)
+    outlying = outlying_rows(data.at_phases(count), time, data.operators, kinematics)
+    if outlying:
+        yield unlike_the_others(outlying, data.n_demonstrations)
 
 
 def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:

@@ -23,6 +23,7 @@ from tpgmm_torch.training.equivalent_points import Instants
 from tpgmm_torch.training.hold_detection import demonstrated_holds
 from tpgmm_torch.training.local_data import (
     Motion,
+    at_phases,
     columns_of,
     constant_columns,
     like,
@@ -59,6 +60,10 @@ class TrainingRows:
         Among which the rows are spread.
     parts : tuple of Tensor of shape (T_m, sum_j (1 + D_j))
         The rows of each demonstration, if all are in memory.
+    file : RowFile, optional
+        Where the rows are, or came from, of more than one batch.
+    spans : tuple of Span
+        Where the demonstrations of this process are in the file.
     """
 
     rows: Rows
@@ -69,6 +74,31 @@ class TrainingRows:
     holds: tuple[Hold, ...]
     processes: Processes
     parts: tuple[Tensor, ...] = ()
+    file: RowFile | None = None
+    spans: tuple[Span, ...] = ()
+
+    def at_phases(self, count: int) -> Tensor:
+        """Rows of all demonstrations of all processes at equal phase.
+
+        Parameters
+        ----------
+        count : int
+            Of instants.
+
+        Returns
+        -------
+        Tensor of shape (M, count, sum_j (1 + D_j))
+        """
+        thinned = [at_phases(rows, count) for rows in self._each()]
+        return self.processes.concatenate(torch.stack(thinned).double())
+
+    def _each(self) -> Iterator[Tensor]:
+        """The rows of each demonstration of this process, (T_m, sum_j (1 + D_j))."""
+        if self.file is None:
+            yield from self.parts
+        else:
+            for _, *rows in self.spans:
+                yield torch.from_numpy(self.file[slice(*rows)])
 
     def within(self, begin: float, end: float) -> Self:
         """Those rows, in memory, whose time is from ``begin`` to before ``end`` [s].
@@ -83,8 +113,9 @@ class TrainingRows:
         own = (rows[:, 0] >= begin) & (rows[:, 0] < end)
         if int(inside.sum()) < 2 or not own.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
-        parts = tuple(x[(x[:, 0] >= begin) & (x[:, 0] < end)] for x in self.parts)
-        return replace(self, rows=rows[own], time=self.time[inside], parts=parts)
+        parts = tuple(x[(x[:, 0] >= begin) & (x[:, 0] < end)] for x in self._each())
+        time = self.time[inside]
+        return replace(self, rows=rows[own], time=time, parts=parts, file=None)
 
 
 def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
@@ -222,7 +253,7 @@ def read_rows(
         following = next(walk, None)
     return _gathered(
         file, spans, all(processes.gather(aligned)), responsibilities, kinematics,
-        TrainingRows(file, 1, grid, 0, completed, holds, processes),
+        TrainingRows(file, 1, grid, 0, completed, holds, processes, file=file),
     )  # fmt: skip
 
 
@@ -264,7 +295,7 @@ def _gathered(
     _, owner, start, stop = everyone[len(everyone) // 2]
     typical = file[start:stop, 0] if processes.rank == owner else None
     time = torch.from_numpy(processes.gather(typical)[owner]).to(kinematics.lower)
-    data = replace(data, time=time, n_demonstrations=n_demonstrations)
+    data = replace(data, time=time, n_demonstrations=n_demonstrations, spans=tuple(spans))
     if size == 1:
         return data
     instants = Instants(np.where(constant, first[0], first), widths)

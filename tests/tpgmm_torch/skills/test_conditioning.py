@@ -13,12 +13,13 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
     ViaPoint,
     ViaPoints,
+    load,
     quaternions,
+    rollout,
     save,
 )
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.operators.text import parse_operator
-from tpgmm_torch.persistence import load_model
 from tpgmm_torch.skills.conditioning import covariance_between, wendland
 
 GRID = torch.linspace(0, 5, 251, dtype=torch.float64)
@@ -93,9 +94,9 @@ def test_the_correlation_falls_smoothly_to_zero():
 def test_a_pose_is_met_exactly_and_the_rest_is_as_it_was(when):
     pose = at_hand(when, [0.03, 0.0, 0.02], [0.1, 0.1, 0.0])
     model = ViaPoints(small_bottle().skill, [ViaPoint(when, "pose:l_hand", pose)])
-    [bent] = model.predict([situation()], candidates=False)
+    [bent] = rollout(model, situation())
     before, step = free(), int((when - GRID).abs().argmin())
-    hand = model.kinematics_.state(bent.joints[step]).pose("l_hand")
+    hand = model.kinematics.state(bent.joints[step]).pose("l_hand")
     assert float((hand.position - pose.position).norm()) < 1e-4
     turn = quaternions.product(hand.orientation, quaternions.conjugate(pose.orientation))
     assert math.degrees(float(quaternions.log(turn).norm())) < 0.01
@@ -104,7 +105,7 @@ def test_a_pose_is_met_exactly_and_the_rest_is_as_it_was(when):
     assert float(sigmas[far].max()) < 1e-2
     assert float(sigmas.max()) <= 1.05 * float(sigmas[step])
     # what is asked for is known there
-    rows = model.kinematics_.state(bent.joints[step]).linear_jacobian("l_hand")
+    rows = model.kinematics.state(bent.joints[step]).linear_jacobian("l_hand")
     assert float((rows @ bent.covariance[step] @ rows.mT).diagonal().max()) < 1e-10
     assert float(torch.linalg.eigvalsh(bent.covariance).min()) > 0
     acceleration = bent.joints.diff(dim=0).diff(dim=0).abs().max()
@@ -117,7 +118,7 @@ def test_within_one_sigma_of_the_path_everything_is():
     posture = before.joints[step] + torch.linalg.cholesky(before.covariance[step]) @ draw
     via = ViaPoint(float(GRID[step]), "canonical", posture)
     model = ViaPoints(small_bottle().skill, [via])
-    [bent] = model.predict([situation()], candidates=False)
+    [bent] = rollout(model, situation())
     assert float((bent.joints[step] - posture).abs().max()) < 1e-4
     assert float(whitened(bent.joints - before.joints, before.covariance).max()) < 1.05
 
@@ -129,8 +130,8 @@ def test_a_tolerance_is_a_compromise():
     for tolerance in (1e-4, 1e-2, 1.0):
         via = ViaPoint(when, "position:l_hand", position, tolerance)
         model = ViaPoints(small_bottle().skill, [via])
-        [bent] = model.predict([situation()], candidates=False)
-        hand = model.kinematics_.state(bent.joints[step]).pose("l_hand").position
+        [bent] = rollout(model, situation())
+        hand = model.kinematics.state(bent.joints[step]).pose("l_hand").position
         reached.append(float((hand - position).norm()))
     assert reached == sorted(reached)
     assert reached[0] < 5e-4 and reached[-1] > 0.02
@@ -150,7 +151,7 @@ def test_some_joints_and_two_hands_and_several_times():
         ViaPoint(3.0, seen, raised),
         ViaPoint(3.0, "position:r_hand", right),
     ]
-    [bent] = ViaPoints(small_bottle().skill, points).predict([situation()], candidates=False)
+    [bent] = rollout(ViaPoints(small_bottle().skill, points), situation())
     state = kinematics.state(bent.joints[150])
     assert float((seen.coordinates(state, frames) - raised).norm()) < 1e-4
     assert float((state.pose("r_hand").position - right).norm()) < 1e-4
@@ -160,8 +161,8 @@ def test_some_joints_and_two_hands_and_several_times():
 def test_robots_of_a_batch_do_not_know_of_each_other():
     pose = at_hand(3.0, [0.0, 0.0, 0.02], [0.0, 0.0, 0.0])
     model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", pose.position)])
-    both = model.predict([situation(2), situation(1)], candidates=False)
-    [alone] = model.predict([situation(1)], candidates=False)
+    both = rollout(model, [situation(2), situation(1)])
+    [alone] = rollout(model, situation(1))
     assert torch.allclose(both[1].joints, alone.joints, atol=1e-7)
 
 
@@ -169,13 +170,13 @@ def test_a_controller_that_localizes_passes_too():
     pose = at_hand(3.0, [0.0, 0.0, 0.03], [0.0, 0.0, 0.0])
     model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", pose.position)])
     start = situation()
-    controller = Controller(model.skill, start.joints, start.frames)
+    controller = Controller(model, start.joints, start.frames)
     robot, nearest = start.joints, math.inf
     for _ in range(250):
-        controller.estimate(0.02, joints=robot, frames=start.frames)
+        controller.step(0.02, joints=robot, frames=start.frames)
         robot = robot + 0.6 * (controller.reference - robot)
         if abs(float(controller.time) - 3.0) < 1e-9:
-            hand = model.kinematics_.state(controller.reference).pose("l_hand").position
+            hand = model.kinematics.state(controller.reference).pose("l_hand").position
             nearest = float((hand - pose.position).norm())
     assert nearest < 1e-4
     assert abs(float(controller.time) - 4.98) < 1e-6  # it did not take the robot for lost
@@ -193,49 +194,47 @@ def test_tracked_poses_have_via_points():
         quaternions.product(turn, pose.orientation),
     )
     model = ViaPoints(hands().skill, [ViaPoint(1.0, "pose:left", pose)], fade=0.5)
-    [bent] = model.predict([start], candidates=False)
-    there = model.kinematics_.state(bent.joints[50]).pose("left")
+    [bent] = rollout(model, start)
+    there = model.kinematics.state(bent.joints[50]).pose("left")
     assert float((there.position - pose.position).norm()) < 1e-4
     turn = quaternions.product(there.orientation, quaternions.conjugate(pose.orientation))
     assert math.degrees(float(quaternions.log(turn).norm())) < 0.01
     assert torch.allclose(bent.joints[80:], before.joints[80:], atol=1e-6)
 
 
-def test_what_is_out_of_reach_is_said():
-    model = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "position:l_hand", [3.0, 0.0, 1.0])])
-    with pytest.warns(PlausibilityWarning, match="is missed by"):
-        [bent] = model.predict([situation()], candidates=False)
-    bounds = model.skill.motion_bounds
+def test_a_warning_names_via_points_out_of_reach():
+    near = ViaPoints(small_bottle().skill, [ViaPoint(3.0, "canonical", {"l_elbow": 0.4})])
+    model = ViaPoints(near, [ViaPoint(4.5, "position:l_hand", [3.0, 0.0, 1.0])])
+    bounds = model.motion_bounds
+    with pytest.warns(PlausibilityWarning, match="l_hand=3.* is missed by") as warned:
+        [bent] = rollout(model, [situation()], bounds=bounds)
+    assert len(warned) == 1
     speed = bent.joints.diff(dim=0).abs() / GRID.diff()[:, None]
     assert bool((speed <= bounds.velocity * 1.001).all())
 
 
-def test_via_points_are_saved_and_taken_away(tmp_path):
+def test_loaded_via_points_give_the_same_references(tmp_path):
     points = [
         ViaPoint(1.0, "canonical", {"b": 0.5}),
         ViaPoint(0.5, "canonical", [0, 1, 0], 0.01),
     ]
     model = TaskParameterizedGMM(n_components=4).fit(waves())
     bent = ViaPoints(model.skill, points, fade=0.4)
-    assert model.via_points_ == ()
     save(bent, tmp_path / "model")
-    loaded = load_model(tmp_path / "model")
-    assert loaded.via_points_ == tuple(points) and loaded.via_fade_ == 0.4
-    [one], [other] = (
-        m.predict([Situation(joints=waves()[0].joints[0])]) for m in (bent, loaded)
-    )
+    loaded = load(tmp_path / "model")
+    assert loaded.points == tuple(points) and loaded.fade == 0.4
+    start = Situation(joints=waves()[0].joints[0])
+    [one], [other] = rollout(bent, start), rollout(loaded, start)
     assert torch.equal(one.joints, other.joints)
-    assert ViaPoints(loaded.skill, []).via_points_ == ()
-    assert loaded.fit(waves()).via_points_ == ()
     with pytest.raises(DataError, match="fade"):
         ViaPoints(model.skill, points, fade=0.0)
 
 
-def test_a_new_frame_has_to_be_told():
+def test_frames_of_via_points_are_needed():
     shelf = Frame([0.3, 0.2, 0.1])
     model = ViaPoints(small_bottle().skill, ["3:position:l_hand@shelf=0,0,0.02~0.05"])
-    assert "shelf" in model.frame_names_
+    assert "shelf" in model.frame_names
     given = situation()
-    model.predict([Situation(given.joints, {**given.frames, "shelf": shelf}, GRID[:20])])
+    rollout(model, Situation(given.joints, {**given.frames, "shelf": shelf}, GRID[:20]))
     with pytest.raises(KeyError, match="shelf"):
-        model.predict([given])
+        rollout(model, given)

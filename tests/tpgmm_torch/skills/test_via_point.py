@@ -1,9 +1,8 @@
 """Via-points as they are written, and what is refused."""
 
 import pytest
-import torch
 
-from tests.support.skills import hands, small_bottle
+from tests.support.skills import small_bottle
 from tpgmm_torch import Frame, ViaPoint, ViaPoints
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
@@ -73,9 +72,3 @@ def test_what_does_not_fit_the_model_is_refused(arguments, error, message):
 def test_what_is_none_is_refused(arguments):
     with pytest.raises(DataError):
         ViaPoint(*arguments)
-
-
-def test_a_step_refuses_via_points():
-    model = ViaPoints(hands().skill, ["1:position:left=0,0,0"])
-    with pytest.raises(DataError, match="controller"):
-        model.step(0.5, torch.zeros(14))

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from itertools import batched
 
 import pytest
 import torch
@@ -111,3 +112,10 @@ def test_fit_learns_from_all_and_warns():
         everyone = hands_model().fit(shown)
     robust, good = hands_model().fit([*shown[:5], *shown[6:]]), handlings(9)[8:]
     assert robust.score(good) > everyone.score(good) + 5
+
+
+@pytest.mark.parametrize("responsibilities", ["instant", "point"])
+def test_demonstrations_of_all_batches_are_compared(responsibilities):
+    shown = some_misplaced(8, [6])
+    with pytest.warns(PlausibilityWarning, match="1 of 8 are unlike the others.*n 6 "):
+        hands_model(responsibilities=responsibilities).fit(list(map(list, batched(shown, 3))))
