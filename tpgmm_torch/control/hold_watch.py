@@ -112,13 +112,11 @@ class HoldWatch:
             Of objects that the skill holds, for which robots it does not yet.
         """
         rests, places = dict(self.rests), dict(frames)
-        for name, not_held in free_yet.items():
-            if name in rests and rests[name].found and not bool(not_held.all()):
-                holding = holding.ungiven(name, ~not_held)
-            if not bool(not_held.any()):  # the skill knows where it is
-                rests.pop(name, None)
-                names = names - {name}
-        for name in names:
+        holding = self._ungiven(holding, free_yet)
+        known = {name for name, not_held in free_yet.items() if not bool(not_held.any())}
+        for name in known:  # the skill knows where it is
+            rests.pop(name, None)
+        for name in names - known:
             seen, yet = frames[name], free_yet.get(name, torch.tensor(True))
             rest = rests.get(name) or Rest.at(seen, joints)
             if rest.seen is not seen:
@@ -128,6 +126,14 @@ class HoldWatch:
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
         return replace(self, rests=rests), holding, places
+
+    def _ungiven(self, holding: Holding, free_yet: Mapping[str, Tensor]) -> Holding:
+        """The skill's holds count again for robots for which they have begun."""
+        for name, not_held in free_yet.items():
+            rest = self.rests.get(name)
+            if rest is not None and rest.found and not bool(not_held.all()):
+                holding = holding.ungiven(name, ~not_held)
+        return holding
 
     def _seen(
         self,

@@ -87,8 +87,10 @@ class Held:
         assert self.apart is not None
         return self.apart.position.isinf().all(-1)
 
-    def later(self, joints: Tensor, share: Tensor | None) -> Self:
+    def later(self, seen: Frame | None, joints: Tensor, share: Tensor | None) -> Self:
         """With postures as late as the object is seen, of which a share is new."""
+        if seen is None:
+            return self
         if self.apart is None or share is None:
             return self if self.joints is None else replace(self, joints=None)
         last = joints if self.joints is None else self.joints
@@ -204,25 +206,23 @@ class Holding:
             If a frame or link does not exist.
         """
         seen, given = frames or {}, given or {}
-        for name in given.keys() - self.frames.keys() - seen.keys():
-            raise UnknownNameError("frame", name, "the situation", self.frames)
+        if unknown := given.keys() - self.frames.keys() - seen.keys():
+            raise UnknownNameError("frame", unknown.pop(), "the situation", self.frames)
         names = {hold.frame: None for hold in self.holds} | dict.fromkeys((*self.held, *given))
         if not names and not seen:
             return self
         places, held = {**self.frames, **seen}, dict(self.held)
         state_now = cache(lambda: self.kinematics.state(joints))
         for name in filter(places.__contains__, names):
-            before, pose = self.held.get(name, FREE), seen.get(name)
-            if pose is not None:
-                before = before.later(joints, shares.get(name))
+            pose = seen.get(name)
+            before = self.held.get(name, FREE).later(pose, joints, shares.get(name))
             carrier = self._carrier(name, torch.as_tensor(time), before, given, where)
             place = self.frames.get(name, places[name])
             after, places[name] = self._changed(name, before, carrier, place, pose, state_now)
             after = self._seen(before, after, pose, state_now, dt)
             if after is not FREE:
                 held[name] = after
-        same = all(held[name] is self.held.get(name) for name in held)
-        return replace(self, frames=places, held=self.held if same else held)
+        return replace(self, frames=places, held=self.held if held == self.held else held)
 
     def free(self, name: str, like: Tensor) -> Tensor:
         """For which robots an object is free: bool, of the shape of ``like``."""

@@ -96,73 +96,86 @@ def _run_together(
     """Trajectories of B situations of one time grid."""
     time = situations[0].time
     assert time is not None  # they are complete
-    frames = {
-        name: Frame.stack([situation.frames[name] for situation in situations])
-        for name in situations[0].frames
-    }
+    frames = _stacked(situations)
     start = torch.stack([situation.joints for situation in situations])
-    alone = len(situations) == 1  # one robot is sooner computed without a batch
-    poses = {name: frame[..., 0] if alone else frame for name, frame in frames.items()}
-    moving = {name for name, frame in frames.items() if len(frame.batch_shape) == 2}
+    joints, poses = start, frames
+    if len(situations) == 1:  # one robot is computed faster without a batch
+        joints, poses = start[0], {name: frame[..., 0] for name, frame in frames.items()}
     held = time.clamp(skill.begin, skill.end)  # nothing is extrapolated
-    grid = held.tolist()
     controller = Controller(
         skill,
-        start[0] if alone else start,
+        joints,
         poses,
         clock=EvenClock(),
         trust=None,
         smoothing=None,
         bounds=bounds,
         blend=blend,
-        begin=grid[0],
-        end=grid[-1],
+        begin=float(held[0]),
+        end=float(held[-1]),
         at_rest=False,  # a situation does not say how its robot moves
     )
-    references: list[torch.Tensor] = []
-    estimates: list[Estimate] = []
-    holdings: list[Holding] = []
-    inferring = torch.is_inference_mode_enabled()
-    for k, now in enumerate(grid):
-        if k == 1:  # what the first step does not record, none does; to ask so takes a third
-            inferring = inferring or not references[0].requires_grad
-        if k and now == grid[k - 1]:
-            estimates.append(estimates[-1])
-            references.append(references[-1])
-            holdings.append(holdings[-1])
-            continue
-        with torch.inference_mode(inferring):
-            here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
-            dt = now - grid[k - 1] if k else 0.0
-            command = controller.step(dt, frames=here if moving else None)
-            estimates.append(command.estimate)
-            references.append(controller.reference)
-            holdings.append(controller.holding)
-    whole = Estimate(
-        torch.stack([estimate.joints for estimate in estimates]).view(len(grid), *start.shape),
-        torch.stack([estimate.covariance for estimate in estimates]).view(
-            len(grid), *start.shape, -1
-        ),
-        torch.stack([estimate.activation for estimate in estimates]),
+    references, estimates, holdings = zip(
+        *_ticks(controller, held.tolist(), poses), strict=True
     )
-    joints = torch.stack(references).view(len(grid), *start.shape)
+    shape = len(time), *start.shape
+    whole = _over_time(estimates, shape)
+    joints = torch.stack(references).view(shape)
     own: list[Candidate] = []
     if candidates and hasattr(skill, "candidates"):
         states = torch.cat((start[None], joints[:-1]))
         own = _candidates(skill, held, states, frames, holdings, whole)
+    names = skill.kinematics.joint_names
     return [
-        Trajectory(
-            time,
-            joints[:, row],
-            whole.covariance[:, row],
-            tuple(
-                Candidate(one.mean[:, row], one.covariance[:, row], one.share[:, row])
-                for one in own
-            ),
-            skill.kinematics.joint_names,
-        )
+        Trajectory(time, joints[:, row], whole.covariance[:, row], _row(own, row), names)
         for row in range(len(situations))
     ]
+
+
+def _stacked(situations: Sequence[Situation]) -> dict[str, Frame]:
+    """Frames of B situations, (B,) or, if they move, (T, B)."""
+    return {
+        name: Frame.stack([situation.frames[name] for situation in situations])
+        for name in situations[0].frames
+    }
+
+
+def _over_time(estimates: Sequence[Estimate], shape: Sequence[int]) -> Estimate:
+    """Estimates (T, B, ...) of T ticks."""
+    return Estimate(
+        torch.stack([estimate.joints for estimate in estimates]).view(*shape),
+        torch.stack([estimate.covariance for estimate in estimates]).view(*shape, -1),
+        torch.stack([estimate.activation for estimate in estimates]),
+    )
+
+
+def _row(candidates: Sequence[Candidate], row: int) -> tuple[Candidate, ...]:
+    """Candidates of one robot of a batch."""
+    return tuple(
+        Candidate(one.mean[:, row], one.covariance[:, row], one.share[:, row])
+        for one in candidates
+    )
+
+
+def _ticks(
+    controller: Controller, grid: Sequence[float], poses: Mapping[str, Frame]
+) -> list[tuple[torch.Tensor, Estimate, Holding]]:
+    """Reference, estimate and held objects at each time of a grid."""
+    batch = controller.reference.ndim - 1
+    moving = {name for name, pose in poses.items() if len(pose.batch_shape) > batch}
+    found: list[tuple[torch.Tensor, Estimate, Holding]] = []
+    inferring = torch.is_inference_mode_enabled()
+    for k, (now, before) in enumerate(zip(grid, [grid[0], *grid], strict=False)):
+        if k == 1:  # what the first step does not record, none does; to ask so takes a third
+            inferring = inferring or not found[0][0].requires_grad
+        if k and now == before:
+            found.append(found[-1])
+            continue
+        with torch.inference_mode(inferring):
+            here = {name: pose[k] if name in moving else pose for name, pose in poses.items()}
+            command = controller.step(now - before, frames=here if moving else None)
+        found.append((controller.reference, command.estimate, controller.holding))
+    return found
 
 
 def _candidates(

@@ -331,7 +331,7 @@ def handling():
 
 def test_the_time_of_a_posture_is_found():
     skill, demonstration = handling().skill, few_bottles()[0]
-    times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 400, dtype=torch.float64)
+    times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 341, dtype=torch.float64)
     state = skill.kinematics.state(demonstration.joints)
     found = times[skill.log_likelihood(times, state, dict(demonstration.frames)).argmax(1)]
     before = demonstration.time < 8  # then it shakes, and places are alike
