@@ -34,6 +34,7 @@ from tpgmm_torch import (
 )
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.structure.select_operators import SelectOperators
 
 __all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
@@ -78,7 +79,10 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
         fps=benchmark.rate,
         environment_names=_environment_names(episodes / "training"),
     )
-    recipe = {"n_components": policy.config.n_components, "operators": policy.config.operators}
+    recipe = {
+        "n_components": model.n_components,
+        "operators": [format_operator(one) for one in model.operators_],
+    }
     processors = make_tpgmm_pre_post_processors(policy.config)
     outcome = "learned by expectation-maximisation"
     return Training(policy, processors, benchmark.rate, recipe, outcome=outcome)

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -16,7 +15,6 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.settings import (
     ControlConfig,
     EMConfig,
-    FitConfig,
     FusionConfig,
     TrainingConfig,
 )
@@ -24,20 +22,15 @@ from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
-from tpgmm_torch import (
-    Hold,
-    Robot,
-    TaskParameterizedGMM,
-    ViaPoint,
-)
-from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_tools.cli.learning import Choices, parse_parts
+from tpgmm_torch import Hold, Robot, TaskParameterizedGMM, ViaPoint
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.text import format_operator, parse_operator
-from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.operators.text import parse_operator
+from tpgmm_torch.persistence import decode
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.skills.via_points import ViaPoints
+from tpgmm_torch.structure.select_ways import SelectWays
 
 __all__ = [
     "StatePolicyConfig",
@@ -98,17 +91,25 @@ def state_features(
 class TPGMMConfig(StatePolicyConfig):
     """Configuration of :class:`TPGMMPolicy`, ``--policy.type=tpgmm``.
 
-    A policy that is fitted has everything here filled in; for training from a data set,
-    ``robot``, ``links`` and what differs from the defaults are enough.
+    It holds what was asked for; what was learned is the model in the policy's folder. For
+    training from a data set, ``robot``, ``links`` and what differs from the defaults are
+    enough.
 
     Parameters
     ----------
-    n_components : int, default=10
-        Number of Gaussians.
+    n_components : int or "auto", default=10
+        Number of Gaussians; "auto" finds it, :class:`tpgmm_torch.SelectComponents`.
     operators : list of str or dict, optional
         As text, ``"pose:l_hand@bottle + pose:r_hand@bottle"``, or as
         :func:`tpgmm_torch.persistence.encode` describes them. The default is the poses of
-        all links in all frames, stacked, and the joints.
+        all links in all frames, stacked, and the joints; ``["auto"]`` finds those that
+        matter, :class:`tpgmm_torch.SelectOperators`.
+    parts : str, optional
+        Where the skill has parts that are learned one by one: ``"auto"``, or when they end, as
+        seconds and events joined by commas, ``"4.2,shake"``.
+    modes : int or "auto", default=1
+        In how many ways the skill is done, each learned for itself; "auto" finds it,
+        :class:`tpgmm_torch.SelectWays`.
     holds : list of str, optional
         From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
         the aligned skill. By default it is found in frames that are read at every step
@@ -151,8 +152,6 @@ class TPGMMConfig(StatePolicyConfig):
         Number of steps of ``predict_action_chunk``.
     em, fusion, control, training : EMConfig, FusionConfig, ControlConfig, TrainingConfig
         Settings by subject: ``--policy.control.clock=even``.
-    fit : FitConfig
-        Filled in by a fit.
     push_to_hub : bool, default=False
         Whether lerobot-train uploads the policy in the end, to ``repo_id``.
 
@@ -162,9 +161,11 @@ class TPGMMConfig(StatePolicyConfig):
         If a value is none that exists.
     """
 
-    n_components: int = 10
+    n_components: int | str = 10
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None
+    parts: str | None = None
+    modes: int | str = 1
     holds: list[str] | None = None
     via_points: list[str] | None = None
     via_fade: float = 1.0
@@ -187,7 +188,6 @@ class TPGMMConfig(StatePolicyConfig):
     fusion: FusionConfig = field(default_factory=FusionConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
     push_to_hub: bool = False
 
     def __post_init__(self) -> None:
@@ -205,12 +205,8 @@ class TPGMMConfig(StatePolicyConfig):
         for name, value in rates.items():
             if value is not None and not 0 < value < math.inf:
                 raise DataError(f"{name} is a positive number or null, got {value}")
-        for name, count, least in (
-            ("fit.n_steps", self.fit.n_steps, 0),
-            ("chunk_size", self.chunk_size, 1),
-        ):
-            if count < least:
-                raise DataError(f"{name} is at least {least}, got {count}")
+        if self.chunk_size < 1:
+            raise DataError(f"chunk_size is at least 1, got {self.chunk_size}")
         if set(self.normalization_mapping.values()) - {NormalizationMode.IDENTITY}:
             raise DataError(
                 "a tpgmm policy works in SI units, normalization_mapping is IDENTITY for all; "
@@ -221,12 +217,20 @@ class TPGMMConfig(StatePolicyConfig):
         for text in self.training.events.values():
             parse_event(text)
         self.control.options()
-        check_parameters(self.estimator(None, ()))
+        self.given_holds()
+        self.choices().check(None)
+        model = self.estimator(None, ())
+        check_parameters(model)
+        check_parameters(SelectWays(model, self.modes))
 
-    @property
-    def fitted(self) -> bool:
-        """Whether what a fit fills in is there."""
-        return bool(self.fit.n_steps)
+    def choices(self) -> Choices:
+        """Structure that is found in the demonstrations, and what a fit is made of."""
+        return Choices(
+            self.operators == ["auto"],
+            self.n_components == "auto",
+            parse_parts(self.parts),
+            self.modes,
+        )
 
     @property
     def rate(self) -> float:
@@ -260,87 +264,43 @@ class TPGMMConfig(StatePolicyConfig):
         return Robot.from_file(urdf, links, joints=joints, coordinates=self.coordinates)
 
     def decoded_operators(self) -> list[Operator] | None:
-        """The operators that ``operators`` describes; None if it says nothing.
+        """The operators that ``operators`` describes; None if they are not given.
 
         Raises
         ------
         DataError
             If a text describes none.
         """
-        if self.operators is None:
+        if self.operators is None or self.operators == ["auto"]:
             return None
         if "auto" in self.operators:
             raise DataError(
-                "a policy has its operators before it sees demonstrations: find them with "
-                "'tpgmm fit --operator auto', which can write a policy, --format lerobot, also "
-                "with --parts auto; or name those that it reports in operators"
+                f"operators are named or found, got {self.operators}: give ['auto'] alone, or "
+                "leave it out"
             )
         return [
             parse_operator(item) if isinstance(item, str) else decode(item)
             for item in self.operators
         ]
 
-    def describe(self, kinematics: Kinematics, operators: Any) -> None:
-        """Write robot and operators into the configuration, complete in themselves.
-
-        Raises
-        ------
-        ModelFileError
-            If one of them has no description, or none that can be read back.
-        """
-        self.robot = encode(kinematics)
-        self.operators = [_description(operator) for operator in operators]
-        self.kinematics()  # what cannot be read back is refused now
-        self.decoded_operators()
-
-    def note(self, model: TaskParameterizedGMM) -> None:
-        """Fill in what a fit has learned beside the mixture's numbers."""
-        skill = model.skill
-        self.n_components = len(model.weights_)
-        # with the paths that it found
-        self.operators = list(map(_description, model.operators_))
-        self.holds = list(map(str, model.holds_))
-        self.fit = FitConfig(
-            len(model.time_),
-            None if skill.summary is None else skill.summary.config(),
-            None if skill.peaks is None else [each.tolist() for each in skill.peaks],
-        )
-        self.fusion = FusionConfig.of(skill.fusion)
-
-    def skill(self, model: TaskParameterizedGMM) -> Any:
-        """What an episode runs: the model's skill, through the via-points."""
-        if not self.via_points:
-            return model.skill
-        return ViaPoints(model.skill, self.via_points, self.via_fade)
-
     def via_operators(self) -> list[Operator]:
         """Whose coordinates the via-points are."""
         return [ViaPoint.parse(text).operator for text in self.via_points or ()]
 
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
-        """An unfitted estimator of these hyper-parameters, for one way."""
+        """An unfitted estimator of these hyper-parameters."""
+        count: Any = 10 if self.n_components == "auto" else self.n_components
         return TaskParameterizedGMM(
-            self.n_components,
+            count,
             operators,
             kinematics,
             fusion=self.fusion.value(),
             **vars(self.em),
         )
 
-    def learned(self) -> dict[str, Any]:
-        """What a fit has learned beside the mixture, for ``from_parameters``."""
-        summary = None
-        if self.fit.shown is not None:
-            summary = TrainingSummary.from_config(self.fit.shown, self.kinematics())
-        peaks = None
-        if self.fit.peaks is not None:
-            peaks = tuple(torch.tensor(each, dtype=torch.float64) for each in self.fit.peaks)
-        return {
-            "holds": list(map(Hold.parse, self.holds or ())),
-            "n_demonstrations": None if summary is None else summary.n_demonstrations,
-            "peaks": peaks,
-            "summary": summary,
-        }
+    def given_holds(self) -> tuple[Hold, ...] | None:
+        """What ``holds`` describes; None if it is found."""
+        return None if self.holds is None else tuple(map(Hold.parse, self.holds))
 
     def validate_features(self) -> None:
         """Check that there are a state and an action."""
@@ -355,12 +315,3 @@ class TPGMMConfig(StatePolicyConfig):
     def get_optimizer_preset(self) -> AdamConfig:
         """Adam, without weight decay."""
         return AdamConfig(lr=self.training.optimizer_lr, weight_decay=0.0)
-
-
-def _description(operator: Operator) -> dict[str, Any] | str:
-    """As text, if that is the whole operator."""
-    text = format_operator(operator)
-    try:
-        return text if parse_operator(text) == operator else encode(operator)
-    except DataError:  # it has no text
-        return encode(operator)

@@ -12,6 +12,7 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import default_operators
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
@@ -25,10 +26,17 @@ NAMES = {
 }
 
 
-def adopt(config: TPGMMConfig, dataset: Any) -> None:
+def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]]:
     """Complete the configuration of a policy that is to be trained, from its data set.
 
-    What is given stays; robot and operators become descriptions that need no file.
+    What is given stays.
+
+    Returns
+    -------
+    kinematics : Kinematics
+        The robot, or the joints alone.
+    operators : list of Operator
+        Those that are given, or the candidates.
     """
     for key, field in NAMES.items():
         if getattr(config, field) is None:
@@ -61,7 +69,7 @@ def adopt(config: TPGMMConfig, dataset: Any) -> None:
     if operators is None:
         frames = _frames(config) if kinematics.links else []
         operators = default_operators(kinematics.links, frames)
-    config.describe(kinematics, operators)
+    return kinematics, operators
 
 
 def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:

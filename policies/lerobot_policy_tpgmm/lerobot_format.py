@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tpgmm_datasets.signals import Signals
@@ -14,12 +15,12 @@ from tpgmm_torch.exceptions import ModelFileError
 __all__ = ["write_pretrained"]
 
 
-def write_pretrained(model: TaskParameterizedGMM, path: Path, signals: Signals) -> None:
+def write_pretrained(model: Any, path: Path, signals: Signals) -> None:
     """Write the directory that LeRobot's commands take as ``--policy.path``.
 
     Parameters
     ----------
-    model : TaskParameterizedGMM
+    model : TaskParameterizedGMM or Skill
         Fitted.
     signals : Signals
         Of the data set that the model was fitted to.
@@ -35,13 +36,14 @@ def write_pretrained(model: TaskParameterizedGMM, path: Path, signals: Signals) 
         raise ModelFileError(
             f"{path} exists and is not a tpgmm policy; choose another directory"
         )
+    skill = model.skill if isinstance(model, TaskParameterizedGMM) else model
     policy = TPGMMPolicy.from_estimator(
         model,
         fps=signals.fps,
         state_names=signals.state_names,
         action_names=signals.action_names,
         environment_names=signals.environment_names,
-        frames={n: p for n, p in signals.frames.items() if n in model.frame_names_},
+        frames={n: p for n, p in signals.frames.items() if n in skill.frame_names},
         units={name: list(scale) for name, scale in signals.units.items()} or None,
     )
     policy.save_pretrained(path)

@@ -30,8 +30,6 @@ class MixtureParameters(nn.Module):
         K.
     dimensions : sequence of int
         D_j, the number of local coordinates of each operator, time not counted.
-    n_steps : int
-        T, the length of the time grid; 0 before a fit.
 
     Attributes
     ----------
@@ -41,7 +39,7 @@ class MixtureParameters(nn.Module):
     factors : ParameterList
         Of shape (K, 1 + D_j, 1 + D_j): log D and N. The upper triangle is not used.
     time : Tensor of shape (T,)
-        Buffer: time grid of a typical demonstration [s].
+        Buffer: time grid of a typical demonstration [s]; empty before a fit.
     fitted : Tensor of shape ()
         Buffer: whether the numbers come from a fitted model.
     """
@@ -54,7 +52,6 @@ class MixtureParameters(nn.Module):
         self,
         n_components: int,
         dimensions: Sequence[int],
-        n_steps: int,
         dtype: torch.dtype = torch.float64,
     ) -> None:
         super().__init__()
@@ -66,7 +63,7 @@ class MixtureParameters(nn.Module):
         self.factors = nn.ParameterList(
             torch.zeros(n_components, width, width, dtype=dtype) for width in widths
         )
-        self.register_buffer("time", torch.zeros(n_steps, dtype=dtype))
+        self.register_buffer("time", torch.zeros(0, dtype=dtype))
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     def tensors(self) -> tuple[Tensor, list[Tensor], list[Tensor]]:
@@ -107,9 +104,6 @@ class MixtureParameters(nn.Module):
     @torch.no_grad()
     def copy_from(self, model: TaskParameterizedGMM) -> None:
         """Take the parameters of a fitted model.
-
-        The time grid becomes the model's, whatever its length: who calls this writes the
-        length into the configuration.
 
         Raises
         ------

@@ -12,7 +12,7 @@ from typing import Any, Self
 import torch
 from draccus.utils import DecodingError, ParsingError
 from huggingface_hub.constants import CONFIG_NAME
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
@@ -30,13 +30,14 @@ from lerobot_policy_tpgmm.observations import (
     observed_frames,
     poses_named,
 )
-from lerobot_policy_tpgmm.policy_files import check_files, read_tensors, write_files
-from lerobot_policy_tpgmm.settings import EMConfig
+from lerobot_policy_tpgmm.policy_files import PATTERNS, read_model, write_files
+from lerobot_policy_tpgmm.settings import EMConfig, FusionConfig
 from lerobot_policy_tpgmm.tick_durations import TickDurations
 from lerobot_policy_tpgmm.training.learner import Learner
-from tpgmm_tools.hub import describe, model_card, upload
+from tpgmm_tools.cli.learning import Choices
+from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.atomic import recover
+from tpgmm_torch.atomic import consistent, recover
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
@@ -47,6 +48,11 @@ from tpgmm_torch.exceptions import (
 )
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.persistence import decode, encode
+from tpgmm_torch.robots import Kinematics
+from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.skills.via_points import ViaPoints
 
 __all__ = ["TPGMMPolicy"]
 
@@ -120,6 +126,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     dataset_meta : LeRobotDatasetMetadata, optional
         What the policy is trained on. It completes the configuration of a policy that is not
         fitted; with a fitted one it must agree.
+    model : TaskParameterizedGMM or Skill, optional
+        What was fitted.
     **unused
         What else LeRobot passes.
 
@@ -139,32 +147,26 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config: TPGMMConfig,
         dataset_stats: object = None,
         dataset_meta: Any = None,
+        model: Any = None,
         **unused: Any,
     ) -> None:
         super().__init__(config)
         self.config = config
-        if dataset_meta is not None:
-            (check_dataset if config.fitted else adopt)(config, dataset_meta)
-        kinematics, operators = config.kinematics(), config.decoded_operators()
-        if kinematics is None or not operators:
-            raise DataError(
-                "a policy that is not fitted needs a data set to be trained on: lerobot-train "
-                "--policy.type=tpgmm --dataset.root=..., or TPGMMPolicy.from_estimator(model), "
-                "or tpgmm fit ... --format lerobot"
-            )
+        if model is None:
+            kinematics, operators = self._asked(dataset_meta)
+            required = frame_names([*operators, *config.via_operators()], kinematics)
+        else:
+            if dataset_meta is not None:
+                check_dataset(config, dataset_meta)
+            skill = _skill(model)
+            kinematics, operators = skill.kinematics, getattr(model, "operators_", ())
+            required = (*skill.frame_names, *frame_names(config.via_operators(), kinematics))
         config.validate_features()
         self.kinematics = kinematics.to(getattr(torch, config.em.dtype))
-        required = list(frame_names([*operators, *config.via_operators()], kinematics))
-        # an object that only stands where links do is told from a misspelt link by its data
-        known = {name for operator in operators for name in operator.references()}
-        known |= {*(config.frames or ()), *poses_named(config.environment_names)}
-        known |= {*poses_named(config.state_names)}
-        for operator in operators:
-            operator.check(self.kinematics, known - set(self.kinematics.links))
-        self._make_mixture(operators)
+        self._make_mixture(operators, model)
         names = self.kinematics.joint_names
         state_names = config.state_names or names
-        if config.fitted:  # the robot at hand may state more than the data set did
+        if model is not None:  # the robot at hand may state more than the data set did
             size = (len(state_names),)
             config.input_features[OBS_STATE] = PolicyFeature(FeatureType.STATE, size)
         self._check_size("state_names", state_names, config.robot_state_feature)
@@ -174,7 +176,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         environment = config.env_state_feature
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names
-        told = observed_frames(config, required)
+        summary = None if model is None else skill.summary
+        told = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
         self.frames = FrameFeatures(told, config.frames, *named, default, width)
         self._learner: Learner | None = None
@@ -191,8 +194,30 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 shown,
                 dataset_meta,
                 self._become,
+                model,
             )
         self.reset()
+
+    def _asked(self, dataset_meta: Any) -> tuple[Kinematics, Sequence[Operator]]:
+        """Robot and operators of a policy that is not fitted."""
+        config = self.config
+        kinematics: Kinematics | None = config.kinematics()
+        operators: Sequence[Operator] | None = config.decoded_operators()
+        if dataset_meta is not None:
+            kinematics, operators = adopt(config, dataset_meta)
+        if kinematics is None or operators is None:
+            raise DataError(
+                "a policy that is not fitted needs a data set to be trained on: lerobot-train "
+                "--policy.type=tpgmm --dataset.root=..., or TPGMMPolicy.from_estimator(model), "
+                "or tpgmm fit ... --format lerobot"
+            )
+        # an object that only stands where links do is told from a misspelt link by its data
+        known = {name for operator in operators for name in operator.references()}
+        known |= {*(config.frames or ()), *poses_named(config.environment_names)}
+        known |= {*poses_named(config.state_names)}
+        for operator in operators:
+            operator.check(kinematics, known - set(kinematics.links))
+        return kinematics, operators
 
     @staticmethod
     def _check_size(field: str, names: Sequence[str], feature: PolicyFeature) -> None:
@@ -203,19 +228,56 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 f"another robot? Else name the entries in order, --policy.{field}='[...]'"
             )
 
-    def _make_mixture(self, operators: Sequence[Operator]) -> None:
-        """The mixture, once the number of time steps is known."""
-        config, dtype = self.config, getattr(torch, self.config.em.dtype)
-        dimensions = [one.dimension(self.kinematics) for one in operators]
-        self.mixture = MixtureParameters(
-            config.n_components, dimensions, config.fit.n_steps, dtype
-        )
+    def _make_mixture(self, operators: Sequence[Operator], model: Any) -> None:
+        """What is learned by gradient: the mixture of a model of given structure.
 
-    def _become(self, model: TaskParameterizedGMM) -> None:
-        """Take over what a fitted model is."""
-        self.config.note(model)
-        self.mixture.copy_from(model)
+        Optimizers are made before a fit, so what it decides on has one stand-in parameter each.
+        """
+        config, dtype = self.config, getattr(torch, self.config.em.dtype)
+        self._model, self._stale = model, False
+        self._plain = config.choices() == Choices()
+        if model is not None:
+            self._plain &= isinstance(model, TaskParameterizedGMM)
+        if not self._plain:
+            self.mixture = MixtureParameters(1, [1], dtype)
+        else:
+            dimensions = [one.dimension(self.kinematics) for one in operators]
+            count: Any = config.n_components if model is None else len(model.weights_)
+            self.mixture = MixtureParameters(count, dimensions, dtype)
+        if model is not None:
+            self._become(model)
+            self._stale = self._plain and self._overridden(model)
+
+    def _become(self, model: Any) -> None:
+        """Take over a fitted model or skill."""
+        self._model = model
+        if self._plain:
+            self.mixture.copy_from(model)
+        else:
+            self.mixture.time = _skill(model).time.to(self.mixture.time, copy=True)
+            self.mixture.fitted.fill_(True)
         self.to(self.mixture.time.device)
+
+    def _overridden(self, model: TaskParameterizedGMM) -> bool:
+        """Whether the configuration has other settings than a model; what cannot is refused."""
+        config, asked = self.config, self.config.decoded_operators()
+        there = list(map(format_operator, model.operators_))  # which has no mean paths
+        changed = {
+            "n_components": config.n_components != len(model.weights_),
+            "operators": asked is not None and list(map(format_operator, asked)) != there,
+        }
+        if wrong := [name for name, differs in changed.items() if differs]:
+            raise ModelFileError(
+                f"{', '.join(wrong)} of the configuration differ from the model beside it, "
+                f"which has {len(model.weights_)} components and the operators {there}: fit "
+                "again to change them"
+            )
+        return (
+            config.given_holds() not in (None, tuple(model.holds_))
+            or FusionConfig.of(model.skill.fusion) != config.fusion
+            or config.em.covariance_shrinkage != model.covariance_shrinkage
+            or config.em.dtype != model.dtype
+        )
 
     @classmethod
     def from_estimator(
@@ -233,7 +295,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
         Parameters
         ----------
-        model : TaskParameterizedGMM
+        model : TaskParameterizedGMM or Skill
             Fitted.
         fps : float, optional
             Steps per second; by default those of the model's time grid.
@@ -241,7 +303,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             Names of the entries of ``observation.state``, ``action`` and
             ``observation.environment_state``; by default states and actions are the model's
             joints in its order, and the environment holds its frames in the order of
-            ``model.frame_names_``, with a warning if there are several.
+            ``skill.frame_names``, with a warning if there are several.
         frames : mapping of str to sequence, optional
             As in :class:`TPGMMConfig`.
         **options
@@ -255,31 +317,26 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             If names or frames do not fit the model, or it holds an operator or a robot of
             your own, which a file cannot describe.
         """
-        if not isinstance(model, TaskParameterizedGMM):
-            raise DataError(
-                f"a policy is made of a TaskParameterizedGMM, got {type(model).__name__}"
-            )
-        if not hasattr(model, "weights_"):
-            raise NotFittedError("the model is not fitted: call fit(demonstrations) first")
-        kinematics, time = model.kinematics_, model.time_
+        skill = _skill(model)
+        try:
+            time = skill.time
+        except AttributeError:
+            raise DataError(f"a policy is made of a model or a skill, got {model!r}") from None
         if fps is None and len(time) > 1:
             fps = round(float((len(time) - 1) / (time[-1] - time[0])), 6)
-        config = TPGMMConfig(
-            **{
-                "device": "cpu",
-                "push_to_hub": False,
-                "fps": fps,
-                "em": _settings(model),
-                **options,
-            }
-        )
-        config.describe(kinematics, model.operators_)
-        config.note(model)
+        settings: dict[str, Any] = {"device": "cpu", "push_to_hub": False, "fps": fps}
+        if isinstance(model, TaskParameterizedGMM):
+            settings |= {"em": _settings(model), "fusion": FusionConfig.of(skill.fusion)}
+            settings["n_components"] = len(model.weights_)
+        config = TPGMMConfig(**(settings | options))
+        tensors: dict[str, Tensor] = {}
+        model = decode(encode(model, tensors), (), tensors)  # what no file can hold is refused
+        kinematics = skill.kinematics
         config.state_names = list(state_names or kinematics.joint_names)
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
-        told = observed_frames(config, model.frame_names_)
+        told = observed_frames(config, skill.frame_names, skill.summary)
         poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
         given = frames or {}
         order = [name for name in poses.in_environment if name not in given]
@@ -294,19 +351,45 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         sizes = len(config.state_names), poses.n_environment, len(config.action_names)
         config.input_features, config.output_features = state_features(*sizes).values()
-        policy = cls(config)
-        policy._become(model)
-        return policy.eval().to(config.device)
+        return cls(config, model=model).eval().to(config.device)
 
-    def to_estimator(self) -> TaskParameterizedGMM:
-        """The fitted model that the policy is."""
+    def to_estimator(self) -> Any:
+        """The fitted model or skill that the policy is.
+
+        Raises
+        ------
+        NotFittedError
+            If the policy is not fitted.
+        """
         device = self.mixture.time.device
-        operators, kinematics = (
-            self.config.decoded_operators(),
-            self.kinematics.to(device=device),
+        if self._model is None:
+            raise NotFittedError("the policy is not fitted: train it, or use from_estimator")
+        if self._stale or _skill(self._model).kinematics.lower.device != device:
+            self._model = self._renewed(device)
+            self._stale = self.training
+        return self._model
+
+    def _renewed(self, device: torch.device) -> Any:
+        """The model with the numbers of the mixture, on its device."""
+        model, tensors = self._model, dict[str, Tensor]()
+        if not self._plain:
+            described = encode(model, tensors)
+            return decode(described, (), {k: v.to(device) for k, v in tensors.items()})
+        new = self.config.estimator(self.kinematics.to(device=device), model.operators_)
+        given, peaks = self.config.given_holds(), model.skill.peaks
+        return self.mixture.to_estimator(
+            new.set_params(device=str(device)),
+            holds=model.holds_ if given is None else given,
+            n_demonstrations=model.n_demonstrations_,
+            peaks=None if peaks is None else tuple(each.to(device) for each in peaks),
+            summary=model.summary_,
         )
-        model = self.config.estimator(kinematics, operators).set_params(device=str(device))
-        return self.mixture.to_estimator(model, **self.config.learned())
+
+    @property
+    def skill(self) -> Skill:
+        """What an episode runs: the model's skill, through the via-points."""
+        skill, points = _skill(self.to_estimator()), self.config.via_points
+        return ViaPoints(skill, points, self.config.via_fade) if points else skill
 
     def reset(self) -> None:
         """Begin a new episode with the next observation."""
@@ -395,11 +478,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
-        skill = self.config.skill(self.to_estimator())
         joints, frames = self._observed(batch), self.frames.frames(batch)
         if len(joints) == 1:  # one robot is sooner computed without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
-        return Controller(skill, joints, frames, **self.config.control.options())
+        return Controller(self.skill, joints, frames, **self.config.control.options())
 
     def _told(
         self, batch: Mapping[str, Tensor], controller: Controller
@@ -487,14 +569,11 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Switch between training and use; what was collected in training is fitted by then."""
         if not mode and self._learner is not None:
             self._learner.end_epoch()
+        self._stale |= mode and self._plain and self._model is not None
         return super().train(mode)
 
     def get_optim_params(self) -> Any:
-        """What gradient training changes: the mixture of one way.
-
-        Others are found when there is an optimizer already, and a run that is resumed has to
-        find in it as many parameters as before.
-        """
+        """What gradient training changes: the mixture."""
         return self.mixture.parameters()
 
     def _save_pretrained(
@@ -502,8 +581,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     ) -> None:
         if self._learner is not None:
             self._learner.check_saveable()
-        self.to_estimator()  # refuses what could not be loaded
-        write_files(self.config, state_dict or self.state_dict(), Path(save_directory))
+        write_files(self.config, self.to_estimator(), Path(save_directory))
 
     def push_to_hub(self, repo_id: str, **options: Any) -> str:
         """Upload the policy to the Hugging Face hub, with a card made from it.
@@ -538,7 +616,15 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return card
 
     @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, **options: Any) -> Self:
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: TPGMMConfig | None = None,
+        revision: str | None = None,
+        token: str | None = None,
+        **options: Any,
+    ) -> Self:
         """Load a policy from a folder, or from the Hugging Face hub by its id.
 
         Parameters
@@ -546,44 +632,46 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         pretrained_name_or_path : str or Path
             A missing folder that is written as one, ``/home/me/policy``, is not looked up on
             the hub.
-        **options
+        config, revision, token, **options
             As for LeRobot's ``PreTrainedPolicy``.
 
         Raises
         ------
         ModelFileError
-            If the folder is missing, or a file in it is damaged, missing, changed, or of
-            another save than the others.
+            If the folder is missing, a file in it is damaged, missing or of another release,
+            or the configuration does not belong to the model.
         """
-        folder = Path(pretrained_name_or_path)
-        recover(folder)
-        if folder.is_dir():
-            check_files(folder)
-        elif str(pretrained_name_or_path).startswith((".", "/", "~")):
-            raise ModelFileError(f"there is no folder {folder}")
+        name = str(pretrained_name_or_path)
+        recover(name)
+        if not Path(name).is_dir():
+            if name.startswith((".", "/", "~")):
+                raise ModelFileError(f"there is no folder {name}")
+            name = str(download(name, PATTERNS, revision=revision, token=token))
+        folder = Path(name)
         try:
-            return super().from_pretrained(pretrained_name_or_path, **options)
+            model, config = consistent(
+                folder,
+                lambda: (
+                    read_model(folder),
+                    config or PreTrainedConfig.from_pretrained(folder, **options),
+                ),
+            )
         except (DecodingError, ParsingError) as error:
-            raise ModelFileError(
-                f"{folder / CONFIG_NAME} cannot be read: {error}. Policies of 0.1 and 0.2 are "
-                "not read any more: fit again"
-            ) from error
-
-    @classmethod
-    def _load_as_safetensor(
-        cls, model: Self, model_file: str, map_location: str, strict: bool
-    ) -> Self:
-        """Strictly, whatever ``strict`` says: LeRobot itself only warns of what is missing."""
-        model.load_state_dict(read_tensors(model_file, model.state_dict()))
-        model.to_estimator()  # refuses numbers that are no mixture
+            raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
+        policy = cls(config, model=model, **options).eval().to(config.device)
         # a robot of LeRobot tells none of this to a policy: who starts it must compare
         log.info(
             "observation.state is taken as %s; actions are %s, %g per second (--fps)",
-            list(model.joints.state_names),
-            list(model.joints.action_names),
-            model.config.rate,
+            list(policy.joints.state_names),
+            list(policy.joints.action_names),
+            policy.config.rate,
         )
-        return model
+        return policy
+
+
+def _skill(model: Any) -> Any:
+    """What runs of a model, or a skill itself."""
+    return model.skill if isinstance(model, TaskParameterizedGMM) else model
 
 
 def _settings(model: TaskParameterizedGMM) -> EMConfig:

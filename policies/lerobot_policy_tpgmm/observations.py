@@ -241,16 +241,17 @@ class FrameFeatures:
         return values.to(torch.float64)
 
 
-def observed_frames(config: TPGMMConfig, required: Sequence[str]) -> list[str]:
-    """Those of the ``required`` frames that a running policy is told.
+def observed_frames(
+    config: TPGMMConfig, required: Sequence[str], summary: TrainingSummary | None = None
+) -> list[str]:
+    """Those of the ``required`` frames that a running policy observes.
 
     Where a link is at the start follows from the joints, unless the names of the entries of
-    ``config`` tell of the frame.
+    ``config`` tell of the frame. The ``summary`` is that of the demonstrations.
     """
     start = {name for name, pose in config.link_poses().items() if pose.event == "start"}
-    if config.fit.shown is not None:
-        frames = TrainingSummary.from_config(config.fit.shown).frames
-        start |= {name for name, shown in frames.items() if shown.link is not None}
+    if summary is not None:
+        start |= {name for name, shown in summary.frames.items() if shown.link is not None}
     placed = {*(config.frames or ()), *poses_named(config.environment_names)}
     placed |= {*poses_named(config.state_names)}
     return [name for name in required if name not in start or name in placed]

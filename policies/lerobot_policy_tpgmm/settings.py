@@ -1,4 +1,4 @@
-"""Groups of a policy's settings: learning, fusion, control, training, and results of a fit."""
+"""Groups of a policy's settings: learning, fusion, control, training."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.sensing.pose_filter import OneEuro
 
-__all__ = ["ControlConfig", "EMConfig", "FitConfig", "FusionConfig", "TrainingConfig"]
+__all__ = ["ControlConfig", "EMConfig", "FusionConfig", "TrainingConfig"]
 
 #: Bounds for all joints, for each, or for some by name.
 Bound = dict[str, float] | list[float] | float | None
@@ -230,23 +230,3 @@ class TrainingConfig:
                 "--policy.training.learn_from=commanded goes with "
                 "--policy.training.loss=likelihood"
             )
-
-
-@dataclass
-class FitConfig:
-    """Results of a fit beside the numbers of the mixture; empty before.
-
-    Parameters
-    ----------
-    n_steps : int, default=0
-        T, the length of the time grid that was learned; 0 before a fit.
-    shown : dict, optional
-        The summary of the demonstrations, :class:`tpgmm_torch.checks.TrainingSummary`, as JSON.
-    peaks : list of two lists of float, optional
-        Accelerations and jerks of the joints in the demonstrations [rad/s^n]: with a margin,
-        the bounds of joints that neither the robot nor the user bounds.
-    """
-
-    n_steps: int = 0
-    shown: dict[str, Any] | None = None
-    peaks: list[list[float]] | None = None

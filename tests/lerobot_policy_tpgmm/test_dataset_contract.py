@@ -37,40 +37,37 @@ def environment(names):
 
 def test_a_data_set_completes_a_configuration():
     made = config(**UPPER_BODY)
-    adopt(made, dataset(20, **environment(POSE)))
+    kinematics, operators = adopt(made, dataset(20, **environment(POSE)))
     assert made.fps == made.rate == 20
     assert made.state_names == made.action_names == list(NAMES)
     assert made.environment_names == POSE and not made.units
     assert set(made.input_features) == {STATE, ENVIRONMENT}
-    assert made.kinematics() == fitted().kinematics
-    assert made.decoded_operators() == fitted().config.decoded_operators()
-    assert "<robot" in made.robot["config"]["urdf"]
-    policy = TPGMMPolicy(made)
-    assert policy.frames.in_environment == {"bottle": [*range(7)]}
-    assert not bool(policy.mixture.fitted)
+    assert kinematics == fitted().kinematics
+    assert tuple(operators) == fitted().to_estimator().operators_
 
 
 def test_what_is_given_stays():
     given = {"operators": ["position:l_hand@cup"], "frames": {"cup": [*range(7)]}}
     made = config(**UPPER_BODY, **given, units="deg", control_fps=50.0)
-    adopt(made, dataset(20))
+    policy = TPGMMPolicy(made, dataset_meta=dataset(20))
     assert made.operators == given["operators"] and made.units == "deg" and made.rate == 50
-    assert TPGMMPolicy(made).frames.in_environment == given["frames"]
+    assert policy.frames.in_environment == given["frames"]
 
 
 def test_units_that_the_data_set_declares_are_taken():
     units = ["deg"] * 16 + ["mm"]
     feature = {"shape": (17,), "names": list(NAMES), "info": {"units": units}}
     made = config(**UPPER_BODY)
-    adopt(made, dataset(20, **{STATE: feature}, **environment(POSE)))
-    joints = TPGMMPolicy(made).joints.joints(torch.full((1, 17), 180.0))
+    data = dataset(20, **{STATE: feature}, **environment(POSE))
+    policy = TPGMMPolicy(made, dataset_meta=data)
+    joints = policy.joints.joints(torch.full((1, 17), 180.0))
     np.testing.assert_allclose(joints[0], [np.pi] * 16 + [0.18])
 
 
 def test_joints_alone_need_no_robot():
     made = config(n_environment=0)
-    adopt(made, dataset(20))
-    assert made.kinematics() == JointSpace(NAMES)
+    kinematics, _ = adopt(made, dataset(20))
+    assert kinematics == JointSpace(NAMES)
     assert made.decoded_operators() == [Canonical()]
 
 
@@ -87,14 +84,6 @@ def test_what_does_not_fit_a_data_set_is_refused(options, features, message):
     made = config(**options)
     with pytest.raises((DataError, OSError), match=message):
         TPGMMPolicy(made, dataset_meta=dataset(20, **features))
-
-
-def test_a_robot_of_a_file_becomes_a_description(tmp_path):
-    (tmp_path / "robot.urdf").write_text(upper_body_urdf())
-    made = config(robot=str(tmp_path / "robot.urdf"), links=["l_hand"])
-    adopt(made, dataset(20, **environment(POSE)))
-    (tmp_path / "robot.urdf").unlink()
-    assert made.kinematics() == Robot.from_urdf(upper_body_urdf(), ["l_hand"])
 
 
 def test_a_robot_may_be_an_mjcf_or_one_that_comes_with_the_package(tmp_path):

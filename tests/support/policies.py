@@ -14,7 +14,6 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.settings import (
     ControlConfig,
     EMConfig,
-    FitConfig,
     FusionConfig,
     TrainingConfig,
 )
@@ -35,7 +34,6 @@ GROUPS = {
     "fusion": FusionConfig,
     "control": ControlConfig,
     "training": TrainingConfig,
-    "fit": FitConfig,
 }
 
 
@@ -107,9 +105,7 @@ def changed(given: TPGMMPolicy, **fields: object) -> TPGMMPolicy:
     for name, value in fields.items():
         owner = [group for group, kind in GROUPS.items() if name in kind.__annotations__]
         setattr(getattr(config, owner[0]) if owner else config, name, value)
-    other = TPGMMPolicy(config)
-    other.load_state_dict(given.state_dict())
-    return other.eval()
+    return TPGMMPolicy(config, model=given.to_estimator()).eval()
 
 
 def loaded(path: Path, *overrides: str, **more: object) -> TPGMMPolicy:

@@ -44,26 +44,20 @@ from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
-from tpgmm_torch import (
-    Demonstration,
-    Hold,
-    TaskParameterizedGMM,
-)
+from tpgmm_tools.cli.learning import Choices, learn, prepared
+from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment.base import Alignment
 from tpgmm_torch.alignment.piecewise_linear import EventAlignment
 from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
-from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
-from tpgmm_torch.training.outlying_demonstrations import (
-    drop_outliers,
-    outlying_demonstrations,
-)
+from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
 __all__ = ["Learner"]
 
@@ -85,14 +79,16 @@ class Learner:
     kinematics : Kinematics
     operators : sequence of Operator
     mixture : MixtureParameters
-        What is learned, of the first way.
+        What is learned.
     joints : JointFeatures
     frames : FrameFeatures
         Where observations hold the joints and the frames.
     dataset_meta : LeRobotDatasetMetadata
         Of the data set that the batches come from.
     become : callable
-        Makes the policy what a fitted model is, ``config`` and ``mixture`` included.
+        Makes the policy what a fitted model or skill is, ``mixture`` included.
+    model : TaskParameterizedGMM or Skill, optional
+        What was fitted before.
 
     Attributes
     ----------
@@ -112,9 +108,11 @@ class Learner:
         joints: JointFeatures,
         frames: FrameFeatures,
         dataset_meta: Any,
-        become: Callable[[TaskParameterizedGMM], None],
+        become: Callable[[Any], None],
+        model: Any = None,
     ) -> None:
         self._config, self._mixture, self._become = config, mixture, become
+        self._model, self._choices = model, config.choices()
         self._kinematics, self._operators = kinematics, tuple(operators)
         self._joints, self._frames = joints, frames
         self._dataset, flags = dataset_meta, dataset_meta.features
@@ -197,8 +195,14 @@ class Learner:
     def _unlearnable(self) -> str:
         """Why frames by themselves are not enough for a gradient; empty if they are."""
         config = self._config
-        if config.holds:  # they do not tell where an object was last free
-            return f"objects are held, {', '.join(config.holds)}"
+        if self._choices != Choices():  # the mixture has no place in the optimizer
+            return "operators, components, parts or ways were found by the fit"
+        if not isinstance(self._model, TaskParameterizedGMM):
+            return f"the policy is a skill, {type(self._model).__name__}, of several models"
+        given = config.given_holds()
+        if holds := self._model.holds_ if given is None else given:
+            # frames do not tell where an object was last free
+            return f"objects are held, {', '.join(map(str, holds))}"
         if config.training.link_frames:  # nor where a link is at an event of the episode
             return f"frames are at events, {', '.join(config.training.link_frames.values())}"
         return ""
@@ -259,29 +263,30 @@ class Learner:
         self._go_on_from(dict(zip(numbers, aligned, strict=True)), kinematics)
 
     def _fit(self, model: TaskParameterizedGMM, aligned: Sequence[Demonstration]) -> None:
-        """Learn aligned demonstrations, of as many ways as there are."""
-        config = self._config
-        log.info("EM: fitting %d components", config.n_components)
-        shown = list(aligned)
-        if config.holds is not None:
-            shown = with_holds(shown, list(map(Hold.parse, config.holds)))
-        if config.training.robust:
-            shown = drop_outliers(shown, self._operators, model.robot)
-        if config.holds is None:
-            shown = attach_holds(shown, model.robot)
-        model.fit(shown)
-        self._become(model)
-        self._operators = model.operators_
-        log.info(
-            "%d components fitted by %d steps of EM: the policy is trained",
-            len(model.weights_),
-            model.mixture_.n_iter_,
-        )
+        """Learn aligned demonstrations, and what of their structure is asked for."""
+        config, operators = self._config, self._operators
+        log.info("EM: fitting %s components", config.n_components)
+        robust, holds = config.training.robust, config.given_holds()
+        shown = prepared(aligned, operators, model.robot, robust, holds)
+        self._model, reports = learn(model, shown, self._choices)
+        for report in reports:
+            log.info("%s", report)
+        self._become(self._model)
+        if isinstance(self._model, TaskParameterizedGMM):
+            self._operators = self._model.operators_
+            log.info(
+                "%d components fitted by %d steps of EM: the policy is trained",
+                len(self._model.weights_),
+                self._model.n_iter_,
+            )
 
     def _go_on_from(self, aligned: Mapping[int, Demonstration], kinematics: Kinematics) -> None:
         """Find what the loss of later steps needs to know of the demonstrations."""
         config, mixture, operators = self._config, self._mixture, self._operators
-        holds = list(map(Hold.parse, config.holds or ()))
+        if self._choices != Choices() or not isinstance(self._model, TaskParameterizedGMM):
+            return
+        given = config.given_holds()
+        holds = self._model.holds_ if given is None else given
         shown = list(aligned.values())
         if config.training.robust:  # as in fit, which says so
             outlying = outlying_demonstrations(shown, operators, kinematics, holds)
@@ -291,9 +296,7 @@ class Learner:
         kept = [one for number, one in aligned.items() if number not in self._left_out]
         like = mixture.time
         with torch.no_grad():
-            model = regression(
-                config, kinematics.to(like.dtype, like.device), operators, mixture
-            )
+            model = self._regression(kinematics.to(like.dtype, like.device))
 
             def expected(j: int, time: Tensor) -> Tensor:
                 return model.expected(j, time.to(like)).to(time)
@@ -439,7 +442,7 @@ class Learner:
         if self._kinematics.lower.device != mixture.time.device:
             self._kinematics = self._kinematics.to(device=mixture.time.device)
         samples = self._samples(batch, numbers, steps)
-        model = regression(config, self._kinematics, self._operators, mixture)
+        model = self._regression(self._kinematics)
         if config.training.loss == "likelihood":
             # held-out frames are scored, not learned
             prior = self.prior if training else None
@@ -453,6 +456,10 @@ class Learner:
                 "lower --policy.training.optimizer_lr"
             )
         return loss
+
+    def _regression(self, kinematics: Kinematics) -> Regression:
+        count = self._model.n_demonstrations_
+        return regression(self._config, kinematics, self._operators, self._mixture, count)
 
     def _samples(self, batch: Mapping[str, Any], numbers: Tensor, steps: Tensor) -> Samples:
         like = self._mixture.time

@@ -14,7 +14,6 @@ from lerobot_policy_tpgmm.training.covariance_prior import CovariancePrior
 from tpgmm_torch import Frame, quaternions
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
-from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics, RobotState
 
@@ -51,6 +50,7 @@ def regression(
     kinematics: Kinematics,
     operators: Sequence[Operator],
     mixture: MixtureParameters,
+    n_demonstrations: int | None,
 ) -> Regression:
     """The regression of a policy, with parameters that carry gradients."""
     local = []
@@ -59,14 +59,13 @@ def regression(
         first, others = triangle[:, 0, 0], triangle[:, 1:, 1:]
         gain, covariance = triangle[:, 1:, 0] / first[:, None], others @ others.mT
         local.append(Conditionals(mean[:, 1:], gain, covariance, mean[:, 0], first.square()))
-    shown = None if config.fit.shown is None else config.fit.shown["n_demonstrations"]
     return Regression(
         kinematics,
         operators,
         local,
         mixture.logits.log_softmax(0),
-        fusion=config.estimator(None, ()).fusion or InformationFusion(),
-        n_samples=shown if config.em.covariance_shrinkage == "auto" else None,
+        fusion=config.fusion.value(),
+        n_samples=n_demonstrations if config.em.covariance_shrinkage == "auto" else None,
     )
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.policies import loaded
+from tests.support.errands import HAND
+from tests.support.policies import act, loaded, seen
 from tests.support.skills import HANDLING, HANDS, same
 from tests.support.training import (
     FPS,
@@ -20,10 +21,13 @@ from tests.support.training import (
     resumed,
     trained,
 )
+from tests.support.two_ways import ARM, another_handle_each, two_ways_set
 from tpgmm_datasets import load_lerobot
-from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
+from tpgmm_torch import Frame, Segmentation, TaskParameterizedGMM, fit_parts
+from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.operators.text import parse_operator
+from tpgmm_torch.persistence import encode
 from tpgmm_torch.robots.joint_space import JointSpace
 
 # What is learned
@@ -47,7 +51,7 @@ def test_an_epoch_of_batches_is_what_the_estimator_learns(waves, alignment, alig
     policy = trained(waves, alignment=alignment, **WAVES)
     same(policy.to_estimator(), model, 1e-12)
     assert torch.equal(policy.to_estimator().time_, model.time_)
-    assert policy.config.fit.n_steps == len(model.time_) and policy.config.fps == FPS
+    assert policy.config.fps == FPS
 
 
 def test_frames_and_quaternions_are_learned(handlings):
@@ -58,6 +62,82 @@ def test_frames_and_quaternions_are_learned(handlings):
     same(policy.to_estimator(), model, 1e-9)
     [one], [other] = (m.predict(demonstrations[:1]) for m in (policy.to_estimator(), model))
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-6)
+
+
+# Structure that is found
+
+
+FOUND = {"n_components": 6, "robot": encode(HAND)}
+
+
+def test_parts_are_found_and_learned(errand_set, caplog, tmp_path):
+    """As tpgmm fit --parts auto --alignment parts does; the skill then stays."""
+    operators = ["position:hand@cup", "position:hand@tray", "canonical"]
+    shown = load_lerobot(errand_set.root)
+    segmentation = Segmentation(HAND)
+    divided = segmentation.fit_transform(shown)
+    aligned = EventAlignment(["part *"], robot=HAND).fit_transform(divided)
+    model = TaskParameterizedGMM(6, list(map(parse_operator, operators)), HAND)
+    wanted = fit_parts(model, aligned, Segmentation(HAND).fit(aligned).times())
+    options = FOUND | {"operators": operators, "alignment": "parts", "robust": False}
+    with caplog.at_level(logging.INFO):
+        policy = trained(errand_set, parts="auto", **options)
+    assert len(wanted.skills) == 2 and "because of" in caplog.text
+    policy.save_pretrained(tmp_path)
+    loss, _ = policy.train().forward(epoch(errand_set, 32)[0])
+    assert loss.item() == 0 and "were found by the fit" in caplog.text
+    for one in (policy, type(policy).from_pretrained(tmp_path)):
+        for part, expected in zip(one.skill.skills, wanted.skills, strict=True):
+            assert part.end == expected.end
+            torch.testing.assert_close(part.log_weights, expected.log_weights)
+    state = {"observation.state": shown[0].joints[:1].float()}
+    poses = [torch.cat((f.position, f.orientation)) for f in shown[0].frames.values()]
+    state["observation.environment_state"] = torch.cat(poses)[None].float()
+    actions = act(one, state, 5)
+    torch.testing.assert_close(actions, act(policy.eval(), state, 5))
+    resumed(tmp_path, errand_set).forward(epoch(errand_set, 32)[0])
+
+
+def test_parts_can_be_given(waves):
+    aligned = LinearTimeNormalization().fit_transform(load_lerobot(waves.root))
+    wanted = fit_parts(TaskParameterizedGMM(**WAVES), aligned, [0.5, 1.2])
+    policy = trained(waves, alignment="linear", parts="0.5, 1.2", robust=False, **WAVES)
+    ends = [one.end for one in policy.skill.skills]
+    assert ends == [one.end for one in wanted.skills]
+
+
+def test_operators_and_components_are_found(errand_set, tmp_path):
+    options = {"robot": encode(HAND), "alignment": "linear"}
+    found = trained(errand_set, operators=["auto"], n_components="auto", **options)
+    found.save_pretrained(tmp_path)
+    again = type(found).from_pretrained(tmp_path)
+    same(again.to_estimator(), found.to_estimator())
+    assert again.config.n_components == "auto" and again.config.operators == ["auto"]
+    assert {"cup", "tray"} == {*again.skill.frame_names}
+    with pytest.raises(DataError, match="one at a time"):
+        fresh(errand_set, parts="auto", modes=2, **options)
+
+
+def test_several_ways_are_found_and_each_robot_goes_the_one_that_suits(tmp_path):
+    data = dataset(two_ways_set(tmp_path) / "set")
+    policy = trained(
+        data, robot=encode(ARM), operators=["position:tip@object", "canonical"],
+        n_components=8, alignment="none", modes="auto",
+    )  # fmt: skip
+    assert len(policy.skill.skills) == 2
+    policy.save_pretrained(tmp_path / "policy")
+    again = type(policy).from_pretrained(tmp_path / "policy")
+    given = another_handle_each()
+    [one, other] = again.skill.choose(
+        torch.stack([each.joints for each in given]),
+        {"object": Frame(*(
+            torch.stack([getattr(each.frames["object"], name) for each in given])
+            for name in ("position", "orientation")
+        ))},
+    )  # fmt: skip
+    assert {one.way, other.way} == {0, 1}
+    actions = act(again, seen(given), 40)
+    assert actions.isfinite().all() and float((actions[:, -1] - actions[:, 0]).norm()) > 0.1
 
 
 def test_commanded_joints_are_learned_by_name(commanded):
@@ -157,9 +237,7 @@ def test_evaluating_and_saving_fit_too(waves, tmp_path):
             policy.forward(batch)
         end(policy)
         assert policy.mixture.fitted
-    assert (
-        type(policy).from_pretrained(tmp_path).config.fit.n_steps == policy.config.fit.n_steps
-    )
+    same(type(policy).from_pretrained(tmp_path).to_estimator(), policy.to_estimator())
 
 
 def test_optimizers_leave_a_policy_alone_that_collects(waves, tmp_path):

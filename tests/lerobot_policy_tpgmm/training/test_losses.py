@@ -225,7 +225,7 @@ def test_a_run_that_is_resumed_goes_on_where_it_was(handlings, tmp_path, loss):
         assert value(again, batch) == 0
     batch = epoch(handlings, 32, seed=2)[0]
     assert value(again, batch) == pytest.approx(value(policy, batch), rel=1e-9)
-    same(again.to_estimator(), policy.to_estimator())
+    same(again.to_estimator(), policy.to_estimator(), 1e-12)
 
 
 def test_a_fitted_policy_can_be_evaluated_without_training(handlings, tmp_path):
@@ -246,7 +246,7 @@ def test_what_is_not_finite_is_refused(waves, tmp_path):
         policy.forward(batch)
     with pytest.raises(DataError, match=r"means\.0"):
         policy.save_pretrained(tmp_path)
-    assert not (tmp_path / "model.safetensors").exists()
+    assert not (tmp_path / "config.json").exists()
 
 
 def test_frames_are_those_of_the_beginning(handlings):

@@ -13,7 +13,7 @@ from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.signals import Signals
 from tpgmm_tools.cli import options
-from tpgmm_tools.cli.learning import Choices, learn, prepared
+from tpgmm_tools.cli.learning import Choices, learn, parse_parts, prepared
 from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
@@ -117,9 +117,7 @@ def fit(
         Leave out episodes that are unlike the others where these agree, with a warning.
     """
     write = model_format(format_)
-    choices = Choices(
-        operator == ["auto"], n_components == "auto", options.parse_parts(parts), modes
-    )
+    choices = Choices(operator == ["auto"], n_components == "auto", parse_parts(parts), modes)
     choices.check(batch_episodes)
     options.filter_plausibility(plausibility)
     robot = described.read()

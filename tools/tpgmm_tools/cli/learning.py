@@ -21,7 +21,7 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "learn", "prepared"]
+__all__ = ["Choices", "learn", "parse_parts", "prepared"]
 
 
 @dataclass(frozen=True)
@@ -129,3 +129,26 @@ def learn(
         reports.append(ways.report())
         return ways.best_model_, reports
     return model.fit(source, processes=processes), reports
+
+
+def parse_parts(text: str | None) -> str | list[float | str] | None:
+    """Where parts end, as ``--parts`` says it: "auto", or seconds and events.
+
+    Parameters
+    ----------
+    text : str or None
+
+    Examples
+    --------
+    >>> parse_parts("4.2, grasp")
+    [4.2, 'grasp']
+    """
+    if text is None or text == "auto":
+        return text
+    cuts: list[float | str] = []
+    for word in map(str.strip, text.split(",")):
+        try:
+            cuts.append(float(word))
+        except ValueError:
+            cuts.append(word)
+    return cuts

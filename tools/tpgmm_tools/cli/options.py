@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Alignments", "DataOptions", "RobotOptions", "align", "aligner", "command", "load",
-    "options_of", "parse_parts", "wanted",
+    "options_of", "wanted",
 ]  # fmt: skip
 
 #: Robots that come with the package.
@@ -309,29 +309,6 @@ def wanted(
     if situations is not None:
         return read_situations(situations, robot.joint_names), shown
     return [Situation.of(one) for one in shown], shown
-
-
-def parse_parts(text: str | None) -> str | list[float | str] | None:
-    """Where parts end, as ``--parts`` says it: "auto", or seconds and events.
-
-    Parameters
-    ----------
-    text : str or None
-
-    Examples
-    --------
-    >>> parse_parts("4.2, grasp")
-    [4.2, 'grasp']
-    """
-    if text is None or text == "auto":
-        return text
-    cuts: list[float | str] = []
-    for word in map(str.strip, text.split(",")):
-        try:
-            cuts.append(float(word))
-        except ValueError:
-            cuts.append(word)
-    return cuts
 
 
 def aligner(method: str, robot: Kinematics | None) -> Alignment | Pipeline | None:
