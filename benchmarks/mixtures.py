@@ -13,7 +13,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture
 
 from benchmarks.points import Problem
-from tpgmm_torch import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 
 __all__ = ["gmr", "ours", "pomegranate", "scikit_learn"]
 

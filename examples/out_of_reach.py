@@ -28,14 +28,9 @@ from torch import Tensor
 
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import (
-    Controller,
-    EvenClock,
-    Frame,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Controller, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.control.clocks import EvenProgress
+from tpgmm_torch.control.clocks import EvenClock, EvenProgress
 from tpgmm_torch.regression.posture import NEGLIGIBLE, PostureCost, descend
 from tpgmm_torch.skills.skill import Skill
 

@@ -3,8 +3,9 @@ Parts of a skill
 ================
 
 Go to the cup, carry it to the tray, and stir there: nobody says where one part ends and the
-next begins, and every demonstration takes its own time. :class:`~tpgmm_torch.Segmentation`
-finds the parts, and :func:`~tpgmm_torch.fit_parts` learns each with what matters in it.
+next begins, and every demonstration takes its own time.
+:class:`~tpgmm_torch.structure.segmentation.Segmentation` finds the parts, and
+:func:`~tpgmm_torch.structure.fit_parts.fit_parts` learns each with what matters in it.
 """
 
 # sphinx_gallery_thumbnail_number = 1
@@ -15,16 +16,16 @@ from tpgmm_tools.plotting import STYLE, plot_parts
 from tpgmm_torch import (
     Demonstration,
     Frame,
-    Segmentation,
     SelectOperators,
     Situation,
     TaskParameterizedGMM,
-    fit_parts,
     rollout,
 )
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses
+from tpgmm_torch.structure.fit_parts import fit_parts
+from tpgmm_torch.structure.segmentation import Segmentation
 
 # %%
 # Demonstrations

@@ -4,7 +4,7 @@ Two ways around an obstacle
 
 Some demonstrations pass an obstacle on one side, some on the other. The mean of both goes
 through the middle: what a single model learns of them is what nobody ever did.
-:class:`~tpgmm_torch.SelectWays` finds that there are two ways, learns a
+:class:`~tpgmm_torch.structure.select_ways.SelectWays` finds that there are two ways, learns a
 model of each, and goes the way that suits the situation.
 """
 
@@ -18,12 +18,12 @@ from tpgmm_torch import (
     Demonstration,
     Frame,
     RelativePosition,
-    SelectWays,
     Situation,
     TaskParameterizedGMM,
     rollout,
 )
 from tpgmm_torch.robots import Poses
+from tpgmm_torch.structure.select_ways import SelectWays
 
 # %%
 # Demonstrations

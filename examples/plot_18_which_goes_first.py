@@ -20,7 +20,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    InformationFusion,
     RelativePosition,
     Robot,
     Situation,
@@ -28,6 +27,7 @@ from tpgmm_torch import (
     rollout,
 )
 from tpgmm_torch.exceptions import PlausibilityWarning
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 
 # %%
 # Demonstrations

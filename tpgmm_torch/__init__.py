@@ -7,13 +7,6 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
-    from tpgmm_torch.control.clock_text import parse_clock
-    from tpgmm_torch.control.clocks import (
-        Clock,
-        EvenClock,
-        WaitingClock,
-    )
-    from tpgmm_torch.control.command import Command, Status
     from tpgmm_torch.control.controller import Controller
     from tpgmm_torch.control.localizing_clock import LocalizingClock
     from tpgmm_torch.control.rollout import rollout
@@ -22,8 +15,6 @@ if TYPE_CHECKING:
     from tpgmm_torch.data.holds import Hold
     from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.estimator import TaskParameterizedGMM
-    from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-    from tpgmm_torch.motion.motion_bounds import MotionBounds
     from tpgmm_torch.operators import (
         AbsoluteOrientation,
         AbsolutePosition,
@@ -33,19 +24,12 @@ if TYPE_CHECKING:
         Stack,
     )
     from tpgmm_torch.persistence import load, save
-    from tpgmm_torch.regression.estimate import Estimate
-    from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
     from tpgmm_torch.robots.robot import Robot
-    from tpgmm_torch.sensing.trust import Trust
     from tpgmm_torch.skills.sequence import Sequence
-    from tpgmm_torch.skills.via_point import ViaPoint
     from tpgmm_torch.skills.via_points import ViaPoints
     from tpgmm_torch.skills.ways import Ways
-    from tpgmm_torch.structure.fit_parts import fit_parts
-    from tpgmm_torch.structure.segmentation import Segmentation
     from tpgmm_torch.structure.select_components import SelectComponents
     from tpgmm_torch.structure.select_operators import SelectOperators
-    from tpgmm_torch.structure.select_ways import SelectWays
     from tpgmm_torch.training.hold_detection import attach_holds, find_holds
 
     __version__: str
@@ -53,59 +37,38 @@ if TYPE_CHECKING:
 __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
-    "BlockGaussianMixture",
     "Canonical",
-    "Clock",
-    "Command",
     "Controller",
-    "CovarianceFusion",
     "Demonstration",
-    "Estimate",
-    "EvenClock",
     "Frame",
     "Hold",
-    "InformationFusion",
     "LocalizingClock",
-    "MotionBounds",
     "RelativeOrientation",
     "RelativePosition",
     "Robot",
-    "Segmentation",
     "SelectComponents",
     "SelectOperators",
-    "SelectWays",
     "Sequence",
     "Situation",
     "Stack",
-    "Status",
     "TaskParameterizedGMM",
     "Trajectory",
-    "Trust",
-    "ViaPoint",
     "ViaPoints",
-    "WaitingClock",
     "Ways",
     "attach_holds",
     "find_holds",
-    "fit_parts",
     "load",
-    "parse_clock",
     "rollout",
     "save",
 ]
 
 _HOMES = {
-    "control.clock_text": ("parse_clock",),
-    "control.clocks": ("Clock", "EvenClock", "WaitingClock"),
     "control.localizing_clock": ("LocalizingClock",),
-    "control.command": ("Command", "Status"),
     "control.controller": ("Controller",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),
     "data.frames": ("Frame",),
     "data.holds": ("Hold",),
-    "mixture.block_gaussian_mixture": ("BlockGaussianMixture",),
-    "motion.motion_bounds": ("MotionBounds",),
     "operators": (
         "AbsoluteOrientation",
         "AbsolutePosition",
@@ -114,22 +77,15 @@ _HOMES = {
         "RelativePosition",
         "Stack",
     ),
-    "regression.estimate": ("Estimate",),
-    "regression.fusion_forms": ("CovarianceFusion", "InformationFusion"),
     "persistence": ("load", "save"),
     "control.rollout": ("rollout",),
     "robots.robot": ("Robot",),
-    "sensing.trust": ("Trust",),
     "skills.sequence": ("Sequence",),
-    "skills.via_point": ("ViaPoint",),
     "skills.via_points": ("ViaPoints",),
     "skills.ways": ("Ways",),
-    "structure.fit_parts": ("fit_parts",),
-    "structure.segmentation": ("Segmentation",),
     "structure.select_components": ("SelectComponents",),
     "structure.select_operators": ("SelectOperators",),
-    "structure.select_ways": ("SelectWays",),
-    "data.trajectories": ("Candidate", "Trajectory"),
+    "data.trajectories": ("Trajectory",),
     "training.hold_detection": ("attach_holds", "find_holds"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}

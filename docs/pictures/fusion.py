@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_tools.plotting import ORANGE
-from tpgmm_torch import CovarianceFusion, Frame, Situation, TaskParameterizedGMM, rollout
+from tpgmm_torch import Frame, Situation, TaskParameterizedGMM, rollout
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import largest_acceleration
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 
 __all__ = ["draw"]
 

@@ -23,13 +23,14 @@ from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_tools.cli.learning import Choices, parse_parts
-from tpgmm_torch import Hold, Robot, TaskParameterizedGMM, ViaPoint
+from tpgmm_torch import Hold, Robot, TaskParameterizedGMM
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import decode
 from tpgmm_torch.robots import Kinematics
+from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.structure.select_ways import SelectWays
 
 __all__ = [
@@ -116,7 +117,7 @@ class TPGMMConfig(StatePolicyConfig):
         (``follow_frames``); an empty list stands for nothing.
     via_points : list of str, optional
         Poses or postures at times of the skill, ``["3.2:position:l_hand@bottle=0,0,0.1"]``, as
-        :meth:`tpgmm_torch.ViaPoint.parse` reads them.
+        :meth:`tpgmm_torch.skills.via_point.ViaPoint.parse` reads them.
     via_fade : float, default=1.0
         For how long before and after a via-point the skill is another [s].
     robot : dict or str, optional

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from tpgmm_torch import Trust, parse_clock
 from tpgmm_torch.alignment.text import METHODS
+from tpgmm_torch.control.clock_text import parse_clock
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.sensing.pose_filter import OneEuro
+from tpgmm_torch.sensing.trust import Trust
 
 __all__ = ["ControlConfig", "EMConfig", "FusionConfig", "TrainingConfig"]
 
@@ -60,9 +61,9 @@ class FusionConfig:
     ----------
     form : {"information", "covariance"}, default="information"
     prior_std, priorities, negligible
-        Of :class:`tpgmm_torch.InformationFusion`.
+        Of :class:`tpgmm_torch.regression.fusion_forms.InformationFusion`.
     epsilon, activation
-        Of :class:`tpgmm_torch.CovarianceFusion`.
+        Of :class:`tpgmm_torch.regression.fusion_forms.CovarianceFusion`.
     """
 
     form: str = "information"
@@ -106,9 +107,9 @@ class ControlConfig:
     Parameters
     ----------
     clock : str, default="localizing:initial=anywhere"
-        How time goes on, as :func:`tpgmm_torch.parse_clock` takes it: ``"even"``,
-        ``"waiting"`` or ``"localizing"``, with options. By default an episode may begin in the
-        middle of the skill.
+        How time goes on, as :func:`tpgmm_torch.control.clock_text.parse_clock` takes it:
+        ``"even"``, ``"waiting"`` or ``"localizing"``, with options. By default an episode may
+        begin in the middle of the skill.
     smoothing : float or None, default=0.5
         Cutoff frequency of the filter on observed poses of objects at rest [Hz]; null for none.
     joint_timeout, frame_timeout : float, default=0.2, 1.0

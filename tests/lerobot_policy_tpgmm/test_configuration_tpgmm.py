@@ -16,8 +16,9 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from lerobot_policy_tpgmm.settings import FusionConfig
 from tests.support.policies import GROUPS, grouped, loaded
 from tests.support.skills import small_bottle
-from tpgmm_torch import CovarianceFusion, Hold, InformationFusion, TaskParameterizedGMM
+from tpgmm_torch import Hold, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
 HANDED_OVER = [Hold("bottle", "l_hand", 4.3, 5.0), Hold("bottle", "r_hand", 5.0)]
 

@@ -54,12 +54,9 @@ from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import (
     Canonical,
     Controller,
-    CovarianceFusion,
     Demonstration,
     Frame,
     Hold,
-    InformationFusion,
-    MotionBounds,
     RelativePosition,
     Robot,
     Situation,
@@ -83,8 +80,10 @@ from tpgmm_torch.metrics import joint_rmse, reproduction_scorer
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.covariance_shrinkage import moderated_variances, shrinkage_intensity
 from tpgmm_torch.motion.demonstrated_peaks import demonstrated_peaks
+from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.training.hold_detection import with_holds
 from tpgmm_torch.training.local_data import local_data

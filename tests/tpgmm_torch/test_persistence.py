@@ -19,17 +19,13 @@ from tests.support.skills import (
 from tpgmm_torch import (
     Canonical,
     Controller,
-    CovarianceFusion,
     Demonstration,
     Hold,
-    InformationFusion,
     Sequence,
     Situation,
     TaskParameterizedGMM,
-    ViaPoint,
     ViaPoints,
     Ways,
-    fit_parts,
     load,
     rollout,
     save,
@@ -37,6 +33,9 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import ModelFileError, NotFittedError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.persistence import load_model, load_skill
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
+from tpgmm_torch.skills.via_point import ViaPoint
+from tpgmm_torch.structure.fit_parts import fit_parts
 
 
 def parts() -> Sequence:

@@ -30,7 +30,6 @@ from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.writer import save_lerobot
 from tpgmm_torch import (
     Canonical,
-    CovarianceFusion,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -45,6 +44,7 @@ from tpgmm_torch import (
 from tpgmm_torch.alignment import DynamicTimeWarping, LinearTimeNormalization
 from tpgmm_torch.metrics import largest_acceleration, largest_velocity
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 
 __all__ = ["BottleExperiment", "bottle_operators"]
 

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from tests.support.worlds import upper_body
-from tpgmm_torch import Estimate
 from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
+from tpgmm_torch.regression.estimate import Estimate
 
 WORDS = ["running", "waiting", "holding", "finished"]
 

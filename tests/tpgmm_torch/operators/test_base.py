@@ -40,10 +40,8 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
     Canonical,
-    CovarianceFusion,
     Demonstration,
     Frame,
-    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Stack,
@@ -51,6 +49,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators import Linearization, Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.training.mixture_settings import check_operators
 

@@ -8,16 +8,10 @@ import torch
 
 from tests.support.mixtures import CASES, Problem, conditionals_of, random_local, times
 from tests.support.worlds import CARRIED, GRASP, OBJECT, RIGHT
-from tpgmm_torch import (
-    Canonical,
-    Frame,
-    InformationFusion,
-    RelativeOrientation,
-    RelativePosition,
-    Stack,
-)
+from tpgmm_torch import Canonical, Frame, RelativeOrientation, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion import KalmanUpdate
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import PART
 
 

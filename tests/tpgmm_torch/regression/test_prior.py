@@ -11,7 +11,6 @@ from tests.support.worlds import upper_body
 from tpgmm_torch import (
     Demonstration,
     Frame,
-    InformationFusion,
     RelativePosition,
     Robot,
     TaskParameterizedGMM,
@@ -24,6 +23,7 @@ from tpgmm_torch.exceptions import (
     UnknownNameError,
 )
 from tpgmm_torch.persistence import load_model
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.robots import Poses
 

@@ -8,19 +8,13 @@ import torch
 
 from tests.support.mixtures import CASES, Problem
 from tests.support.skills import HANDLING, handlings, hands_model, waves
-from tpgmm_torch import (
-    Canonical,
-    InformationFusion,
-    Situation,
-    TaskParameterizedGMM,
-    rollout,
-    save,
-)
+from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM, rollout, save
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.gaussians import information
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression import regression as module
 from tpgmm_torch.regression.fusion import Projection
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 
 NOW = torch.tensor(0.8, dtype=torch.float64)
 PROBLEM = Problem.of(CASES["three"], 1)

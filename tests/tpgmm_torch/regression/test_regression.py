@@ -21,18 +21,11 @@ from tests.support.mixtures import (
     times,
 )
 from tests.support.worlds import LEFT, OBJECT, RIGHT, OnRobot, upper_body
-from tpgmm_torch import (
-    AbsolutePosition,
-    Canonical,
-    CovarianceFusion,
-    Frame,
-    InformationFusion,
-    RelativePosition,
-    Stack,
-)
+from tpgmm_torch import AbsolutePosition, Canonical, Frame, RelativePosition, Stack
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 
 EVERY_CASE = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 FORMS = pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from tpgmm_torch import (
     Canonical,
     Demonstration,
     Frame,
-    InformationFusion,
     RelativeOrientation,
     RelativePosition,
     Robot,
@@ -24,6 +23,7 @@ from tpgmm_torch import (
     TaskParameterizedGMM,
 )
 from tpgmm_torch.exceptions import DataError, DependencyError, ShapeError, UnknownNameError
+from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.compiled import PART, compile_skill, export_estimate
 

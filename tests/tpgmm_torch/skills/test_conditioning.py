@@ -11,7 +11,6 @@ from tpgmm_torch import (
     Frame,
     Situation,
     TaskParameterizedGMM,
-    ViaPoint,
     ViaPoints,
     load,
     quaternions,
@@ -21,6 +20,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.skills.conditioning import covariance_between, wendland
+from tpgmm_torch.skills.via_point import ViaPoint
 
 GRID = torch.linspace(0, 5, 251, dtype=torch.float64)
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from tests.support.skills import canonical, handlings, hands_model, wave, waves
-from tpgmm_torch import Canonical, Controller, SelectOperators, Sequence, fit_parts, rollout
+from tpgmm_torch import Canonical, Controller, SelectOperators, Sequence, rollout
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.structure.fit_parts import fit_parts
 
 
 def test_parts_reproduce_the_whole():

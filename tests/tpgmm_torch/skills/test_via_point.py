@@ -3,8 +3,9 @@
 import pytest
 
 from tests.support.skills import small_bottle
-from tpgmm_torch import Frame, ViaPoint, ViaPoints
+from tpgmm_torch import Frame, ViaPoints
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.skills.via_point import ViaPoint
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,12 @@ from sklearn.pipeline import make_pipeline
 
 from tests.support.errands import HAND, motion
 from tests.support.skills import generator
-from tpgmm_torch import Demonstration, Frame, Segmentation, SelectOperators, Situation
+from tpgmm_torch import Demonstration, Frame, SelectOperators, Situation
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.data.arrays import as_array
 from tpgmm_torch.events import find_boundaries, find_stops
 from tpgmm_torch.exceptions import NotFittedError
+from tpgmm_torch.structure.segmentation import Segmentation
 
 
 def pick_and_place(n=5, seed=0, noise=0.0, names=("hand.x", "hand.y", "hand.z", "gripper")):

@@ -10,17 +10,11 @@ from tests.support.skills import few_bottles
 from tests.support.two_ways import TIME, Handles, Obstacle, shown
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import upper_body
-from tpgmm_torch import (
-    Canonical,
-    Demonstration,
-    Frame,
-    RelativePosition,
-    SelectWays,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, TaskParameterizedGMM
 from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.robots import Poses
+from tpgmm_torch.structure.select_ways import SelectWays
 
 POINT = Poses(["hand"], orientation=False)
 

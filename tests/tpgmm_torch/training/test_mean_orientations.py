@@ -13,7 +13,6 @@ from tpgmm_torch import (
     AbsoluteOrientation,
     Canonical,
     Controller,
-    CovarianceFusion,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -27,6 +26,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
