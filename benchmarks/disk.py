@@ -15,7 +15,7 @@ from benchmarks.points import BLOCKS, Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
 from benchmarks.timing import in_turns, medians, per_iteration, seconds
-from tpgmm_torch import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.row_file import RowFile
 
 __all__ = ["measure"]

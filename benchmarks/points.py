@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_torch import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 
 __all__ = ["BLOCKS", "Problem", "motions"]
 

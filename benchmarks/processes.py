@@ -15,7 +15,7 @@ from benchmarks.machine import cores_allowed
 from benchmarks.points import Problem, motions
 from benchmarks.rows import Omitted, Row
 from benchmarks.settings import Settings
-from tpgmm_torch import BlockGaussianMixture
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.processes import ALONE, Processes, joined_processes
 
 __all__ = ["measure"]

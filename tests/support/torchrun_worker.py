@@ -16,7 +16,6 @@ import numpy as np
 import torch
 
 from tpgmm_torch import (
-    BlockGaussianMixture,
     Canonical,
     Demonstration,
     Frame,
@@ -25,6 +24,7 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
 )
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.processes import Processes, joined_processes
 from tpgmm_torch.mixture.row_file import RowFile
 from tpgmm_torch.robots import Poses

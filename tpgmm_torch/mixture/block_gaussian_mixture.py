@@ -138,7 +138,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
     Examples
     --------
     >>> import numpy as np
-    >>> from tpgmm_torch import BlockGaussianMixture
+    >>> from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
     >>> time = np.linspace(0, 1, 50)
     >>> X = np.column_stack([time, time**2, time, np.sin(3 * time)])
     >>> model = BlockGaussianMixture(n_components=3, blocks=(2, 2)).fit(X)

@@ -42,7 +42,8 @@ class InformationFusion:
 
     Examples
     --------
-    >>> from tpgmm_torch import InformationFusion, TaskParameterizedGMM
+    >>> from tpgmm_torch import TaskParameterizedGMM
+    >>> from tpgmm_torch.regression.fusion_forms import InformationFusion
     >>> TaskParameterizedGMM(10, fusion=InformationFusion(negligible=0.0)).fusion.negligible
     0.0
     """

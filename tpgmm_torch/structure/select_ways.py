@@ -116,7 +116,8 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
 
     Examples
     --------
-    >>> from tpgmm_torch import Demonstration, SelectWays, Situation, rollout
+    >>> from tpgmm_torch import Demonstration, Situation, rollout
+    >>> from tpgmm_torch.structure.select_ways import SelectWays
     >>> rng, time = np.random.default_rng(0), np.linspace(0, 1, 50)
     >>> shown = [
     ...     Demonstration(time, (side * np.sin(3 * time) + 0.02 * rng.normal())[:, None])

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from tests.support.blocks import WIDTHS, fitted
-from tpgmm_torch import BlockGaussianMixture
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.row_file import RowFile
 
 SETTINGS = {"blocks": WIDTHS, "max_iter": 12, "tol": 0.0, "random_state": 0}
