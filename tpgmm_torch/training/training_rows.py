@@ -90,7 +90,7 @@ class TrainingRows:
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
         thinned = [at_phases(rows, count) for rows in self._each()]
-        return self.processes.concatenate(torch.stack(thinned).double())
+        return torch.cat(self.processes.gather(torch.stack(thinned).double().cpu()))
 
     def _each(self) -> Iterator[Tensor]:
         """The rows of each demonstration of this process, (T_m, sum_j (1 + D_j))."""
