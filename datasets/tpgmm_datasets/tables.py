@@ -374,7 +374,7 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
     for name, group in pose_groups(columns).items():
         pose = _numbers(part, [columns[i] for i in group])
         pose = pose[0] if bool((pose == pose[0]).all()) else pose
-        frames[name] = Frame.from_pose(pose, order="wxyz")
+        frames[name] = Frame(pose[..., :3], pose[..., 3:])
     return frames
 
 

@@ -49,16 +49,19 @@ def as_tensor(values: Any, name: str) -> Tensor:
             raise DataError(f"{name} must be an array of numbers: {error}") from error
     # every tick asks: a sum is quickly had, and is not finite if a number is not
     few = tensor.numel() <= FEW
-    if math.isfinite(sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()):
-        return tensor
-    finite = torch.isfinite(tensor)
-    if not bool(finite.all()):
-        first = torch.nonzero(~finite)[0].tolist()
-        raise DataError(
-            f"{name} holds {int((~finite).sum())} value(s) that are NaN or infinite, "
-            f"the first is {tensor[tuple(first)].item()} at index {first}"
-        )
+    total = sum(tensor.reshape(-1).tolist()) if few else tensor.detach().sum().item()
+    if not math.isfinite(total):
+        _check_finite(tensor, name)
     return tensor
+
+
+def _check_finite(tensor: Tensor, name: str) -> None:
+    places = torch.nonzero(~torch.isfinite(tensor)).tolist()
+    if places:
+        raise DataError(
+            f"{name} holds {len(places)} value(s) that are NaN or infinite, "
+            f"the first is {tensor[tuple(places[0])].item()} at index {places[0]}"
+        )
 
 
 def as_array(tensor: Tensor) -> Array:

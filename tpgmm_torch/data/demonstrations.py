@@ -6,10 +6,10 @@ copied once into tensors, see :mod:`tpgmm_torch.data.arrays`; nothing is modifie
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,9 +18,6 @@ from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Demonstration", "Situation", "check_demonstrations", "check_robot"]
 
@@ -39,9 +36,7 @@ def _checked_time(values: Any) -> Tensor:
     return time
 
 
-def _checked_frames(
-    frames: Mapping[str, Frame] | None, length: int | None
-) -> Mapping[str, Frame]:
+def _checked_frames(frames: Mapping[str, Frame] | None, length: int | None) -> dict[str, Frame]:
     """Check types and lengths; without ``length``, frames per time step share one."""
     frames = dict(frames or {})
     for name, frame in frames.items():
@@ -56,31 +51,34 @@ def _checked_frames(
                 f"frame {name!r} has leading shape {tuple(frame.batch_shape)}; "
                 f"it is one pose, (), or one per time step, ({length},)"
             )
-    return MappingProxyType(frames)
+    return frames
 
 
-def _set(frozen: object, **attributes: Any) -> None:
-    """Set attributes of a frozen dataclass while it is made."""
-    for name, value in attributes.items():
-        object.__setattr__(frozen, name, value)
+def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
+    names = None if names is None else tuple(names)
+    if names is not None and not len(set(names)) == len(names) == count:
+        raise ShapeError(f"joint_names needs {count} different names, got {names}")
+    return names
 
 
-class _PlainFrames:
-    """Pickle the read-only views of frames and events as plain dicts."""
+class _Frozen:
+    """A frozen dataclass whose mappings are read-only, and pickled as plain dicts."""
+
+    def _set(self, **attributes: Any) -> None:
+        for name, value in attributes.items():
+            value = MappingProxyType(value) if isinstance(value, dict) else value
+            object.__setattr__(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         state = vars(self).items()
         return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in state}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        _set(
-            self,
-            **{k: MappingProxyType(v) if isinstance(v, dict) else v for k, v in state.items()},
-        )
+        self._set(**state)
 
 
 @dataclass(frozen=True, eq=False)
-class Demonstration(_PlainFrames):
+class Demonstration(_Frozen):
     """One demonstration of a skill: T_m datapoints and the frames they were made in.
 
     Parameters
@@ -135,11 +133,7 @@ class Demonstration(_PlainFrames):
                 f"joints has shape (T, n_joints) with T = {len(time)} as in time, "
                 f"got {tuple(joints.shape)}"
             )
-        names = None if self.joint_names is None else tuple(self.joint_names)
-        if names is not None and not len(set(names)) == len(names) == joints.shape[1]:
-            raise ShapeError(
-                f"joint_names needs {joints.shape[1]} different names, got {names}"
-            )
+        names = _checked_names(self.joint_names, joints.shape[1])
         events = {str(name): float(at) for name, at in dict(self.events).items()}
         for name, at in events.items():
             if not time[0] <= at <= time[-1]:
@@ -148,10 +142,9 @@ class Demonstration(_PlainFrames):
                     f"{time[0]:.6g} to {time[-1]:.6g} s"
                 )
         frames = _checked_frames(self.frames, len(time))
-        kept = MappingProxyType(events)
         holds = None if self.holds is None else check_holds(self.holds, frames)
-        _set(self, time=time, joints=joints, frames=frames, joint_names=names, events=kept)
-        _set(self, holds=holds)
+        self._set(time=time, joints=joints, frames=frames, joint_names=names)
+        self._set(events=events, holds=holds)
 
     def __len__(self) -> int:
         """Number of time steps T."""
@@ -234,7 +227,7 @@ class Demonstration(_PlainFrames):
 
 
 @dataclass(frozen=True, eq=False)
-class Situation(_PlainFrames):
+class Situation(_Frozen):
     """A new situation: where the robot starts and where the objects are.
 
     Parameters
@@ -272,26 +265,14 @@ class Situation(_PlainFrames):
     frames_time: Tensor | None = None
 
     def __post_init__(self) -> None:
-        joints: Any = self.joints
-        names = None if self.joint_names is None else tuple(self.joint_names)
-        if isinstance(joints, Mapping):
-            if names is not None:
-                raise DataError("joints are given by name: leave out joint_names")
-            names, joints = tuple(joints), _by_name(joints)
-        joints = as_tensor(joints, "the start posture")
-        if joints.ndim != 1:
-            raise ShapeError(
-                f"the start posture has shape (n_joints,), got {tuple(joints.shape)}"
-            )
-        if names is not None and not len(set(names)) == len(names) == len(joints):
-            raise ShapeError(f"joint_names needs {len(joints)} different names, got {names}")
-        time = None if self.time is None else _checked_time(self.time)
-        recorded = time if self.frames_time is None else _checked_time(self.frames_time)
+        joints, names = _start_posture(self.joints, self.joint_names)
+        times = {
+            name: None if value is None else _checked_time(value)
+            for name, value in (("time", self.time), ("frames_time", self.frames_time))
+        }
+        recorded = times["time"] if self.frames_time is None else times["frames_time"]
         frames = _checked_frames(self.frames, None if recorded is None else len(recorded))
-        if self.frames_time is None:
-            recorded = None
-        _set(self, joints=joints, frames=frames, time=time, joint_names=names)
-        _set(self, frames_time=recorded)
+        self._set(joints=joints, frames=frames, joint_names=names, **times)
 
     @classmethod
     def of(cls, demonstration: Demonstration, time: Any = None) -> Situation:
@@ -354,18 +335,27 @@ class Situation(_PlainFrames):
         return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
 
 
-def _by_name(joints: Mapping[Any, Any]) -> Tensor:
-    """The values of joints that are given by name."""
-    if not joints:
-        raise ShapeError("the start posture has no joints")
-    values = [as_tensor(value, f"joint {name!r}") for name, value in joints.items()]
-    for name, value in zip(joints, values, strict=True):
-        if not isinstance(name, str) or value.ndim:
-            raise ShapeError(
-                f"the start posture maps names to numbers, got {name!r}: shape "
-                f"{tuple(value.shape)}"
-            )
-    return torch.stack([value.to(values[0]) for value in values])
+def _start_posture(
+    joints: Any, names: Sequence[str] | None
+) -> tuple[Tensor, tuple[str, ...] | None]:
+    """The start posture (n_joints,), given in order or by name, and the joints' names."""
+    if isinstance(joints, Mapping):
+        if names is not None:
+            raise DataError("joints are given by name: leave out joint_names")
+        values = [as_tensor(value, f"joint {name!r}") for name, value in joints.items()]
+        for name, value in zip(joints, values, strict=True):
+            if not isinstance(name, str) or value.ndim:
+                raise ShapeError(
+                    f"the start posture maps names to numbers, got {name!r}: shape "
+                    f"{tuple(value.shape)}"
+                )
+        if not values:
+            raise ShapeError("the start posture has no joints")
+        return torch.stack([value.to(values[0]) for value in values]), tuple(joints)
+    joints = as_tensor(joints, "the start posture")
+    if joints.ndim != 1:
+        raise ShapeError(f"the start posture has shape (n_joints,), got {tuple(joints.shape)}")
+    return joints, _checked_names(names, len(joints))
 
 
 def _columns(
@@ -412,11 +402,10 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
     """
     if isinstance(demonstrations, Demonstration):
         raise DataError("expected a list of demonstrations, got one: wrap it, [demonstration]")
-    try:
-        checked = list(demonstrations)
-    except TypeError:
+    if not isinstance(demonstrations, Iterable):
         name = type(demonstrations).__name__
-        raise DataError(f"expected a list of Demonstration, got {name}") from None
+        raise DataError(f"expected a list of Demonstration, got {name}")
+    checked = list(demonstrations)
     if not checked:
         raise DataError("expected at least one demonstration, got an empty list")
     for index, item in enumerate(checked):
@@ -426,18 +415,23 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
             )
     first, names = checked[0], next((d.joint_names for d in checked if d.joint_names), ())
     for index, item in enumerate(checked):
-        if item.n_joints != first.n_joints:
-            raise ShapeError(
-                f"demonstration {index} has {item.n_joints} joints, the first has "
-                f"{first.n_joints}"
-            )
-        if set(item.joint_names or names) != set(names):
-            raise DataError(
-                f"demonstration {index} has joint_names {item.joint_names}, another {names}"
-            )
-        if set(item.frames) != set(first.frames):
-            raise DataError(
-                f"demonstration {index} has frames {sorted(item.frames)}, the first has "
-                f"{sorted(first.frames)}"
-            )
+        _check_alike(index, item, first, names)
     return [item.reordered(names) for item in checked]
+
+
+def _check_alike(
+    index: int, item: Demonstration, first: Demonstration, names: tuple[str, ...]
+) -> None:
+    if item.n_joints != first.n_joints:
+        raise ShapeError(
+            f"demonstration {index} has {item.n_joints} joints, the first has {first.n_joints}"
+        )
+    if set(item.joint_names or names) != set(names):
+        raise DataError(
+            f"demonstration {index} has joint_names {item.joint_names}, another {names}"
+        )
+    if set(item.frames) != set(first.frames):
+        raise DataError(
+            f"demonstration {index} has frames {sorted(item.frames)}, the first has "
+            f"{sorted(first.frames)}"
+        )

@@ -47,13 +47,6 @@ class Frame:
     >>> Frame([0, 0, 0], [0, 0, 0, 2])
     Traceback (most recent call last):
     tpgmm_torch.exceptions.DataError: a frame's orientation must be a unit quaternion ...
-
-    Other ways to write a pose, see the methods of that name:
-
-    >>> turned = Frame.from_xyzw([0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0])
-    >>> same = Frame.from_pose([0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], order="wxyz")
-    >>> torch.equal(turned.orientation, same.orientation)
-    True
     """
 
     position: Tensor
@@ -89,119 +82,6 @@ class Frame:
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "orientation", orientation / norm)
 
-    @classmethod
-    def from_matrix(cls, matrix: Any, position: Any = None) -> Frame:
-        """The pose of a rotation matrix and a position, or of a homogeneous matrix.
-
-        Parameters
-        ----------
-        matrix : array-like of shape (..., 3, 3) or (..., 4, 4)
-            Columns are the frame's axes in the base frame; of 4 x 4, the last column is the
-            origin [m] and the last row (0, 0, 0, 1).
-        position : array-like of shape (..., 3), optional
-            Origin [m]; only with 3 x 3, which needs it.
-
-        Raises
-        ------
-        ShapeError
-            If the shape is another.
-        DataError
-            If it is no rotation, the last row is another, or the origin is lacking or twofold.
-
-        Examples
-        --------
-        >>> Frame.from_matrix([[0, -1, 0, 0.5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        Frame(position=tensor([0.5000, ...), orientation=tensor([0.7071, ...0.7071], ...))
-        """
-        given = as_tensor(matrix, "the frame's matrix")
-        shape = tuple(given.shape)
-        if shape[-2:] not in ((3, 3), (4, 4)):
-            raise ShapeError(
-                f"a frame's matrix has shape (..., 3, 3) or (..., 4, 4), got {shape}"
-            )
-        if shape[-1] == 4:
-            if position is not None:
-                raise DataError("a matrix of 4 x 4 holds the position: give no other")
-            last = given.new_tensor([0.0, 0.0, 0.0, 1.0])
-            if bool(((given[..., 3, :] - last).abs() > UNIT_NORM_TOLERANCE).any()):
-                raise DataError(
-                    "the last row of a homogeneous matrix is (0, 0, 0, 1), got "
-                    f"{given[..., 3, :].reshape(-1, 4)[0].tolist()}: is it transposed?"
-                )
-            position = given[..., :3, 3]
-        elif position is None:
-            raise DataError("a rotation of 3 x 3 is no pose: give the position, too")
-        return cls(position, quaternions.from_matrix(given[..., :3, :3]))
-
-    @classmethod
-    def from_xyzw(cls, position: Any, orientation: Any) -> Frame:
-        """The pose of a position and a quaternion (x, y, z, w), the real part last.
-
-        Parameters
-        ----------
-        position : array-like of shape (..., 3)
-            Origin [m].
-        orientation : array-like of shape (..., 4)
-            As ROS, scipy and most trackers write it.
-
-        Raises
-        ------
-        ShapeError, DataError
-            As the constructor does.
-        """
-        xyzw = as_tensor(orientation, "the frame's orientation")
-        return cls(position, xyzw.roll(1, -1) if xyzw.ndim else xyzw)
-
-    @classmethod
-    def from_rotation(cls, position: Any, rotation: Any) -> Frame:
-        """The pose of a position and a rotation of scipy.
-
-        Parameters
-        ----------
-        position : array-like of shape (..., 3)
-            Origin [m].
-        rotation : scipy.spatial.transform.Rotation
-            As many as positions.
-
-        Raises
-        ------
-        ShapeError, DataError
-            As the constructor does, and if it is no rotation of scipy.
-        """
-        from scipy.spatial.transform import Rotation
-
-        if not isinstance(rotation, Rotation):
-            raise DataError(
-                f"rotation is a scipy.spatial.transform.Rotation, got {type(rotation).__name__}"
-            )
-        return cls.from_xyzw(position, rotation.as_quat())
-
-    @classmethod
-    def from_pose(cls, values: Any, *, order: str) -> Frame:
-        """The pose of seven numbers: position, then quaternion.
-
-        Parameters
-        ----------
-        values : array-like of shape (..., 7)
-            Position x, y, z [m], and a unit quaternion.
-        order : {"wxyz", "xyzw"}
-            Where the quaternion's real part stands; no default, as numbers do not show it.
-
-        Raises
-        ------
-        ShapeError
-            If the last dimension is not 7.
-        DataError
-            If the order is another, and as the constructor does.
-        """
-        pose = as_tensor(values, "the pose")
-        if pose.ndim == 0 or pose.shape[-1] != 7:
-            raise ShapeError(f"a pose has shape (..., 7), got {tuple(pose.shape)}")
-        if order not in ("wxyz", "xyzw"):
-            raise DataError(f"order is 'wxyz' or 'xyzw', got {order!r}")
-        make = cls if order == "wxyz" else cls.from_xyzw
-        return make(pose[..., :3], pose[..., 3:])
-
     @property
     def batch_shape(self) -> torch.Size:
         """Leading dimensions: () for one pose, (T,) for a pose per time step."""
@@ -230,20 +110,10 @@ class Frame:
             Of shape () or (T,).
         """
         steps = [frame.batch_shape for frame in frames if frame.batch_shape]
-        frames = [frame.expand(steps[0] if steps else ()) for frame in frames]
-        kinds = {type(frame) for frame in frames}
-        if len(kinds) > 1:
-            raise DataError(
-                "situations differ in what a frame is: "
-                f"{sorted(kind.__name__ for kind in kinds)}"
-            )
-        return kinds.pop()._stacked(frames)
-
-    @classmethod
-    def _stacked(cls, frames: Sequence[Frame]) -> Frame:
+        batched = [frame.expand(steps[0] if steps else ()) for frame in frames]
         return cls._from(
-            torch.stack([frame.position for frame in frames], dim=-2),
-            torch.stack([frame.orientation for frame in frames], dim=-2),
+            torch.stack([frame.position for frame in batched], dim=-2),
+            torch.stack([frame.orientation for frame in batched], dim=-2),
         )
 
     def between(self, lower: Tensor, fraction: Tensor) -> Frame:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, Self
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -106,18 +105,6 @@ class Hold:
         begin, end = ("" if math.isinf(at) else repr(at) for at in (self.begin, self.end))
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
 
-    def to_list(self) -> list[Any]:
-        """Frame, link, begin, end, share: for JSON, which has no infinity but None."""
-        begin, end = (None if math.isinf(at) else at for at in (self.begin, self.end))
-        return [self.frame, self.link, begin, end, self.share]
-
-    @classmethod
-    def from_list(cls, values: Sequence[Any]) -> Self:
-        """The inverse of :meth:`to_list`."""
-        frame, link, begin, end, share = values
-        begin, end = (-math.inf if begin is None else begin), (math.inf if end is None else end)
-        return cls(frame, link, begin, end, share)
-
     @property
     def _names(self) -> str:
         return f"{self.frame}@{self.link}"
@@ -150,22 +137,20 @@ def check_holds(
                 f"holds are Hold objects, got {hold!r}: Hold(frame, link, begin, end), or "
                 "Hold.parse('bottle@l_hand:4.3-')"
             )
+        where = f"the demonstration (hold {hold})"
         if hold.frame not in frames:
-            raise UnknownNameError(
-                "frame", hold.frame, f"the demonstration (hold {hold})", frames
-            )
+            raise UnknownNameError("frame", hold.frame, where, frames)
         if links is not None and hold.link not in links:
             raise UnknownNameError("link", hold.link, f"the robot (hold {hold})", links)
     checked = tuple(sorted(checked, key=lambda hold: (hold.begin, hold.end)))
-    of_frame: dict[str, list[Hold]] = {hold.frame: [] for hold in checked}
+    last: dict[str, Hold] = {}
     for hold in checked:
-        of_frame[hold.frame].append(hold)
-    for several in of_frame.values():
-        for one, other in pairwise(several):
-            if other.begin < one.end:
-                raise DataError(
-                    f"{one.frame!r} is held twice at once, {one} and {other}: one link is the "
-                    "holder; the other hand keeps its pose relative to the object by an "
-                    "operator with held=True"
-                )
+        before = last.setdefault(hold.frame, hold)
+        if before is not hold and hold.begin < before.end:
+            raise DataError(
+                f"{hold.frame!r} is held twice at once, {before} and {hold}: one link is the "
+                "holder; the other hand keeps its pose relative to the object by an "
+                "operator with held=True"
+            )
+        last[hold.frame] = hold
     return checked

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 __all__ = [
     "POSE_PARTS",
@@ -41,7 +41,9 @@ def is_gripper(name: str) -> bool:
     return re.search(words, name, re.IGNORECASE) is not None
 
 
-def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
+def pose_groups(
+    names: Sequence[str] | None, parts: tuple[str, ...] = POSE_PARTS
+) -> dict[str, tuple[int, ...]]:
     """Positions of the seven parts of every pose among the names.
 
     A pose ``bottle`` is there when ``bottle.x``, ... ``bottle.qz`` (or ``bottle_x``, ...) are.
@@ -50,13 +52,22 @@ def pose_groups(names: Sequence[str] | None) -> dict[str, tuple[int, ...]]:
     ----------
     names : sequence of str or None
         Of columns; None has no poses.
+    parts : tuple of str, default=POSE_PARTS
+        Names of the parts.
 
     Returns
     -------
     dict of str to tuple of int
-        By name of the pose, in the order of :data:`POSE_PARTS`.
+        By name of the pose, in the order of the parts.
     """
-    return _groups(names, POSE_PARTS)
+    positions = {name: i for i, name in enumerate(names or ())}
+    groups = {}
+    for name in positions:
+        stem = name.removesuffix(parts[0])
+        columns = [positions.get(stem + part, -1) for part in parts]
+        if stem != name and stem.endswith((".", "_")) and min(columns) >= 0:
+            groups[stem[:-1]] = tuple(columns)
+    return groups
 
 
 def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
@@ -67,7 +78,7 @@ def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
     names : sequence of str or None
         Of columns; None has no quaternions.
     """
-    return list(_groups(names, POSE_PARTS[3:]).values())
+    return list(pose_groups(names, POSE_PARTS[3:]).values())
 
 
 def incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -94,15 +105,3 @@ def incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
         if there != set(POSE_PARTS)
         and (there >= {"x", "y", "z"} or len(there & set(POSE_PARTS[3:])) > 1)
     }
-
-
-def _groups(names: Sequence[str] | None, parts: tuple[str, ...]) -> dict[str, tuple[int, ...]]:
-    positions: Mapping[str, int] = {name: i for i, name in enumerate(names or ())}
-    groups = {}
-    for name in positions:
-        match = re.fullmatch(rf"(.*)([._]){parts[0]}", name, re.DOTALL)
-        if match:
-            stem = match[1] + match[2]
-            if all(stem + part in positions for part in parts):
-                groups[match[1]] = tuple(positions[stem + part] for part in parts)
-    return groups

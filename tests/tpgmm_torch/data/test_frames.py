@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
@@ -113,76 +112,3 @@ def test_gradients_of_an_orientation_stay_on_the_unit_sphere():
     orientation = Frame(torch.zeros(3, dtype=torch.float64), given).orientation
     (gradient,) = torch.autograd.grad(orientation[0], given)
     assert abs(float(gradient @ given.detach())) < 1e-15
-
-
-ROTATIONS = Rotation.random(6, np.random.default_rng(3))
-POSITIONS = np.random.default_rng(4).standard_normal((6, 3))
-
-
-def homogeneous() -> np.ndarray:
-    matrices = np.zeros((6, 4, 4))
-    matrices[:, :3, :3], matrices[:, :3, 3], matrices[:, 3, 3] = (
-        ROTATIONS.as_matrix(), POSITIONS, 1.0,
-    )  # fmt: skip
-    return matrices
-
-
-@pytest.mark.parametrize(
-    "frame",
-    [
-        Frame.from_matrix(homogeneous()),
-        Frame.from_matrix(ROTATIONS.as_matrix(), POSITIONS),
-        Frame.from_xyzw(POSITIONS, ROTATIONS.as_quat()),
-        Frame.from_rotation(POSITIONS, ROTATIONS),
-        Frame.from_pose(np.c_[POSITIONS, ROTATIONS.as_quat()], order="xyzw"),
-        Frame.from_pose(np.c_[POSITIONS, ROTATIONS.as_quat()[:, [3, 0, 1, 2]]], order="wxyz"),
-    ],
-    ids=["4x4", "3x3", "xyzw", "scipy", "pose xyzw", "pose wxyz"],
-)
-def test_a_pose_can_be_written_in_many_ways(frame):
-    points = torch.from_numpy(np.random.default_rng(5).standard_normal((6, 3)))
-    expected = ROTATIONS.apply(points.numpy()) + POSITIONS
-    np.testing.assert_allclose(frame.transform(points), expected, rtol=0, atol=1e-12)
-    alone = frame[2]
-    assert alone.batch_shape == ()
-
-
-def test_one_pose_is_a_pose_without_a_batch():
-    for frame in (
-        Frame.from_matrix(np.eye(4)),
-        Frame.from_matrix(np.eye(3), [0, 0, 0]),
-        Frame.from_rotation([0, 0, 0], Rotation.identity()),
-        Frame.from_pose([0, 0, 0, 0, 0, 0, 1], order="xyzw"),
-    ):
-        assert frame.batch_shape == ()
-        assert frame.orientation.tolist() == [1.0, 0.0, 0.0, 0.0]
-
-
-def changed(row: int, column: int, value: float) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[row, column] = value
-    return matrix
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "message"),
-    [
-        (lambda: Frame.from_matrix(np.eye(2)), ShapeError, r"got \(2, 2\)"),
-        (lambda: Frame.from_matrix(1.0), ShapeError, r"got \(\)"),
-        (lambda: Frame.from_matrix(np.eye(3)), DataError, "give the position, too"),
-        (lambda: Frame.from_matrix(np.eye(4), [0, 0, 0]), DataError, "give no other"),
-        (lambda: Frame.from_matrix(changed(3, 0, 0.5)), DataError, "is it transposed"),
-        (lambda: Frame.from_matrix(changed(0, 0, 1.1)), DataError, "no rotation"),
-        (lambda: Frame.from_matrix(changed(0, 0, -1.0)), DataError, "a reflection"),
-        (lambda: Frame.from_matrix(changed(0, 0, math.nan)), DataError, "NaN"),
-        (lambda: Frame.from_xyzw([0, 0, 0], 1.0), ShapeError, r"shape \(4,\), got \(\)"),
-        (lambda: Frame.from_xyzw([0, 0, 0], [1, 1, 0, 0]), DataError, "unit quaternion"),
-        (lambda: Frame.from_rotation([0, 0, 0], np.eye(3)), DataError, "got ndarray"),
-        (lambda: Frame.from_rotation([0, 0, 0], ROTATIONS), ShapeError, r"got \(6, 4\)"),
-        (lambda: Frame.from_pose([0.0] * 6, order="wxyz"), ShapeError, r"got \(6,\)"),
-        (lambda: Frame.from_pose([0.0] * 7, order="zyx"), DataError, "'wxyz' or 'xyzw'"),
-    ],
-)
-def test_what_is_no_pose_is_refused(make, error, message):
-    with pytest.raises(error, match=message):
-        make()
