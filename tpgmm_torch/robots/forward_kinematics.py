@@ -12,7 +12,7 @@ further one doubles the number of joints that are behind: ten joints in a row ne
 """
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,67 +46,43 @@ class TreeKinematics:
     def __init__(
         self, tree: MovingTree, n_joints: int, dtype: torch.dtype, device: torch.device | str
     ) -> None:
-        def constant(values: Any) -> Tensor:
-            return torch.from_numpy(np.ascontiguousarray(values)).to(device, dtype)
-
-        def index(values: Iterable[int]) -> Tensor:
-            return torch.tensor([*values], dtype=torch.long, device=device)
-
-        # bodies are the base, the moving frames and, fixed to them, the L links; behind the N
-        # matrices of their poses stand the N that turn
-        frames, links = tree.frames, tree.links
-        count, first_link = 1 + len(frames) + len(links), 1 + len(frames)
-        factors = np.zeros((4, 2 * count, 4, 4))  # of 1, sine, cosine, joint
-        factors[0, [0, count]] = np.eye(4)
-        follow, shift = np.zeros((n_joints, 2 * count)), np.zeros(2 * count)
-        parents = [0] * count + [count] * count
-        turned = [np.eye(4), *(_z_to(frame.axis) for frame in frames)]
-        for body, frame in enumerate(frames, 1):
-            parents[body], parents[count + body] = 1 + frame.parent, count + 1 + frame.parent
-            offset = turned[1 + frame.parent].T @ frame.offset @ turned[body]
-            factors[:, body] = offset @ (SLIDE if frame.prismatic else TURN)
-            factors[:, count + body] = _turn(offset) @ (STAY if frame.prismatic else HALF_TURN)
-            follow[frame.joint, body], shift[body] = frame.multiplier, frame.shift
-            follow[:, count + body], shift[count + body] = follow[:, body] / 2, shift[body] / 2
-        for body, link in enumerate(links, first_link):
-            parents[body], parents[count + body] = 1 + link.frame, count + 1 + link.frame
-            offset = turned[1 + link.frame].T @ link.pose
-            factors[0, body], factors[0, count + body] = offset, _turn(offset)
-        self._factors = constant(factors.reshape(4, 2 * count, 16)).unbind(0)
-        self._follow, self._shift = constant(follow), constant(shift)
+        self._options: dict[str, Any] = {"dtype": dtype, "device": device}
+        factors, follow, shift, parents = _motions(tree, n_joints)
+        self._factors = self._constant(factors.reshape(4, -1, 16)).unbind(0)
+        self._follow, self._shift = self._constant(follow), self._constant(shift)
         # each matrix's ancestor of degree 1, 2, 4, ...; by level, the matrices and where their
         # carriers stand among those of the level before; and where each comes to stand
-        self._ancestors = [index(ancestors) for ancestors in _doubled(parents)]
+        self._ancestors = [self._index(ancestors) for ancestors in _doubled(parents)]
         levels = _levels(parents)
-        self._levels = [index(level) for level in levels]
+        self._levels = [self._index(level) for level in levels]
         self._carriers = [
-            index(before.index(parents[body]) for body in level)
+            self._index(before.index(parents[body]) for body in level)
             for before, level in itertools.pairwise(levels)
         ]
-        self._order = index(np.argsort(np.concatenate(levels)).tolist())
+        self._order = self._index(np.argsort(np.concatenate(levels)).tolist())
 
         # each column of the Jacobians is moved by a frame, or by none; where joints mimic
         # others, several frames add up to one
+        frames, links = tree.frames, tree.links
         movers = {frame.joint: body for body, frame in enumerate(frames, 1)}
         columns = [movers.get(joint, 0) for joint in range(n_joints)]
         self._mimic = None
         if len(movers) < len(frames) or any(frame.multiplier != 1 for frame in frames):
-            columns = list(range(1, first_link))
-            self._mimic = constant(follow[:, columns].T)  # (C, n)
-        # which numbers of the matrices are wanted: where links are, where what moves them is,
-        # about which axis, line by line, and the rows that turn
-        bodies = range(first_link, count)
-        wanted = [16 * body + 4 * line + 3 for body in bodies for line in range(3)]
-        for column in (3, 2):
-            wanted += [16 * mover + 4 * line + column for line in range(3) for mover in columns]
-        wanted += [16 * (count + body) + place for body in bodies for place in range(4)]
-        self._wanted, n = index(wanted), len(columns)
-        self._sizes = 3 * len(links), 3 * n, 3 * n, 4 * len(links)
+            columns = list(range(1, 1 + len(frames)))
+            self._mimic = self._constant(follow[:, columns].T)  # (C, n)
+        self._wanted = self._index(_entries(columns, len(frames), len(links)))
+        self._sizes = [3 * len(links), 3 * len(columns), 3 * len(columns), 4 * len(links)]
         moved = [[c - 1 in tree.moved_by(link.frame) for c in columns] for link in links]
-        slide = np.array([c > 0 and frames[c - 1].prismatic for c in columns], bool)
-        mask = np.array(moved, bool).reshape(len(links), 1, n)
-        self._turns = constant(1.0 * (mask & ~slide))  # (L, 1, C)
-        self._slides = constant(1.0 * (mask & slide)) if slide.any() else None
+        mask = np.array(moved, bool).reshape(len(links), 1, len(columns))
+        slide = np.array([False, *(frame.prismatic for frame in frames)])[columns]
+        self._turns = self._constant(1.0 * (mask & ~slide))  # (L, 1, C)
+        self._slides = self._constant(1.0 * (mask & slide)) if slide.any() else None
+
+    def _constant(self, values: Array) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(values)).to(**self._options)
+
+    def _index(self, values: Iterable[int]) -> Tensor:
+        return torch.tensor([*values], dtype=torch.long, device=self._options["device"])
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Poses and Jacobians in the base frame.
@@ -142,10 +118,8 @@ class TreeKinematics:
             local = torch.cat(done, 1).index_select(1, self._order)
         numbers = local.flatten(1).index_select(1, self._wanted)
         position, origin, axis, quaternion = numbers.split(self._sizes, 1)
-        position, quaternion = (
-            position.unflatten(1, (links, 3)),
-            quaternion.unflatten(1, (links, 4)),
-        )
+        position = position.unflatten(1, (links, 3))
+        quaternion = quaternion.unflatten(1, (links, 4))
         quaternion = quaternion * quaternions.hemisphere_sign(quaternion.narrow(-1, 0, 1))
         origin, axis = (part.unflatten(1, (1, 3, columns)) for part in (origin, axis))
         turning = axis * self._turns  # (B, L, 3, C)
@@ -163,6 +137,58 @@ def _product(first: Tensor, second: Tensor) -> Tensor:
     if torch.compiler.is_compiling():
         return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(-2)
     return first @ second
+
+
+def _motions(tree: MovingTree, n_joints: int) -> tuple[Array, Array, Array, list[int]]:
+    """How N matrices of poses, and behind them N of turns, depend on the joints.
+
+    Bodies are the base, the moving frames and, fixed to these, the links.
+
+    Returns
+    -------
+    factors : ndarray of shape (4, 2 N, 4, 4)
+        Of 1, the sine, the cosine and the joint.
+    follow, shift : ndarray of shape (n_joints, 2 N) and (2 N,)
+        ``joints @ follow + shift`` moves each matrix.
+    parents : list of int
+        What carries each; the base itself.
+    """
+    frames = tree.frames
+    turned = [np.eye(4), *(_z_to(frame.axis) for frame in frames)]
+    offsets = [frame.offset @ own for frame, own in zip(frames, turned[1:], strict=True)]
+    offsets += [link.pose for link in tree.links]
+    carriers = [
+        *(1 + frame.parent for frame in frames),
+        *(1 + link.frame for link in tree.links),
+    ]
+    count = 1 + len(carriers)
+    factors = np.zeros((4, 2 * count, 4, 4))
+    factors[0, [0, count]] = np.eye(4)
+    for body, (carrier, offset) in enumerate(zip(carriers, offsets, strict=True), 1):
+        kind = frames[body - 1].prismatic if body <= len(frames) else None
+        moved, turn = MOTIONS[kind]
+        pose = turned[carrier].T @ offset
+        factors[:, body], factors[:, count + body] = pose @ moved, _turn(pose) @ turn
+    follow, shift = np.zeros((n_joints, 2, count)), np.zeros((2, count))
+    for body, frame in enumerate(frames, 1):  # turns follow half the joint
+        follow[frame.joint, :, body] = frame.multiplier, frame.multiplier / 2
+        shift[:, body] = frame.shift, frame.shift / 2
+    parents = [0, *carriers, count, *(count + carrier for carrier in carriers)]
+    width = follow.size // max(n_joints, 1)  # without joints a width cannot be inferred
+    return factors, follow.reshape(n_joints, width), shift.reshape(-1), parents
+
+
+def _entries(columns: Sequence[int], n_frames: int, n_links: int) -> Iterator[int]:
+    """Which numbers of the 2 N matrices are wanted, as they stand in memory.
+
+    Where links are, where what moves each column is, about which axis, line by line, and the
+    rows that turn the links.
+    """
+    links, count = range(1 + n_frames, 1 + n_frames + n_links), 1 + n_frames + n_links
+    yield from (16 * link + 4 * line + 3 for link in links for line in range(3))
+    for entry in (3, 2):
+        yield from (16 * mover + 4 * line + entry for line in range(3) for mover in columns)
+    yield from (16 * (count + link) + place for link in links for place in range(4))
 
 
 def _z_to(axis: Array) -> Array:
@@ -214,3 +240,5 @@ HALF_TURN[1, [3, 2, 1, 0], [0, 1, 2, 3]] = -1.0, 1.0, -1.0, 1.0
 HALF_TURN[2] = np.eye(4)
 STAY = np.zeros((4, 4, 4))
 STAY[0] = np.eye(4)
+#: By kind of joint, slides or turns or none, how the pose and the turn of a frame move.
+MOTIONS = {True: (SLIDE, STAY), False: (TURN, HALF_TURN), None: (STAY, STAY)}

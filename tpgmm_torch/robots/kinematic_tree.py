@@ -14,7 +14,7 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfJoint, UrdfModel
+from tpgmm_torch.robots.urdf import FREEDOMS, UrdfJoint, UrdfModel
 
 __all__ = ["Attachment", "MovingFrame", "MovingTree", "motion", "reduce"]
 
@@ -136,7 +136,7 @@ def _cross(
     frames: list[MovingFrame],
 ) -> Attachment:
     """Where the far link of a joint sits; a joint that moves adds its frame to ``frames``."""
-    if joint.type in MULTIPLE_TYPES:
+    if FREEDOMS[joint.type] > 1:
         raise DataError(
             f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
             "joints of several degrees of freedom are not supported; give a base beyond it, "

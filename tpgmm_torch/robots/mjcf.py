@@ -20,7 +20,14 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematic_tree import motion
-from tpgmm_torch.robots.urdf import Mimic, UrdfJoint, description_text, is_text, parse_xml
+from tpgmm_torch.robots.urdf import (
+    X_AXIS,
+    Mimic,
+    UrdfJoint,
+    description_text,
+    is_text,
+    parse_xml,
+)
 from tpgmm_torch.robots.urdf_writer import free_name, numbers, origin, write_urdf
 
 __all__ = ["mjcf_to_urdf"]
@@ -138,7 +145,7 @@ class _Translation:
 
     def _fix(self, link: str, parent: str, pose: Array, kind: str = "fixed") -> None:
         self.fixed_names.add(name := free_name(f"{link}_mount", self.fixed_names))
-        self.joints.append(UrdfJoint(name, kind, parent, link, pose, np.array([1.0, 0, 0])))
+        self.joints.append(UrdfJoint(name, kind, parent, link, pose, X_AXIS))
 
     def _limits(self, joint: int) -> tuple[float, float, float]:
         """Lower, upper and velocity: of the joint, and of the servos that drive it.

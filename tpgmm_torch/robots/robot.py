@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, Self
 
@@ -23,7 +23,7 @@ from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
-from tpgmm_torch.robots.urdf import UrdfModel, description_text, parse_xml, read_urdf
+from tpgmm_torch.robots.urdf import UrdfJoint, UrdfModel, description_text, parse_xml, read_urdf
 from tpgmm_torch.robots.urdf_writer import joined
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
@@ -100,19 +100,12 @@ class Robot(Kinematics):
         """
         model = read_urdf(urdf)
         extra = _names("coordinates", coordinates)
-        chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
-        columns = _joints_named(model, chosen, extra)
-        fixed = _locked(model, locked or {}, columns)
-        if joints is None:
-            columns = tuple(name for name in model.actuated if name not in fixed)
-        columns += tuple(name for name in extra if name not in columns)
-        _check_joints(model, columns, extra, fixed)
-        moving = set(columns)
+        columns, fixed = _joint_vector(model, joints, extra, locked or {})
         config = {
             "urdf": model.text,
             "links": list(_names("links", links)),
             "joints": list(columns),
-            "locked": {n: float(fixed.get(n, 0.0)) for n in model.actuated if n not in moving},
+            "locked": fixed,
             "coordinates": list(extra),
             "base": model.root if base is None else base,
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
@@ -254,21 +247,21 @@ class Robot(Kinematics):
         for name in poses or ():
             if name not in robots:
                 raise UnknownNameError("robot", name, "the robots to combine", robots)
-        parts: dict[str, tuple[UrdfModel, Array]] = {}
+        parts = {}
         settings: dict[str, Any] = {"locked": {}, "tools": {}}
         settings |= {"links": [], "joints": [], "coordinates": []}
         for name, robot in robots.items():
-            config = robot.config()
-            model = read_urdf(config["urdf"])
-            place = np.eye(4) if poses is None or name not in poses else _matrix(poses[name])
-            parts[name] = model, place @ _root_in_base(name, model, config)
-            for key in ("links", "joints", "coordinates"):
-                settings[key] += [f"{name}_{member}" for member in config[key]]
-            settings["locked"] |= {f"{name}_{n}": v for n, v in config["locked"].items()}
-            settings["tools"] |= {
-                f"{name}_{tool}": (f"{name}_{parent}", *pose)
-                for tool, (parent, *pose) in config["tools"].items()
-            }
+            place = _matrix(poses[name]) if poses and name in poses else np.eye(4)
+            parts[name] = robot.model, place @ robot._root_in_base(name)
+            for key in settings.keys() & robot._config.keys():
+                own, prefix = robot._config[key], f"{name}_"
+                if isinstance(own, list):
+                    settings[key] += [prefix + member for member in own]
+                else:
+                    settings[key] |= {prefix + member: value for member, value in own.items()}
+            for tool in robot._config["tools"]:
+                parent, *pose = settings["tools"][f"{name}_{tool}"]
+                settings["tools"][f"{name}_{tool}"] = (f"{name}_{parent}", *pose)
         still = {link: _matrix(pose) for link, pose in dict(fixed or {}).items()}
         first = next(iter(robots.values())).lower
         options: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
@@ -278,7 +271,8 @@ class Robot(Kinematics):
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
     ) -> None:
         self._config = config
-        self._name = model.name
+        #: The description of which it was made.
+        self.model = model
         self.joint_names = tuple(config["joints"])
         self.links = tuple(config["links"])
         column = {name: i for i, name in enumerate(self.joint_names) if name in model.joint}
@@ -357,6 +351,18 @@ class Robot(Kinematics):
             raise DataError("a robot's configuration holds the text of its URDF, not a path")
         return cls.from_urdf(**settings, dtype=dtype, device=device)
 
+    def _root_in_base(self, name: str) -> Array:
+        """Where the root of the description is in the frame of the base, which it must hold."""
+        model, base, root = self.model, self._config["base"], [(self.model.root, np.eye(4))]
+        columns = {joint: i for i, joint in enumerate(self.joint_names) if joint in model.joint}
+        [place] = reduce(model, base, root, columns, self._config["locked"]).links
+        if place.frame >= 0:
+            raise DataError(
+                f"the base {base!r} of the robot {name!r} is moved by its joints: give it a "
+                f"base that stands still to combine it, base={model.root!r}"
+            )
+        return place.pose
+
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and other._config == self._config
 
@@ -369,7 +375,7 @@ class Robot(Kinematics):
     def __repr__(self) -> str:
         dtype = "" if self._config["dtype"] == "float64" else f", {self._config['dtype']}"
         return (
-            f"Robot({self._name!r}, n_joints={self.n_joints}, links={self.links}, "
+            f"Robot({self.model.name!r}, n_joints={self.n_joints}, links={self.links}, "
             f"base={self._config['base']!r}{dtype})"
         )
 
@@ -383,60 +389,63 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     return listed
 
 
-def _joints_named(
-    model: UrdfModel, names: Sequence[str], coordinates: Sequence[str]
-) -> tuple[str, ...]:
-    """The names, with what fits the patterns among them in the place of each."""
-    columns = dict.fromkeys(name for name in names if name in model.joint)
-    listed: dict[str, None] = {}
-    for name in names:
-        if name in columns or name in coordinates or not set(name) & set("*?["):
-            listed[name] = None
-            continue
-        fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
+def _joint_vector(
+    model: UrdfModel,
+    joints: str | Sequence[str] | None,
+    coordinates: tuple[str, ...],
+    locked: Mapping[str, float],
+) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Names of the joint vector, and where all other actuated joints stand."""
+    chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
+    named = {name for name in chosen if name in model.joint}
+    columns: dict[str, None] = {}
+    for name in chosen:
+        fits = [name] if name in coordinates else _fitting(model, name)
+        columns |= dict.fromkeys(fit for fit in fits if fit == name or fit not in named)
+    fixed = {name: value for name, value in locked.items() if name in model.joint}
+    for name in locked.keys() - fixed.keys():
+        fits = [fit for fit in _fitting(model, name) if fit not in columns]
         if not fits:
-            raise UnknownNameError(
-                "joint", name, "the movable joints of the URDF", model.actuated
+            raise DataError(
+                f"locked has {name!r}, and all joints that it names are in the joint vector"
             )
-        listed |= dict.fromkeys(fit for fit in fits if fit not in columns)
-    return tuple(listed)
+        fixed = dict.fromkeys(fits, locked[name]) | fixed
+    if joints is None:
+        columns = {name: None for name in model.actuated if name not in fixed}
+    columns |= dict.fromkeys(coordinates)
+    _check_joints(model, columns, coordinates, fixed)
+    still = (name for name in model.actuated if name not in columns)
+    return tuple(columns), {name: float(fixed.get(name, 0.0)) for name in still}
 
 
-def _locked(
-    model: UrdfModel, locked: Mapping[str, float], columns: Sequence[str]
-) -> dict[str, float]:
-    """Where joints are locked, with what fits the patterns that is neither named nor moves."""
-    values = {name: value for name, value in locked.items() if name in model.joint}
-    for name in locked:
-        if name not in model.joint:
-            fits = [n for n in _joints_named(model, [name], ()) if n not in columns]
-            if not fits:
-                raise DataError(
-                    f"locked has {name!r}, and all joints that it names are in the joint vector"
-                )
-            values = dict.fromkeys(fits, locked[name]) | values
-    return values
+def _fitting(model: UrdfModel, name: str) -> list[str]:
+    """The joint of that name, or the actuated ones that fit it as a pattern."""
+    if name in model.joint or not set(name) & set("*?["):
+        return [name]
+    fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
+    if not fits:
+        raise UnknownNameError("joint", name, "the movable joints of the URDF", model.actuated)
+    return fits
 
 
 def _check_joints(
     model: UrdfModel,
-    columns: Sequence[str],
+    columns: Collection[str],
     coordinates: Sequence[str],
     locked: Mapping[str, float],
 ) -> None:
-    """Check coordinates, joints and locked joints against the description."""
-    actuated = set(model.actuated)
+    """Whether each coordinate, joint and locked joint can be what it is said to be."""
     for name in coordinates:
         if name in model.joint:
             raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
     for name in (*(name for name in columns if name not in coordinates), *locked):
-        joint = model.joint.get(name)
-        if joint is not None and joint.mimic is not None:
+        mimic = model.movable[name].mimic if name in model.movable else None
+        if mimic is not None:
             raise DataError(
-                f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
+                f"joint {name!r} mimics {mimic.joint!r} and cannot be chosen or locked: "
                 f"choose or lock {model.leader(name).joint!r}"
             )
-        if name not in actuated:
+        if name not in model.movable:
             where = "the movable joints of the URDF (a coordinate without kinematics, like a "
             where += "gripper, is named in coordinates)"
             raise UnknownNameError("joint", name, where, model.actuated)
@@ -494,59 +503,52 @@ def _matrix(pose: Frame) -> Array:
     return matrix
 
 
-def _root_in_base(name: str, model: UrdfModel, config: Mapping[str, Any]) -> Array:
-    """Where the root of a description is in the frame of its base, which it must hold."""
-    columns = {joint: i for i, joint in enumerate(config["joints"]) if joint in model.joint}
-    root = [(model.root, np.eye(4))]
-    [place] = reduce(model, config["base"], root, columns, config["locked"]).links
-    if place.frame >= 0:
-        raise DataError(
-            f"the base {config['base']!r} of the robot {name!r} is moved by its joints: give "
-            f"it a base that stands still to combine it, base={model.root!r}"
-        )
-    return place.pose
-
-
 def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
     """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
 
-    What mimics a joint moves with it, so that its limits are the joint's too. Limits that
-    leave the joint a single point, as where a sign was forgotten, are none. Coordinates without
-    kinematics have no limits, and lack none.
+    Coordinates without kinematics have no limits, and lack none.
     """
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
+    without = set()
     for name in rows.keys() & model.joint.keys():
         joint = model.joint[name]
         rows[name] = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk]
-    without = {
-        name
-        for name in rows.keys() & model.joint.keys()
-        if math.isinf(rows[name][2])
-        or (model.joint[name].type != "continuous" and math.isinf(rows[name][1]))
-    }
-    for joint in model.joints:
-        if not joint.movable or joint.mimic is None:
-            continue
-        try:
-            leader = model.leader(joint.name)
-        except TPGMMError:  # raised where it matters: for a link that depends on it
-            continue
-        if leader.joint not in rows or leader.multiplier == 0:
-            continue
-        row, factor = rows[leader.joint], leader.multiplier
-        ends = sorted((end - leader.offset) / factor for end in (joint.lower, joint.upper))
-        low, high = max(row[0], ends[0]), min(row[1], ends[1])
-        if low > high + 1e-9:
-            raise DataError(
-                f"the limits of joint {joint.name!r}, {joint.lower:g} to {joint.upper:g}, "
-                f"leave no room to {leader.joint!r}, which it mimics as {factor:g} * "
-                f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
-            )
-        if high - low < 1e-9 < row[1] - row[0]:
-            without.add(leader.joint)
-        else:
-            row[:2] = low, high
-        rates = joint.velocity, joint.acceleration, joint.jerk
-        row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
+        endless = joint.type != "continuous" and math.isinf(joint.upper)
+        if endless or math.isinf(joint.velocity):
+            without.add(name)
+    for joint in model.movable.values():
+        if joint.mimic is not None:
+            without |= _limit_leader(model, joint, rows)
     limits = torch.tensor(list(rows.values()), dtype=torch.float64, device="cpu")
     return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
+
+
+def _limit_leader(
+    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]]
+) -> set[str]:
+    """Apply the limits of a joint that mimics another to that other, which moves with it.
+
+    Limits that leave it a single point, as where a sign was forgotten, are none: its name is
+    returned.
+    """
+    try:
+        leader = model.leader(joint.name)
+    except TPGMMError:  # raised where it matters: for a link that depends on it
+        return set()
+    if leader.joint not in rows or leader.multiplier == 0:
+        return set()
+    row, factor = rows[leader.joint], leader.multiplier
+    rates = joint.velocity, joint.acceleration, joint.jerk
+    row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
+    ends = sorted((end - leader.offset) / factor for end in (joint.lower, joint.upper))
+    low, high = max(row[0], ends[0]), min(row[1], ends[1])
+    if low > high + 1e-9:
+        raise DataError(
+            f"the limits of joint {joint.name!r}, {joint.lower:g} to {joint.upper:g}, "
+            f"leave no room to {leader.joint!r}, which it mimics as {factor:g} * "
+            f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
+        )
+    if high - low < 1e-9 < row[1] - row[0]:
+        return {leader.joint}
+    row[:2] = low, high
+    return set()

@@ -33,9 +33,15 @@ __all__ = [
     "read_urdf",
 ]
 
-MOVABLE_TYPES = ("revolute", "continuous", "prismatic")
-#: Joints of more than one degree of freedom: read, but no :class:`Robot` can be moved by them.
-MULTIPLE_TYPES = ("floating", "planar")
+#: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.
+FREEDOMS = {
+    "fixed": 0,
+    "revolute": 1,
+    "continuous": 1,
+    "prismatic": 1,
+    "planar": 3,
+    "floating": 6,
+}
 XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
 #: What may stand before the first element of a text: a byte order mark, and space.
 BEFORE_XML = "\ufeff \t\r\n"
@@ -44,6 +50,8 @@ OTHER_FORMATS = {
     "mujoco": ": that is an MJCF, Robot.from_mjcf reads it",
     "sdf": ": that is an SDF; pytorch_kinematics reads it, Robot.from_chain takes its chain",
 }
+#: The axis of a joint that names none.
+X_AXIS = np.array([1.0, 0.0, 0.0])
 #: Lengths [m] and factors beyond this are mistakes, and their products would not be finite.
 LARGEST = 1e9
 
@@ -92,7 +100,7 @@ class UrdfJoint:
     @property
     def movable(self) -> bool:
         """Whether it has one degree of freedom."""
-        return self.type in MOVABLE_TYPES
+        return FREEDOMS[self.type] == 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,8 +224,8 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     links = tuple(_names(root, "link"))
     if not links:
         raise DataError("the URDF has no link")
-    names = _names(root, "joint")
-    joints = tuple(map(_joint, names, root.findall("joint")))
+    _names(root, "joint")
+    joints = tuple(map(_joint, root.findall("joint")))
     return UrdfModel(root.get("name", ""), text, _root_link(links, joints), links, joints)
 
 
@@ -268,76 +276,82 @@ def _names(root: ElementTree.Element, tag: str) -> list[str]:
     return list(names)
 
 
-def _joint(name: str, element: ElementTree.Element) -> UrdfJoint:
-    kind = element.get("type", "")
-    if kind not in (*MOVABLE_TYPES, *MULTIPLE_TYPES, "fixed"):
-        known = sorted((*MOVABLE_TYPES, *MULTIPLE_TYPES, "fixed"))
-        raise DataError(f"joint {name!r} has type {kind!r}; URDF knows {known}")
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    name, kind = element.get("name", ""), element.get("type", "")
+    if kind not in FREEDOMS:
+        raise DataError(f"joint {name!r} has type {kind!r}; URDF knows {sorted(FREEDOMS)}")
     ends = []
     for side in ("parent", "child"):
         end = element.find(side)
         if end is None or not end.get("link"):
             raise DataError(f"joint {name!r} has no {side} link")
         ends.append(end.get("link", ""))
-
-    def numbers(tag: str, attribute: str, *default: float) -> list[float]:
-        child = element.find(tag)
-        text = None if child is None else child.get(attribute)
-        return (
-            list(default)
-            if text is None
-            else _numbers(name, tag, attribute, text, len(default))
-        )
-
-    origin = placement(numbers("origin", "xyz", 0, 0, 0), numbers("origin", "rpy", 0, 0, 0))
-    joint = UrdfJoint(name, kind, ends[0], ends[1], origin, np.array([1.0, 0.0, 0.0]))
+    xyz, rpy = (_numbers(element, "origin", key, 0.0, 0.0, 0.0) for key in ("xyz", "rpy"))
+    joint = UrdfJoint(name, kind, ends[0], ends[1], placement(xyz, rpy), X_AXIS)
     if not joint.movable:
         return joint
-    axis = np.array(numbers("axis", "xyz", 1.0, 0.0, 0.0))
+    return replace(joint, axis=_axis(element), mimic=_mimic(element), **_limits(element))
+
+
+def _axis(element: ElementTree.Element) -> Array:
+    axis = np.array(_numbers(element, "axis", "xyz", *X_AXIS))
     if not axis.any():
+        name = element.get("name")
         raise DataError(f"joint {name!r} has the axis 0 0 0: it needs a direction")
     axis /= np.abs(axis).max()  # a direction alone: the square of a length may overflow
-    axis /= np.linalg.norm(axis)
-    # without a range <limit> gives effort and velocity alone; values that cannot be, such as
-    # those of tools that write -1 or 0 where nothing is known, are no limits
-    limit = element.find("limit")
-    lower, upper = -math.inf, math.inf
-    if kind != "continuous" and limit is not None and {"lower", "upper"} & set(limit.keys()):
-        [low], [high] = numbers("limit", "lower", 0), numbers("limit", "upper", 0)
+    unit: Array = axis / np.linalg.norm(axis)
+    return unit
+
+
+def _limits(element: ElementTree.Element) -> dict[str, float]:
+    """Range and rates; values that cannot be, as tools write -1 or 0, are no limits.
+
+    Without a range ``<limit>`` gives effort and velocity alone.
+    """
+    limit, lower, upper = element.find("limit"), -math.inf, math.inf
+    given = set() if limit is None or element.get("type") == "continuous" else set(limit.keys())
+    if given & {"lower", "upper"}:
+        [low], [high] = (_numbers(element, "limit", key, 0.0) for key in ("lower", "upper"))
         lower, upper = (low, high) if low <= high else (lower, upper)
     velocity, acceleration, deceleration, jerk = (
         rate if rate > 0 else math.inf
         for key in ("velocity", "acceleration", "deceleration", "jerk")
-        for rate in numbers("limit", key, math.inf)
+        for rate in _numbers(element, "limit", key, math.inf)
     )
-    joint = replace(joint, axis=axis, lower=lower, upper=upper, velocity=velocity)
-    joint = replace(joint, acceleration=min(acceleration, deceleration), jerk=jerk)
+    limits = {"lower": lower, "upper": upper, "velocity": velocity, "jerk": jerk}
+    return {**limits, "acceleration": min(acceleration, deceleration)}
+
+
+def _mimic(element: ElementTree.Element) -> Mimic | None:
     follows = element.find("mimic")
     if follows is None:
-        return joint
+        return None
     if not follows.get("joint"):
-        raise DataError(f"joint {name!r}: <mimic> does not name a joint")
-    line = numbers("mimic", "multiplier", 1.0) + numbers("mimic", "offset", 0.0)
-    return replace(joint, mimic=Mimic(follows.get("joint", ""), *line))
+        raise DataError(f"joint {element.get('name')!r}: <mimic> does not name a joint")
+    [multiplier] = _numbers(element, "mimic", "multiplier", 1.0)
+    [offset] = _numbers(element, "mimic", "offset", 0.0)
+    return Mimic(follows.get("joint", ""), multiplier, offset)
 
 
-def _numbers(joint: str, tag: str, attribute: str, text: str, count: int) -> list[float]:
+def _numbers(
+    element: ElementTree.Element, tag: str, attribute: str, *default: float
+) -> list[float]:
+    """The finite numbers of an attribute of a joint's child, as many as ``default``."""
+    child = element.find(tag)
+    text = None if child is None else child.get(attribute)
+    if text is None:
+        return [*default]
+    what = f"joint {element.get('name')!r}: <{tag} {attribute}>"
     shown = repr(text if len(text) <= 100 else f"{text[:100]} ...")
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not all(map(math.isfinite, values)):
+    if len(values) != len(default) or not all(map(math.isfinite, values)):
         hint = f". {XACRO}" if "${" in text or "$(" in text else ""
-        raise DataError(
-            f"joint {joint!r}: <{tag} {attribute}> needs {count} finite number(s), "
-            f"got {shown}{hint}"
-        )
+        raise DataError(f"{what} needs {len(default)} finite number(s), got {shown}{hint}")
     if tag in ("origin", "mimic") and max(map(abs, values)) > LARGEST:
-        raise DataError(
-            f"joint {joint!r}: <{tag} {attribute}> is {shown}, and no robot's is beyond "
-            f"{LARGEST:g}"
-        )
+        raise DataError(f"{what} is {shown}, and no robot's is beyond {LARGEST:g}")
     return values
 
 
@@ -361,14 +375,7 @@ def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
 
 def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:
     """The one link from which all others hang."""
-    known, above = set(links), dict[str, str]()
-    for joint in joints:
-        for link in (joint.parent, joint.child):
-            if link not in known:
-                raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
-        if joint.child in above:
-            raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")
-        above[joint.child] = joint.parent
+    above = _parents(links, joints)
     roots = [link for link in links if link not in above]
     if len(roots) > 1:
         raise DataError(f"the URDF has {len(roots)} links without a parent, not one: {roots}")
@@ -382,3 +389,16 @@ def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:
             raise DataError(f"the joints of the URDF form a cycle: {' < '.join([*way, link])}")
         reached.update(way)
     return roots[0]
+
+
+def _parents(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> dict[str, str]:
+    """The parent of each link that has one."""
+    known, above = set(links), dict[str, str]()
+    for joint in joints:
+        for link in (joint.parent, joint.child):
+            if link not in known:
+                raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
+        if joint.child in above:
+            raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")
+        above[joint.child] = joint.parent
+    return above

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.robots.urdf import UrdfJoint, UrdfModel, parse_xml
+from tpgmm_torch.robots.urdf import X_AXIS, UrdfJoint, UrdfModel, parse_xml
 
 __all__ = ["Visuals", "free_name", "joined", "roll_pitch_yaw", "write_urdf"]
 
@@ -116,7 +116,7 @@ def joined(
 
     def mount(name: str, link: str, pose: Array) -> None:
         taken.add(name := free_name(f"{name}_mount", taken))
-        joints.append(UrdfJoint(name, "fixed", root, link, pose, np.array([1.0, 0.0, 0.0])))
+        joints.append(UrdfJoint(name, "fixed", root, link, pose, X_AXIS))
 
     for name, pose in fixed.items():
         mount(name, name, pose)

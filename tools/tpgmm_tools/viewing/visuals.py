@@ -21,7 +21,7 @@ from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, DependencyError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
-from tpgmm_torch.robots.urdf import MULTIPLE_TYPES, UrdfModel, placement, read_urdf
+from tpgmm_torch.robots.urdf import FREEDOMS, UrdfModel, placement, read_urdf
 
 __all__ = ["Color", "Shape", "link_shapes", "mesh", "parse_shape", "unit_ball", "whole_body"]
 
@@ -246,7 +246,7 @@ def whole_body(
 def _held_by(urdf: UrdfModel, base: str) -> set[str]:
     """Links between which and the base there is no joint of several degrees of freedom."""
     held, front = {base}, [base]
-    joints = [joint for joint in urdf.joints if joint.type not in MULTIPLE_TYPES]
+    joints = [joint for joint in urdf.joints if FREEDOMS[joint.type] <= 1]
     while front:
         at = front.pop()
         ends = [(j.parent, j.child) for j in joints if at in (j.parent, j.child)]
