@@ -186,8 +186,8 @@ def _state_at(time: Tensor, joints: Tensor, instants: Tensor, robot: Kinematics)
 class PoseScorer:
     """Scorer for scikit-learn: minus the mean pose error of links of reproductions.
 
-    For ``scoring=`` of :func:`tpgmm_torch.model_selection.cross_validate`, ``cross_val_score``
-    and ``GridSearchCV``. Held-out demonstrations are reproduced on their own clock; those of a
+    For ``scoring=`` of scikit-learn's ``cross_validate``, ``cross_val_score`` and
+    ``GridSearchCV``. Held-out demonstrations are reproduced on their own clock; those of a
     pipeline of alignment and model are aligned first, by what the alignment learned.
 
     Parameters

@@ -116,17 +116,17 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
 def load_model(
     path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
 ) -> TaskParameterizedGMM:
-    """:func:`load` a fitted estimator.
+    """:func:`tpgmm_torch.load` a fitted estimator.
 
     Parameters
     ----------
     path, custom, device
-        As of :func:`load`.
+        As of :func:`tpgmm_torch.load`.
 
     Raises
     ------
     ModelFileError
-        As :func:`load`; or if it is another skill.
+        As :func:`tpgmm_torch.load`; or if it is another skill.
     """
     model = load(path, custom, device)
     if not isinstance(model, TaskParameterizedGMM):
@@ -139,12 +139,12 @@ def load_model(
 def load_skill(
     path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None
 ) -> Any:
-    """:func:`load` what runs: a skill, or that of an estimator.
+    """:func:`tpgmm_torch.load` what runs: a skill, or that of an estimator.
 
     Parameters
     ----------
     path, custom, device
-        As of :func:`load`.
+        As of :func:`tpgmm_torch.load`.
     """
     model = load(path, custom, device)
     return model.skill if isinstance(model, TaskParameterizedGMM) else model

@@ -18,6 +18,13 @@ import tpgmm_torch
 
 __all__ = ["setup"]
 
+#: Modules of the core of which the data sets hand on a name.
+HANDED_ON = {
+    value.__module__
+    for value in (getattr(tpgmm_datasets, name) for name in tpgmm_datasets.__all__)
+    if getattr(value, "__module__", "").startswith("tpgmm_torch")
+}
+
 
 def _types(app: Sphinx, config: Config) -> None:
     """Names that numpydoc links where they stand as a type."""
@@ -36,15 +43,17 @@ def _by_last_part(
     if node.get("refdomain") != "py":
         return None
     domain = env.domains.python_domain
-    target = node["reftarget"]
-    if node["reftype"] == "attr" and target not in domain.objects:
-        target = target.rpartition(".")[0]  # fields are explained where their class is
-    ending = f".{target}"
-    found = {
-        name: entry
-        for name, entry in domain.objects.items()
-        if f".{name}".endswith(ending) and not entry.aliased
-    }
+    targets = [node["reftarget"]]
+    if node["reftype"] == "attr":
+        targets.append(targets[0].rpartition(".")[0])  # fields are explained where classes are
+    found = {}
+    while targets and not found:
+        ending = f".{targets.pop(0)}"
+        found = {
+            name: entry
+            for name, entry in domain.objects.items()
+            if f".{name}".endswith(ending) and not entry.aliased
+        }
     if len(found) != 1:
         return None
     [(name, entry)] = found.items()
@@ -64,12 +73,14 @@ def _other_name(app: Sphinx, document: nodes.document) -> None:
         value = getattr(sys.modules.get(module), name.partition(".")[0], None)
         home = getattr(value, "__module__", None)
         place = home if isinstance(home, str) and home.startswith("tpgmm_") else module
+        places = ["tpgmm_datasets"] if place in HANDED_ON else []
         while place:
-            other = f"{place}.{name}"
+            places.append(place)
+            place = place.rpartition(".")[0]
+        for other in (f"{place}.{name}" for place in places):
             if other not in document.ids:
                 signature["ids"].append(other)
                 document.ids[other] = signature
-            place = place.rpartition(".")[0]
 
 
 def setup(app: Sphinx) -> dict[str, Any]:

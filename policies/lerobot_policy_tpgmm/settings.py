@@ -199,7 +199,7 @@ class TrainingConfig:
         reads them like any frame, but for those at ``start``: they follow from the joints.
     events : dict of str to str, optional
         How events are found, ``{"close": "closing:*gripper*"}``, as
-        :func:`tpgmm_torch.events.parse_event` takes it. Others are those of the columns
+        :func:`tpgmm_datasets.events.parse_event` takes it. Others are those of the columns
         ``event.*`` of the data set; ``close``, ``open`` and ``stop`` of a link at which a
         frame is are found by themselves, where there is no such column.
     """

@@ -72,7 +72,9 @@ class LimitArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """Bounds on position, speed, acceleration and jerk of each joint; made by :meth:`of`.
+    """Bounds on position, speed, acceleration and jerk of each joint.
+
+    :meth:`MotionBounds.of` makes them.
 
     Parameters
     ----------

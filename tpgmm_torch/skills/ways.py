@@ -79,7 +79,7 @@ class Ways(Skill):
         The largest surprise of the demonstrations of each [nats],
         :meth:`Regression.surprise`; 0 by default.
     chosen : Tensor of shape (...), optional
-        The way of each robot, as :meth:`start` chooses it.
+        The way of each robot, as :meth:`Skill.start` chooses it.
 
     Raises
     ------

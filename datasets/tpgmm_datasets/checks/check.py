@@ -83,7 +83,7 @@ def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = No
 def check_summaries(
     episodes: Sequence[RecordingSummary], robot: Kinematics | None = None
 ) -> Report:
-    """The report of :func:`check` on recordings that were summarised as they were read.
+    """The report of :func:`tpgmm_datasets.check` on summaries of recordings.
 
     Parameters
     ----------
