@@ -30,7 +30,7 @@ STEPS = 400
 def in_skill_time(
     model: TaskParameterizedGMM, demonstrations: Sequence[Demonstration]
 ) -> list[Demonstration]:
-    """Bring what a person showed into the time of a skill, as ``partial_fit`` wants it.
+    """Bring what a person showed into the time of a skill, to fit it with the demonstrations.
 
     What is shown may be the whole skill or a segment, that in which a person took over. It
     begins where the skill, reproduced with its frames, is most like its beginning, and ends

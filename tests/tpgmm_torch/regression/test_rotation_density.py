@@ -69,7 +69,7 @@ def test_without_orientations_it_is_the_likelihood():
     operator = RelativePosition("hand", "here")
     shown = [Demonstration(d.time, d.joints, {"here": Frame([0.0, 0.0, 0.0])}) for d in shown]
     skill = TaskParameterizedGMM(3, [operator], HAND).fit(shown)
-    [block] = (torch.from_numpy(row) for row in skill.rows(shown[:1]))
+    [block] = skill.rows(shown[:1])
     regression = skill.skill
     found = rotation_log_density(regression, block[:, 0], [block[:, 1:]])
     assert torch.equal(found, regression.log_density(block[:, 0], [block[:, 1:]]))
