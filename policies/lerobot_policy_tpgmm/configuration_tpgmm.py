@@ -110,7 +110,7 @@ class TPGMMConfig(StatePolicyConfig):
         seconds and events joined by commas, ``"4.2,shake"``.
     modes : int or "auto", default=1
         In how many ways the skill is done, each learned for itself; "auto" finds it,
-        :class:`tpgmm_torch.SelectWays`.
+        :class:`tpgmm_torch.structure.select_ways.SelectWays`.
     holds : list of str, optional
         From when to when a link holds an object, ``["bottle@l_hand:4.3-9.1"]``, in seconds of
         the aligned skill. By default it is found in frames that are read at every step

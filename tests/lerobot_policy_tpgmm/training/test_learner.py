@@ -23,12 +23,14 @@ from tests.support.training import (
 )
 from tests.support.two_ways import ARM, Handles, another_handle_each, tip, two_ways_set
 from tpgmm_datasets import load_lerobot
-from tpgmm_torch import Frame, Segmentation, TaskParameterizedGMM, fit_parts
+from tpgmm_torch import Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment, LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators.text import parse_operator
 from tpgmm_torch.persistence import encode
 from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.structure.fit_parts import fit_parts
+from tpgmm_torch.structure.segmentation import Segmentation
 
 # What is learned
 
