@@ -61,11 +61,16 @@ class TreeKinematics:
         ]
         self._order = self._index(np.argsort(np.concatenate(levels)).tolist())
 
-        # each column of the Jacobians is moved by a frame, or by none; where joints mimic
-        # others, several frames add up to one
+        self._select_columns(tree, follow)
+
+    def _select_columns(self, tree: MovingTree, follow: Array) -> None:
+        """What moves each column of the Jacobians: a frame, or none.
+
+        Where joints mimic others, several frames add up to one.
+        """
         frames, links = tree.frames, tree.links
         movers = {frame.joint: body for body, frame in enumerate(frames, 1)}
-        columns = [movers.get(joint, 0) for joint in range(n_joints)]
+        columns = [movers.get(joint, 0) for joint in range(len(follow))]
         self._mimic = None
         if len(movers) < len(frames) or any(frame.multiplier != 1 for frame in frames):
             columns = list(range(1, 1 + len(frames)))

@@ -155,18 +155,11 @@ class _Translation:
         """
         import mujoco
 
-        model = self.model
         lower, upper, velocity = -math.inf, math.inf, math.inf
-        if model.jnt_limited[joint]:
-            lower, upper = map(float, model.jnt_range[joint])
-        direct = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-        for index in range(model.nu):
-            servo = model.actuator(index)
+        if self.model.jnt_limited[joint]:
+            lower, upper = map(float, self.model.jnt_range[joint])
+        for servo in self._servos(joint):
             gear = float(servo.gear[0])
-            driven = int(servo.trntype[0]) in direct and servo.trnid[0] == joint
-            affine = int(servo.biastype[0]) == mujoco.mjtBias.mjBIAS_AFFINE
-            if not (driven and affine and gear):
-                continue
             constant, stiffness, damping = map(float, servo.biasprm[:3])
             commands, limited = servo.ctrlrange, servo.ctrllimited[0]
             if int(servo.dyntype[0]) == mujoco.mjtDyn.mjDYN_INTEGRATOR:
@@ -184,6 +177,20 @@ class _Translation:
             else:
                 velocity = min(velocity, float(np.abs(ends / damping).max()))
         return lower, upper, velocity
+
+    def _servos(self, joint: int) -> Iterator[Any]:
+        """The actuators with an affine bias that drive a joint directly."""
+        import mujoco
+
+        direct = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        for servo in map(self.model.actuator, range(self.model.nu)):
+            drives = int(servo.trntype[0]) in direct and servo.trnid[0] == joint
+            if (
+                drives
+                and int(servo.biastype[0]) == mujoco.mjtBias.mjBIAS_AFFINE
+                and servo.gear[0]
+            ):
+                yield servo
 
     def _mimics(self) -> dict[int, Mimic]:
         """Joints that follow others: ``q - q0 = c0 + c1 (q' - q0')`` by active equalities."""

@@ -248,20 +248,10 @@ class Robot(Kinematics):
             if name not in robots:
                 raise UnknownNameError("robot", name, "the robots to combine", robots)
         parts = {}
-        settings: dict[str, Any] = {"locked": {}, "tools": {}}
-        settings |= {"links": [], "joints": [], "coordinates": []}
         for name, robot in robots.items():
             place = _matrix(poses[name]) if poses and name in poses else np.eye(4)
             parts[name] = robot.model, place @ robot._root_in_base(name)
-            for key in settings.keys() & robot._config.keys():
-                own, prefix = robot._config[key], f"{name}_"
-                if isinstance(own, list):
-                    settings[key] += [prefix + member for member in own]
-                else:
-                    settings[key] |= {prefix + member: value for member, value in own.items()}
-            for tool in robot._config["tools"]:
-                parent, *pose = settings["tools"][f"{name}_{tool}"]
-                settings["tools"][f"{name}_{tool}"] = (f"{name}_{parent}", *pose)
+        settings = _side_by_side({name: robot._config for name, robot in robots.items()})
         still = {link: _matrix(pose) for link, pose in dict(fixed or {}).items()}
         first = next(iter(robots.values())).lower
         options: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
@@ -397,25 +387,41 @@ def _joint_vector(
 ) -> tuple[tuple[str, ...], dict[str, float]]:
     """Names of the joint vector, and where all other actuated joints stand."""
     chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
-    named = {name for name in chosen if name in model.joint}
-    columns: dict[str, None] = {}
-    for name in chosen:
-        fits = [name] if name in coordinates else _fitting(model, name)
-        columns |= dict.fromkeys(fit for fit in fits if fit == name or fit not in named)
-    fixed = {name: value for name, value in locked.items() if name in model.joint}
-    for name in locked.keys() - fixed.keys():
-        fits = [fit for fit in _fitting(model, name) if fit not in columns]
-        if not fits:
-            raise DataError(
-                f"locked has {name!r}, and all joints that it names are in the joint vector"
-            )
-        fixed = dict.fromkeys(fits, locked[name]) | fixed
+    columns = _columns_named(model, chosen, coordinates)
+    fixed = _locked(model, locked, columns)
     if joints is None:
         columns = {name: None for name in model.actuated if name not in fixed}
     columns |= dict.fromkeys(coordinates)
     _check_joints(model, columns, coordinates, fixed)
     still = (name for name in model.actuated if name not in columns)
     return tuple(columns), {name: float(fixed.get(name, 0.0)) for name in still}
+
+
+def _columns_named(
+    model: UrdfModel, names: Sequence[str], coordinates: Sequence[str]
+) -> dict[str, None]:
+    """The names, with the joints that fit the patterns among them in the place of each."""
+    named, columns = model.joint.keys() & names, dict[str, None]()
+    for name in names:
+        fits = [name] if name in coordinates else _fitting(model, name)
+        columns |= dict.fromkeys(fit for fit in fits if fit == name or fit not in named)
+    return columns
+
+
+def _locked(
+    model: UrdfModel, locked: Mapping[str, float], columns: Collection[str]
+) -> dict[str, float]:
+    """Where joints are locked; patterns stand for those that are neither named nor move."""
+    fixed = {name: value for name, value in locked.items() if name in model.joint}
+    for name in locked:
+        if name not in model.joint:
+            fits = [fit for fit in _fitting(model, name) if fit not in columns]
+            if not fits:
+                raise DataError(
+                    f"locked has {name!r}, and all joints that it names are in the joint vector"
+                )
+            fixed = dict.fromkeys(fits, locked[name]) | fixed
+    return fixed
 
 
 def _fitting(model: UrdfModel, name: str) -> list[str]:
@@ -491,6 +497,19 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
         if link not in places:
             raise UnknownNameError("link", link, "the URDF and the tools", places)
     return config["base"], [places[link] for link in config["links"]]
+
+
+def _side_by_side(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Settings of robots by name, which stands before the names of what is theirs."""
+    settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
+    settings |= {"locked": {}, "tools": {}}
+    for robot, config in configs.items():
+        for key in ("links", "joints", "coordinates"):
+            settings[key] += [f"{robot}_{name}" for name in config[key]]
+        settings["locked"] |= {f"{robot}_{name}": at for name, at in config["locked"].items()}
+        for tool, (parent, *pose) in config["tools"].items():
+            settings["tools"][f"{robot}_{tool}"] = f"{robot}_{parent}", *pose
+    return settings
 
 
 def _matrix(pose: Frame) -> Array:

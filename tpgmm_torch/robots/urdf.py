@@ -303,7 +303,7 @@ def _axis(element: ElementTree.Element) -> Array:
     return unit
 
 
-def _limits(element: ElementTree.Element) -> dict[str, float]:
+def _limits(element: ElementTree.Element) -> dict[str, Any]:
     """Range and rates; values that cannot be, as tools write -1 or 0, are no limits.
 
     Without a range ``<limit>`` gives effort and velocity alone.
@@ -343,16 +343,22 @@ def _numbers(
         return [*default]
     what = f"joint {element.get('name')!r}: <{tag} {attribute}>"
     shown = repr(text if len(text) <= 100 else f"{text[:100]} ...")
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        values = []
-    if len(values) != len(default) or not all(map(math.isfinite, values)):
+    values = _finite(text)
+    if len(values) != len(default):
         hint = f". {XACRO}" if "${" in text or "$(" in text else ""
         raise DataError(f"{what} needs {len(default)} finite number(s), got {shown}{hint}")
     if tag in ("origin", "mimic") and max(map(abs, values)) > LARGEST:
         raise DataError(f"{what} is {shown}, and no robot's is beyond {LARGEST:g}")
     return values
+
+
+def _finite(text: str) -> list[float]:
+    """The numbers of a text; none if something in it is no finite number."""
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        return []
+    return values if all(map(math.isfinite, values)) else []
 
 
 def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
