@@ -66,9 +66,9 @@ def test_units_that_the_data_set_declares_are_taken():
 
 def test_joints_alone_need_no_robot():
     made = config(n_environment=0)
-    kinematics, _ = adopt(made, dataset(20))
+    kinematics, operators = adopt(made, dataset(20))
     assert kinematics == JointSpace(NAMES)
-    assert made.decoded_operators() == [Canonical()]
+    assert operators == [Canonical()]
 
 
 @pytest.mark.parametrize(

@@ -440,7 +440,8 @@ class LocalizingProgress(WaitingProgress):
                 state = state[0]
                 shared = {name: f[0] if f.batch_shape else f for name, f in shared.items()}
         names = frozenset((*shared, *state.links))
-        return _Seen(self.skill.observed(names), state, shared)
+        skill = self.skill.observed(names)
+        return _Seen(skill and skill.of_robots(mask), state, shared)
 
     def _explains(self, place: Array, measured: Array, seen: _Seen) -> Flags:
         """Whether robots are near the references at some times (B,)."""

@@ -193,6 +193,15 @@ class Skill(Protocol):
         """
         return self
 
+    def of_robots(self, robots: Tensor) -> Skill:
+        """The skill for some robots of the batch.
+
+        Parameters
+        ----------
+        robots : Tensor of bool of the batch shape
+        """
+        return self
+
     def advance(self, estimate: Estimate) -> Skill:
         """The skill for the next tick, with what it remembers of its last estimate.
 

@@ -180,6 +180,12 @@ class Ways(Skill):
         ways = torch.tensor([one.way for one in self.choose(joints, frames)])
         return replace(self, chosen=ways.reshape(joints.shape[:-1]))
 
+    def of_robots(self, robots: Tensor) -> Self:
+        """See :meth:`Skill.of_robots`."""
+        if self.chosen is None or self.chosen.ndim == 0:
+            return self
+        return replace(self, chosen=self.chosen[robots])
+
     def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
         """The way for each robot, and why; each way is tried on a coarse grid of time.
 
