@@ -13,9 +13,8 @@ from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import (
-    Demonstration,
-)
+from tpgmm_torch import Demonstration
+from tpgmm_torch import rollout as reproduced
 
 NAMES = fitted().kinematics.joint_names
 POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
@@ -116,7 +115,8 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
     sent = json.loads(log.read_text())
     assert len(sent) >= 12 and list(sent[0]) == list(start)[:17]
     time = torch.arange(len(sent), dtype=torch.float64) / 20
-    [wanted] = small_bottle().predict(situations(observed, time), candidates=False)
+    given = situations(observed, time)
+    [wanted] = reproduced(small_bottle().skill, given, bounds="robot", blend=1.0)
     for index, name in enumerate(NAMES):
         moved = np.array([action[f"{name}.pos"] for action in sent])
         # later this coarse model makes much of the last bit in which followed frames differ
@@ -143,7 +143,8 @@ def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
     assert len(sent) >= 12
     moved = np.array([list(action.values()) for action in sent])
     time = torch.arange(100, dtype=torch.float64) / 20
-    [wanted] = small_bottle().predict(situations(observed, time), candidates=False)
+    given = situations(observed, time)
+    [wanted] = reproduced(small_bottle().skill, given, bounds="robot", blend=1.0)
     # whenever a chunk comes, it goes on from what was sent before
     step = np.abs(np.diff(moved, axis=0)).max()
     assert step < 2 * float(wanted.joints.diff(dim=0).abs().max())

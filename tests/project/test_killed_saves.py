@@ -14,7 +14,7 @@ from tests.support.kills import exit_code, forked, killed_between
 from tests.support.policies import changed, fitted
 from tests.support.written_sets import FPS, assert_same, demonstration
 from tpgmm_datasets import load_lerobot, save_lerobot
-from tpgmm_torch import atomic
+from tpgmm_torch import atomic, persistence
 from tpgmm_torch.persistence import load_model
 
 KILLS = 200 if FULL else 4
@@ -39,7 +39,7 @@ def test_models(tmp_path):
 
     def save(number):
         model.n_iter_, model.means_[0] = number, mean + number
-        save(model, path)
+        persistence.save(model, path)
 
     def load():
         found = load_model(path)
@@ -160,10 +160,10 @@ def test_who_reads_while_it_is_saved_has_the_old_or_the_new(tmp_path):
         while not enough.exists():
             number += 1
             model.n_iter_, model.means_[0] = number, mean + number
-            save(model, path)
+            persistence.save(model, path)
 
     model.n_iter_ = 0
-    save(model, path)
+    persistence.save(model, path)
     pid, seen = forked(save), set()
     while len(seen) < 5:  # however slowly either of them gets a processor
         found = load_model(path)
@@ -180,7 +180,7 @@ def test_savers_of_one_model_leave_a_whole_one(tmp_path):
     def save(number):
         model.n_iter_, model.means_[0] = number, mean + number
         for _ in range(10):
-            save(model, path)
+            persistence.save(model, path)
 
     pids = [forked(lambda number=number: save(number)) for number in range(4)]
     assert [exit_code(pid) for pid in pids] == [0] * 4
