@@ -46,7 +46,7 @@ def _by_last_part(
     targets = [node["reftarget"]]
     if node["reftype"] == "attr":
         targets.append(targets[0].rpartition(".")[0])  # fields are explained where classes are
-    found = {}
+    found: dict[str, Any] = {}
     while targets and not found:
         ending = f".{targets.pop(0)}"
         found = {
@@ -83,8 +83,18 @@ def _other_name(app: Sphinx, document: nodes.document) -> None:
                 document.ids[other] = signature
 
 
+def _module_of_value(app: Sphinx, module: str, name: str) -> str | None:
+    """The module that documents a value: it is not defined where its class is."""
+    value = sys.modules.get(module)
+    for part in name.split("."):
+        value = getattr(value, part, None)
+    code = hasattr(value, "__qualname__") or type(value).__module__ in ("builtins", "functools")
+    return None if code else module
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """What Sphinx calls."""
+    app.connect("viewcode-follow-imported", _module_of_value)
     app.connect("config-inited", _types, priority=100)  # before numpydoc
     app.connect("doctree-read", _other_name)
     app.connect("missing-reference", _by_last_part)
