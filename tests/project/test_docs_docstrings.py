@@ -30,10 +30,11 @@ ASKED_FOR = set(ERROR_MSGS) - set(LEFT_OUT)
 #: What most users meet first: each of these has an example.
 SHOWN = {
     "tpgmm_torch": (
-        "AbsoluteOrientation AbsolutePosition BlockGaussianMixture Canonical Demonstration "
+        "AbsoluteOrientation AbsolutePosition Canonical Demonstration "
         "Frame RelativeOrientation RelativePosition Robot.from_urdf "
         "Situation Stack TaskParameterizedGMM TaskParameterizedGMM.step"
     ),
+    "tpgmm_torch.mixture.block_gaussian_mixture": "BlockGaussianMixture",
     "tpgmm_torch.robots": "Kinematics Poses",
     "tpgmm_torch.alignment": "DynamicTimeWarping LinearTimeNormalization",
     "tpgmm_torch.gaussians": "condition information moment_match product",
