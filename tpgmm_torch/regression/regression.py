@@ -242,6 +242,10 @@ class Regression:
         """The same for all robots; see :meth:`Skill.start`."""
         return self
 
+    def of_robots(self, robots: Tensor) -> Regression:
+        """See :meth:`Skill.of_robots`."""
+        return self
+
     def advance(self, estimate: Estimate) -> Regression:
         """The same at all ticks; see :meth:`Skill.advance`."""
         return self
