@@ -18,14 +18,14 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.skills.skill import CompositeSkill, Skill
 
 __all__ = ["Sequence"]
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence(Skill):
+class Sequence(CompositeSkill):
     """Skills one after the other, mixed where one ends and the next begins.
 
     Parameters
@@ -59,16 +59,6 @@ class Sequence(Skill):
                 )
 
     @property
-    def kinematics(self) -> Kinematics:
-        """See :attr:`Skill.kinematics`."""
-        return self.skills[0].kinematics
-
-    @property
-    def begin(self) -> float:
-        """See :attr:`Skill.begin`."""
-        return self.skills[0].begin
-
-    @property
     def end(self) -> float:
         """See :attr:`Skill.end`."""
         return self.skills[-1].end
@@ -77,16 +67,6 @@ class Sequence(Skill):
     def time(self) -> Tensor:
         """See :attr:`Skill.time`."""
         return torch.cat([one.time for one in self.skills]).unique()
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """See :attr:`Skill.frame_names`."""
-        return tuple(dict.fromkeys(name for one in self.skills for name in one.frame_names))
-
-    @property
-    def carried_names(self) -> tuple[str, ...]:
-        """See :attr:`Skill.carried_names`."""
-        return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
 
     @property
     def holds(self) -> tuple[Hold, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -16,7 +16,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["Observation", "Skill"]
+__all__ = ["CompositeSkill", "Observation", "Skill"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,3 +211,36 @@ class Skill(Protocol):
             What :meth:`estimate` returned at this tick.
         """
         return self
+
+
+class CompositeSkill(Skill):
+    """A skill made of several others of one robot.
+
+    Attributes
+    ----------
+    skills : tuple of Skill
+    """
+
+    skills: tuple[Any, ...]
+
+    @property
+    def kinematics(self) -> Kinematics:
+        """See :attr:`Skill.kinematics`."""
+        kinematics: Kinematics = self.skills[0].kinematics
+        return kinematics
+
+    @property
+    def begin(self) -> float:
+        """See :attr:`Skill.begin`."""
+        begin: float = self.skills[0].begin
+        return begin
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.frame_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.frame_names))
+
+    @property
+    def carried_names(self) -> tuple[str, ...]:
+        """See :attr:`Skill.carried_names`."""
+        return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))

@@ -20,8 +20,8 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.skills.skill import Skill
+from tpgmm_torch.robots.kinematics import RobotState
+from tpgmm_torch.skills.skill import CompositeSkill
 
 __all__ = ["WayChoice", "Ways"]
 
@@ -62,7 +62,7 @@ class WayChoice:
 
 
 @dataclass(frozen=True, eq=False)
-class Ways(Skill):
+class Ways(CompositeSkill):
     """Several ways of one skill; each robot goes the likeliest in its situation.
 
     The mean of passing an obstacle on the left and on the right goes through it: each way is a
@@ -112,16 +112,6 @@ class Ways(Skill):
             object.__setattr__(self, name, value)
 
     @property
-    def kinematics(self) -> Kinematics:
-        """See :attr:`Skill.kinematics`."""
-        return self.skills[0].kinematics
-
-    @property
-    def begin(self) -> float:
-        """See :attr:`Skill.begin`."""
-        return self.skills[0].begin
-
-    @property
     def end(self) -> float:
         """See :attr:`Skill.end`; ways that last longer or shorter are played in that time."""
         return self.skills[0].end
@@ -132,16 +122,6 @@ class Ways(Skill):
         time = self.skills[0].time
         assert time is not None
         return time
-
-    @property
-    def frame_names(self) -> tuple[str, ...]:
-        """See :attr:`Skill.frame_names`."""
-        return tuple(dict.fromkeys(name for one in self.skills for name in one.frame_names))
-
-    @property
-    def carried_names(self) -> tuple[str, ...]:
-        """See :attr:`Skill.carried_names`."""
-        return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
 
     @property
     def holds(self) -> tuple[Hold, ...]:
