@@ -25,6 +25,7 @@ from tpgmm_torch import (
     Situation,
     Stack,
     TaskParameterizedGMM,
+    rollout,
 )
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.robots import Poses
@@ -155,7 +156,11 @@ def test_joints_in_two_operators_are_all_joints_where_these_are_independent():
     shown, start = waves(), Situation.of(waves()[0])
     pair = [Canonical(joints=["a"]), Canonical(joints=["[bc]"])]
     whole, parts = (
-        TaskParameterizedGMM(1, operators, covariance_type="diag").fit(shown).predict(start)[0]
+        rollout(
+            TaskParameterizedGMM(1, operators, covariance_type="diag").fit(shown).skill,
+            start,
+            blend=1.0,
+        )[0]
         for operators in ([Canonical()], pair)
     )
     torch.testing.assert_close(parts.joints, whole.joints, rtol=0, atol=2e-3)
