@@ -656,7 +656,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                     config or PreTrainedConfig.from_pretrained(folder, **options),
                 ),
             )
-        except (DecodingError, ParsingError) as error:
+        except (DecodingError, ParsingError, FileNotFoundError) as error:
             raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
         policy = cls(config, model=model, **options).eval().to(config.device)
         # a robot of LeRobot tells none of this to a policy: who starts it must compare

@@ -1,12 +1,21 @@
-"""The folder of a policy: LeRobot's configuration and processors, and a model's folder."""
+"""The folder of a policy: LeRobot's configuration and processors, and a model's folder.
+
+A file of digests says which of them were saved together: files of two saves, or one that was
+changed afterwards, are refused.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from lerobot.utils.constants import (
+    POLICY_POSTPROCESSOR_DEFAULT_NAME,
+    POLICY_PREPROCESSOR_DEFAULT_NAME,
+)
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
@@ -18,6 +27,14 @@ __all__ = ["PATTERNS", "read_model", "write_files"]
 
 #: Folder of the model, as :func:`tpgmm_torch.save` writes it.
 MODEL = "model"
+PROCESSORS = tuple(
+    f"{name}.json"
+    for name in (POLICY_PREPROCESSOR_DEFAULT_NAME, POLICY_POSTPROCESSOR_DEFAULT_NAME)
+)
+#: Of a step of a processor: lerobot-train writes these files again, on its device, with its
+#: names and statistics, so only what could change numbers counts.
+STEP = ("norm_map", "float_dtype")
+DIGESTS = "digests.json"
 #: Files of a policy, as the hub selects them.
 PATTERNS = ("*.json", *(f"{MODEL}/{name}" for name in FILES))
 
@@ -32,6 +49,43 @@ def write_files(config: TPGMMConfig, model: Any, directory: Path) -> None:
         config.save_pretrained(folder)
         for processor in make_tpgmm_pre_post_processors(config):
             processor.save_pretrained(folder)
+        digests = {name: _digest(folder / name) for name in _compared()}
+        (folder / DIGESTS).write_text(json.dumps(digests, indent=1))
+
+
+def _compared() -> tuple[str, ...]:
+    return (CONFIG_NAME, *PROCESSORS, f"{MODEL}/{CONFIG_NAME}")
+
+
+def _digest(file: Path) -> str:
+    """Of a whole file; of a processor's, of what could change numbers."""
+    try:
+        content = read_whole(file)
+        if file.name in PROCESSORS:
+            steps = [
+                [step["registry_name"], {k: step["config"].get(k) for k in STEP}]
+                for step in json.loads(content)["steps"]
+            ]
+            content = json.dumps(steps, sort_keys=True).encode()
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ModelFileError(f"{file} cannot be read: {error!r}") from error
+    return hashlib.sha256(content).hexdigest()
+
+
+def _check_digests(directory: Path) -> None:
+    """Refuse files that were not saved together, or were changed since."""
+    try:
+        digests = json.loads(read_whole(directory / DIGESTS))
+        expected = {name: digests[name] for name in _compared()}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ModelFileError(f"{directory / DIGESTS} cannot be read: {error!r}") from error
+    changed = [name for name in expected if _digest(directory / name) != expected[name]]
+    if changed:
+        raise ModelFileError(
+            f"{directory} holds files of different saves, or one was changed afterwards: "
+            f"{', '.join(changed)} is not what was saved. Save the policy again; settings are "
+            "changed when it is loaded, --policy.FIELD=VALUE"
+        )
 
 
 def read_model(directory: Path) -> Any:
@@ -49,7 +103,9 @@ def read_model(directory: Path) -> Any:
         except (OSError, ValueError, RecursionError) as error:
             raise ModelFileError(f"{config} cannot be read: {error!r}") from error
     if folder.is_dir():
-        return load(folder)
+        model = load(folder)
+        _check_digests(directory)
+        return model
     if config.exists() and (directory / SAFETENSORS_SINGLE_FILE).exists():
         raise ModelFileError(
             f"{directory} is a policy of release 0.1 or 0.2, which is not read any more: fit "

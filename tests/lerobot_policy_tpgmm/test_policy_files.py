@@ -20,6 +20,7 @@ from tpgmm_torch.persistence import load
 
 FILES = {
     "config.json",
+    "digests.json",
     "model/config.json",
     "model/model.safetensors",
     "policy_preprocessor.json",

@@ -17,7 +17,8 @@ from tests.support.skills import hands
 from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_datasets.situation_files import read_situations
-from tpgmm_torch import Demonstration, Robot, TaskParameterizedGMM
+from tpgmm_torch import Demonstration, Robot, save
+from tpgmm_torch import load as load_model
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import TPGMMError
 
@@ -50,7 +51,7 @@ def check_all(original, tmp_path, damages, seeds, load, check):
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "saved"
-    skills.save(hands(), path)
+    save(hands(), path)
     return path
 
 
@@ -70,7 +71,7 @@ def same_model(found):
 
 @pytest.mark.parametrize("seeds", blocks(200, 5000), ids=str)
 def test_models(model, tmp_path, seeds):
-    check_all(model, tmp_path, WITH_JSON, seeds, TaskParameterizedGMM.load, same_model)
+    check_all(model, tmp_path, WITH_JSON, seeds, load_model, same_model)
 
 
 # Policies
