@@ -95,11 +95,14 @@ def compare(
     grids = _grids(tasks, policies, demonstrations, seeds, conditions, say)
     for task in tasks:
         task.keep(out / task.env / "settings.json")
-    groups, finished = [], 0
-    for task, cells in zip(tasks, grids, strict=True):
-        results = Results(out / task.env / "cells")
-        pending = [cell for cell in cells if not _finished(results, cell, say)]
-        finished += len(cells) - len(pending)
+    left = [
+        [cell for cell in cells if not _finished(Results(out / task.env / "cells"), cell, say)]
+        for task, cells in zip(tasks, grids, strict=True)
+    ]
+    total = sum(map(len, grids))
+    say(f"{total} cells, {total - sum(map(len, left))} of them finished before")
+    groups = []
+    for task, cells, pending in zip(tasks, grids, left, strict=True):
         for seed in sorted({cell.seed for cell in pending}):
             say(f"{task.env}: episodes of seed {task.drawn(seed)} ...")
             record(out / task.env, task, max(cell.demonstrations for cell in cells), seed)
@@ -108,8 +111,6 @@ def compare(
             (out / task.env, task, list(same))
             for _, same in groupby(pending, key=lambda cell: cell.training)
         ]
-    total = sum(map(len, grids))
-    say(f"{total} cells, {finished} of them finished before")
     failures = _run(groups, workers, say)
     path = _report(out, failures, command, say)
     say(f"report and tables: {path}")
