@@ -100,7 +100,7 @@ def lint(demonstrations, robot=None):
 
 @cache
 def learned() -> TaskParameterizedGMM:
-    return bottle_model(4, tol=1e6, blend=0.5).fit(shown())
+    return bottle_model(4, tol=1e6).fit(shown())
 
 
 def usual() -> Situation:
@@ -109,7 +109,6 @@ def usual() -> Situation:
 
 
 def predict(situation):
-    learned().set_params(blend=0.5)
     return learned().predict([situation], candidates=False)
 
 
@@ -753,7 +752,7 @@ def one_demonstration_without_a_joint(_):
     learn(one(lambda d: Demonstration(d.time, d.joints[:, :-1], d.frames)))
 
 
-@mistake("shapes", r"predict takes .*Situation")
+@mistake("shapes", r"Situation objects, got Frame")
 def frames_for_situations(_):
     learned().predict([usual().frames["bottle"]])
 
@@ -841,7 +840,7 @@ def a_model_that_was_edited(folder):
     save(learned(), folder / "model")
     path = folder / "model" / "config.json"
     config = json.loads(path.read_text())
-    config["parameters"]["blend"] = 3.0
+    config["model"]["reg_covar"] = 3.0
     path.write_text(json.dumps(config))
     load_model(folder / "model")
 

@@ -178,9 +178,10 @@ def _check_alike(first: Demonstration | None, processes: Processes) -> None:
     texts = processes.gather(text)
     if "" in texts:
         without = [rank for rank, text in enumerate(texts) if not text]
-        where = f" in process(es) {without} of {processes.count}: each needs some"
+        where = f" in process(es) {without} of {processes.count}" if processes.count > 1 else ""
         raise DataError(
-            f"there are no demonstrations, X is empty{where if processes.count > 1 else ''}"
+            f"there are no demonstrations, X is empty{where}: "
+            "expected at least one demonstration"
         )
     for rank, other in enumerate(texts):
         if other != texts[0]:
