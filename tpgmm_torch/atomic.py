@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import re
 import shutil
 import stat
-import sys
-import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,14 +12,8 @@ from typing import BinaryIO
 
 __all__ = ["consistent", "open_whole", "read_whole", "recover", "replacing"]
 
-# How Linux and macOS let two names change places: <fcntl.h>, <linux/fs.h>, <sys/stdio.h>.
-AT_FDCWD, RENAME_EXCHANGE, RENAME_SWAP = -100, 2, 2
-
 #: How a file begins that stands for one which Git LFS has not fetched.
 POINTER = b"version https://git-lfs.github.com/spec/"
-
-#: How long a writer waits for another one of the same name [s].
-PATIENCE = 600.0
 
 
 @contextmanager
@@ -32,11 +21,10 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     """Write a file or a folder that takes the place of ``path`` when the block ends.
 
     It is written beside ``path``, brought to the disk, and moved there. If the block raises,
-    or the process dies wherever it is, ``path`` is what it was, or all that is new. (Where
-    the system or the file system cannot let two folders change places, one that dies in
-    between leaves the old one under another name, from which :func:`recover` brings it back.)
-    Writers of one path wait for each other, so what the block reads of the old is still the
-    old at its end; what others left who died is removed.
+    ``path`` is what it was. If the process dies, it is what it was, or all that is new; where
+    an old folder had been moved away and the new one was not there yet, :func:`recover`, which
+    readers call, puts it back. Writers of one path wait for each other, so what the block reads
+    of the old is still the old at its end.
 
     Parameters
     ----------
@@ -52,14 +40,13 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
 
     Raises
     ------
-    NotADirectoryError
-        If one of the folders above it is a file.
-    TimeoutError
-        If another process writes the same path for more than ten minutes.
+    OSError
+        If one of the folders above it is a file, or it cannot be written there.
 
     Examples
     --------
-    >>> with tempfile.TemporaryDirectory() as folder:
+    >>> from tempfile import TemporaryDirectory
+    >>> with TemporaryDirectory() as folder:
     ...     for text in ("old", "new"):
     ...         with replacing(Path(folder) / "notes.txt") as file:
     ...             written = file.write_text(text)
@@ -69,29 +56,26 @@ def replacing(path: str | Path, *, keep: bool = False) -> Iterator[Path]:
     path = Path(path)
     if path.name in ("", ".."):  # "." has no name of its own
         path = path.resolve()
-    made = [folder for folder in path.parents if not folder.exists()]
-    if (there := path.parents[len(made)]).is_file():
-        raise NotADirectoryError(f"{path} cannot be written: {there} is a file, not a folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     with _alone(path):
-        _recover(path)
-        for left in _left(path, "new"):
-            shutil.rmtree(left, ignore_errors=True)
-        with tempfile.TemporaryDirectory(
-            prefix=f".{path.name}.", suffix=".new", dir=path.parent, ignore_cleanup_errors=True
-        ) as folder:
-            new = Path(folder) / path.name
+        _put_back(path)
+        folder = _beside(path, "new")
+        shutil.rmtree(folder, ignore_errors=True)  # of a writer that died
+        folder.mkdir()
+        new = folder / path.name
+        try:
             yield new
             if keep and path.is_dir():
                 _take_over(path, new)
             for item in [*new.rglob("*"), new]:
                 _synchronize(item)
-            if new.is_dir() and path.exists():
-                _exchange(new, path)
-            else:
-                new.replace(path)
-            for changed in (path.parent, *(folder.parent for folder in made)):
-                _synchronize(changed)
+            if new.is_dir() and path.exists():  # a folder replaces none that has files
+                path.rename(_beside(path, "previous"))
+            new.replace(path)
+            _synchronize(path.parent)
+        finally:
+            _put_back(path)
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def recover(path: str | Path) -> None:
@@ -103,9 +87,9 @@ def recover(path: str | Path) -> None:
         What is to be read; where it is there, nothing is done.
     """
     path = Path(path)
-    if not path.exists() and _left(path, "previous"):
+    if not path.exists() and _beside(path, "previous").exists():
         with _alone(path):
-            _recover(path)
+            _put_back(path)
 
 
 @contextmanager
@@ -182,20 +166,18 @@ def read_whole(path: str | Path) -> bytes:
         return file.read()
 
 
-def _left(path: Path, kind: str) -> list[Path]:
-    """Folders beside ``path`` that processes left when they died: "new" or "previous"."""
-    name = re.compile(rf"\.{re.escape(path.name)}\.[a-z0-9_]{{8}}\.{kind}")
-    with suppress(OSError):
-        return sorted(item for item in path.parent.iterdir() if name.fullmatch(item.name))
-    return []
+def _beside(path: Path, kind: str) -> Path:
+    """Where the "new", the "previous" or the "lock" of ``path`` is."""
+    return path.with_name(f".{path.name}.{kind}")
 
 
-def _recover(path: Path) -> None:
-    for previous in _left(path, "previous"):
-        if path.exists():  # the new one came after it
-            shutil.rmtree(previous, ignore_errors=True)
-        else:
-            previous.rename(path)
+def _put_back(path: Path) -> None:
+    """Let the previous folder go, or put it back where no new one took its place."""
+    previous = _beside(path, "previous")
+    if path.exists():
+        shutil.rmtree(previous, ignore_errors=True)
+    elif previous.exists():
+        previous.rename(path)
 
 
 @contextmanager
@@ -206,23 +188,12 @@ def _alone(path: Path) -> Iterator[None]:
     except ImportError:  # on Windows, where nothing can be renamed that is in use
         yield
         return
-    lock, until = path.with_name(f".{path.name}.lock"), time.monotonic() + PATIENCE
+    lock = _beside(path, "lock")
     while True:
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # the one before may have removed the file that was opened
-            if lock.exists() and os.path.samestat(os.fstat(descriptor), lock.stat()):
-                break
-        except BlockingIOError:
-            if time.monotonic() > until:
-                raise TimeoutError(
-                    f"another process writes {path} (it holds {lock}): wait until it is done"
-                ) from None
-            time.sleep(0.02)
-        except FileNotFoundError:
-            pass
-        except OSError:  # a file system without locks
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if os.fstat(descriptor).st_nlink:  # else the writer before has removed this file
             break
         os.close(descriptor)
     try:
@@ -254,31 +225,3 @@ def _synchronize(path: Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-
-def _exchange(new: Path, path: Path) -> None:
-    """Put ``new`` in the place of ``path``; what was there is removed, or is ``new`` then."""
-    if _swap(new, path):
-        return
-    previous = new.parent.with_suffix(".previous")
-    path.rename(previous)
-    try:
-        new.rename(path)
-    except BaseException:
-        previous.rename(path)
-        raise
-    shutil.rmtree(previous, ignore_errors=True)
-
-
-def _swap(one: Path, other: Path) -> bool:
-    """Let two names change places in one step; False where that cannot be."""
-    names = os.fsencode(one), os.fsencode(other)
-    try:
-        library = ctypes.CDLL(None, use_errno=True)
-        if sys.platform == "darwin":
-            failed = library.renamex_np(*names, RENAME_SWAP)
-        else:
-            failed = library.renameat2(AT_FDCWD, names[0], AT_FDCWD, names[1], RENAME_EXCHANGE)
-    except (AttributeError, OSError, TypeError):  # the C library has no such function
-        return False
-    return not failed

@@ -8,20 +8,23 @@ not fit together.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections import abc
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.torch
+from safetensors import SafetensorError
 from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
-from tpgmm_torch.atomic import read_whole
+from tpgmm_torch.atomic import consistent, read_whole, replacing
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -32,19 +35,20 @@ from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.joint_space import JointSpace
+from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.skills.sequence import Sequence
 from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.skills.via_points import ViaPoints
 from tpgmm_torch.skills.ways import Ways
-from tpgmm_torch.storage import CONFIG, Folder
 
 __all__ = ["FILES", "decode", "encode", "load", "load_model", "load_skill", "save"]
 
-#: Files of a model; version 1 was written up to 0.2.
-MODEL = Folder("model", 2)
-FILES = CONFIG, MODEL.tensors
+#: Files of a model.
+FILES = CONFIG, TENSORS = "config.json", "model.safetensors"
+#: Version 1 was written up to 0.2.
+FORMAT = {"format": "tpgmm-torch model", "version": 2}
 OPERATORS = (getattr(builtin_operators, name) for name in builtin_operators.__all__)
 KNOWN: dict[str, type] = {
     each.__name__: each
@@ -76,9 +80,43 @@ def save(model: Any, path: str | Path) -> None:
         If something else is there, or the model has parts that cannot be described: a robot of
         your own needs ``config()`` and a classmethod ``from_config()``.
     """
-    tensors: dict[str, Tensor] = {}
-    description = encode(model, tensors)
-    MODEL.write(path, {"model": description}, tensors)
+    path, tensors = Path(path), dict[str, Tensor]()
+    config = FORMAT | {"model": encode(model, tensors)}
+    blob = safetensors.torch.save(
+        {name: each.detach().cpu().contiguous() for name, each in tensors.items()}
+    )
+    config["tensors_sha256"] = hashlib.sha256(blob).hexdigest()
+    config["digest"] = _digest(config)
+    with replacing(path) as new:
+        if path.exists() and not _replaceable(path):
+            raise ModelFileError(
+                f"{path} exists and is not a saved model alone; choose another directory"
+            )
+        new.mkdir()
+        (new / CONFIG).write_text(json.dumps(config, indent=1, allow_nan=False))
+        (new / TENSORS).write_bytes(blob)
+
+
+def _replaceable(path: Path) -> bool:
+    """Whether nothing but a model, or nothing at all, is lost by replacing what is there."""
+    if not path.is_dir() or {item.name for item in path.iterdir()} - set(FILES):
+        return False
+    try:
+        return bool(json.loads(read_whole(path / CONFIG))["format"] == FORMAT["format"])
+    except FileNotFoundError:
+        return not any(path.iterdir())
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return False
+
+
+def _digest(config: Mapping[str, Any]) -> str:
+    """Of a configuration without its own digest; empty if it is not of JSON's values."""
+    body = {key: value for key, value in config.items() if key != "digest"}
+    try:
+        text = json.dumps(body, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError, RecursionError):
+        return ""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None = None) -> Any:
@@ -102,15 +140,45 @@ def load(path: str | Path, custom: abc.Sequence[type] = (), device: str | None =
         If the folder is missing, damaged, of another version, or does not fit together.
     """
     path = Path(path)
-    _refuse_others(path)
-    config, tensors = MODEL.read(path)
+    config, tensors = consistent(path, lambda: _read(path))
     try:
-        model = decode(config["model"], custom, _on_device(tensors, device, path))
-    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        if isinstance(error, ModelFileError):
-            raise
-        raise ModelFileError(f"{path} does not fit together: {error}") from error
-    return model
+        on_device = {name: tensor.to(device) for name, tensor in tensors.items()}
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ModelFileError(
+            f"{path} cannot be loaded onto the device {device!r}: "
+            f'{str(error).partition(chr(10))[0]}. Use load(path, device="cpu")'
+        ) from error
+    return decode(config["model"], custom, on_device)
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Configuration and tensors of a folder, of which nothing was cut off or changed."""
+    config = _parsed(path / CONFIG, json.loads)
+    if not isinstance(config, dict) or config.get("format") != FORMAT["format"]:
+        raise ModelFileError(
+            f"{path / CONFIG} describes no model; a LeRobot policy is loaded with "
+            "TPGMMPolicy.from_pretrained(path)"
+        )
+    if config.get("version") != FORMAT["version"]:
+        raise ModelFileError(
+            f"{path} has format version {config.get('version')!r}, this release reads "
+            f"{FORMAT['version']}: load it with the release that wrote it, or fit again"
+        )
+    if config.get("digest") != (_digest(config) or None):
+        raise ModelFileError(f"{path / CONFIG} was changed after it was saved")
+    blob = _parsed(path / TENSORS, bytes)
+    if config.get("tensors_sha256") != hashlib.sha256(blob).hexdigest():
+        raise ModelFileError(f"{path / TENSORS} was cut off or changed after it was saved")
+    return config, _parsed(path / TENSORS, safetensors.torch.load)
+
+
+def _parsed[T](file: Path, parse: Callable[[bytes], T]) -> T:
+    try:
+        return parse(read_whole(file))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ModelFileError(f"{file.parent} is not a saved model: {file} is missing") from None
+    except (SafetensorError, KeyError, ValueError, OSError, RecursionError, MemoryError) as e:
+        raise ModelFileError(f"{file} cannot be read: {e}") from e
 
 
 def load_model(
@@ -170,12 +238,10 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
     >>> encode(RelativePosition("hand", "cup"))
     {'type': 'RelativePosition', 'link': 'hand', 'frame': 'cup', 'held': False, ...}
     """
-    if isinstance(thing, np.generic):
-        thing = thing.item()
-    if thing is None or isinstance(thing, str | bool | int):
+    if isinstance(thing, float) and not math.isfinite(thing):
+        return {"float": repr(float(thing))}
+    if isinstance(thing, str | bool | int | float | None):
         return thing
-    if isinstance(thing, float):
-        return thing if math.isfinite(thing) else {"float": repr(thing)}
     if isinstance(thing, abc.Sequence | np.ndarray):
         return [encode(each, tensors) for each in thing]
     if isinstance(thing, Mapping):
@@ -184,11 +250,21 @@ def encode(thing: Any, tensors: dict[str, Tensor] | None = None) -> Any:
         name = f"{len(tensors):04d}"
         tensors[name] = thing
         return {"tensor": name}
+    return _described(thing, tensors)
+
+
+def _described(thing: Any, tensors: dict[str, Tensor] | None) -> Any:
+    """An object as the name of its class and its fields."""
+    if isinstance(thing, np.generic):
+        return encode(thing.item())
     name = type(thing).__name__
     if KNOWN.get(name, type(thing)) is not type(thing):
         raise ModelFileError(f"your class {name} has the name of a built-in one: rename it")
     if hasattr(thing, "config"):
-        return {"type": name, "config": thing.config()}
+        given = {"config": thing.config()}
+        if not _digest(given):
+            raise ModelFileError(f"config() of {name} gives more than JSON's values: {given}")
+        return {"type": name} | given
     return {"type": name} | {key: encode(each, tensors) for key, each in _parts(thing).items()}
 
 
@@ -246,80 +322,66 @@ def decode(
     ModelFileError
         If a class is not known or does not take these fields.
     """
+    try:
+        return _decoded(description, custom, tensors or {})
+    except ModelFileError:
+        raise
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ModelFileError(f"the model does not fit together: {error!r}") from error
+
+
+def _decoded(
+    description: Any, custom: abc.Sequence[type], tensors: Mapping[str, Tensor]
+) -> Any:
     if isinstance(description, list):
-        return tuple(decode(each, custom, tensors) for each in description)
+        return tuple(_decoded(each, custom, tensors) for each in description)
     if not isinstance(description, Mapping):
         return description
     if "float" in description:
         return float(description["float"])
     if "tensor" in description:
-        return (tensors or {})[description["tensor"]]
-    if "mapping" in description:
-        return {k: decode(each, custom, tensors) for k, each in description["mapping"].items()}
-    known = KNOWN | {cls.__name__: cls for cls in custom}
-    arguments = dict(description)
-    name = arguments.pop("type", None)
+        return tensors[description["tensor"]]
+    if "config" in description:  # of a class, which reads it itself
+        return _rebuilt(dict(description), custom)
+    fields = description.get("mapping", description)
+    given = {key: _decoded(each, custom, tensors) for key, each in fields.items()}
+    return given if "mapping" in description else _rebuilt(given, custom)
+
+
+def _rebuilt(given: dict[str, Any], custom: abc.Sequence[type]) -> Any:
+    """An object of its class's name and its fields."""
+    known = KNOWN | {kind.__name__: kind for kind in custom}
+    name = given.pop("type", None)
     if name not in known:
         raise ModelFileError(
             f"the model uses the class {name!r}, which is not known here: pass it, "
             f"load(path, custom=[{name}]); known are {sorted(known)}"
         )
     kind: Any = known[name]
-    try:
-        if kind is TrainingSummary:
-            return partial(TrainingSummary.from_config, arguments["config"])
-        if "config" in arguments:
-            return kind.from_config(arguments["config"])
-        given = {key: decode(each, custom, tensors) for key, each in arguments.items()}
-        if kind is Stack:
-            return Stack(*given["operators"])
-        if (summary := given.get("summary")) is not None:  # which needs the robot
-            given["summary"] = summary(given.get("robot") or given["kinematics"])
-        if kind is TaskParameterizedGMM:
-            given["device"] = str(given["time"].device)
-            learning = given.pop("learning")
-            model = TaskParameterizedGMM.from_parameters(**given)
-            for each in LEARNING:
-                setattr(model, each, learning[each])
-            return model
-        if kind is Regression:
-            given["kinematics"] = given["kinematics"].to(device=given["time"].device)
-        return kind(**given)
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
-        if isinstance(error, ModelFileError):
-            raise
-        raise ModelFileError(f"the model's {name} cannot be rebuilt: {error}") from error
+    if kind is TrainingSummary:  # it needs the robot of its model
+        return partial(kind.from_config, given["config"])
+    if "config" in given:
+        return kind.from_config(given["config"])
+    if (summary := given.get("summary")) is not None:
+        given["summary"] = summary(given.get("robot") or given["kinematics"])
+    return REBUILT.get(kind, kind)(**given)
 
 
-def _refuse_others(path: Path) -> None:
-    """Say what a folder is that people take for a model's."""
-    if (path / "modes").is_dir():
-        raise ModelFileError(
-            f"{path} is a model of several ways of version 0.2, which is not read any more: "
-            "fit it again, and save Ways"
-        )
-    try:
-        kind = json.loads(read_whole(path / CONFIG)).get("type")
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return
-    if kind == "tpgmm":
-        raise ModelFileError(
-            f"{path} is a LeRobot policy, not a model: load it with "
-            "TPGMMPolicy.from_pretrained(path)"
-        )
+def _estimator(learning: Mapping[str, Any], **given: Any) -> TaskParameterizedGMM:
+    given["device"] = str(given["time"].device)
+    model = TaskParameterizedGMM.from_parameters(**given)
+    for name in LEARNING:
+        setattr(model, name, learning[name])
+    return model
 
 
-def _on_device(
-    tensors: Mapping[str, Tensor], device: str | None, path: Path
-) -> Mapping[str, Tensor]:
-    """The tensors of a file on a device, which may be one of another machine."""
-    if device is None:
-        return tensors
-    try:
-        return {name: tensor.to(device) for name, tensor in tensors.items()}
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).partition("\n")[0]
-        raise ModelFileError(
-            f"{path} cannot be loaded onto the device {device!r}, which is not there "
-            f'({reason}): use load(path, device="cpu")'
-        ) from error
+def _regression(kinematics: Kinematics, time: Tensor, **given: Any) -> Regression:
+    return Regression(kinematics.to(device=time.device), time=time, **given)
+
+
+#: How classes are made that do not take their fields as they are.
+REBUILT: dict[type, Callable[..., Any]] = {
+    Stack: lambda operators: Stack(*operators),
+    TaskParameterizedGMM: _estimator,
+    Regression: _regression,
+}

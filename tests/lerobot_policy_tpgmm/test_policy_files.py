@@ -50,7 +50,7 @@ def test_the_directory_contains_a_model_in_its_own_format(saved):
     model = load(saved / "model")
     same(model, small_bottle(), 0)
     assert model.kinematics_ == small_bottle().kinematics_
-    with pytest.raises(ModelFileError, match="is a LeRobot policy"):
+    with pytest.raises(ModelFileError, match="a LeRobot policy"):
         load(saved)
 
 

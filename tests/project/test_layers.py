@@ -24,7 +24,6 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
         ("exceptions",),
         ("atomic", "constraints", "quaternions", "gaussians", "notebook"),
-        ("storage",),
         ("data",),
         ("robots", "alignment", "mixture"),
         ("operators", "impedance"),
