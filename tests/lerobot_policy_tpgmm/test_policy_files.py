@@ -192,7 +192,7 @@ def test_a_folder_that_is_not_there_is_not_looked_up_on_the_hub(tmp_path):
 
 
 def test_the_old_one_is_found_again_where_a_save_died_between_two_renames(directory):
-    directory.rename(directory.with_name(".policy.abcdefgh.previous"))
+    directory.rename(directory.with_name(".policy.previous"))
     assert TPGMMPolicy.from_pretrained(directory).config == fitted().config
 
 
