@@ -368,8 +368,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         if self._untried:  # wrong units are there from the first tick on: others cost nothing
             self._untried = False
             joints = state.joints if isinstance(state, RobotState) else state
-            at, summary = self.time_, skill.summary
-            check_situations(joints, known, now, kinematics, at, summary).act()
+            summaries = [] if self.summary_ is None else [self.summary_]
+            check_situations(joints, known, now, kinematics, self.time_, summaries).act()
         bounds = kinematics.lower, kinematics.upper
         return skill.estimate(now, state, known, bounds, candidates=candidates)
 

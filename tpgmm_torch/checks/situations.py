@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from torch import Tensor
@@ -26,7 +26,7 @@ def check_situations(
     times: Tensor,
     kinematics: Kinematics,
     learned: Tensor,
-    summary: TrainingSummary | None = None,
+    summaries: Sequence[TrainingSummary] = (),
 ) -> Report:
     """Check where robots and objects are when a skill begins, or goes on.
 
@@ -45,31 +45,24 @@ def check_situations(
     kinematics : Kinematics
     learned : Tensor of shape (T,)
         The model's time grid [s].
-    summary : TrainingSummary, optional
-        Of the demonstrations.
+    summaries : sequence of TrainingSummary, optional
+        Of the demonstrations; of several ways of a skill the nearest one counts.
     """
-    begin, end = float(learned[0]), float(learned[-1])
-    first, last = float(times.min()), float(times.max())
-    findings = []
-    if first < 2 * begin - end or last > 2 * end - begin:
-        message = (
-            f"references are wanted from {first:.4g} to {last:.4g} s, the skill goes from "
-            f"{begin:.4g} to {end:.4g} s"
-        )
-        remedy = (
-            "Is time in seconds, and from the same zero? Without one the skill's own is used"
-        )
-        findings.append(Finding("time", message, remedy, value=last))
-    poses = dict(frames)
-    batch = np.broadcast_shapes(joints.shape[:-1], *(f.batch_shape for f in poses.values()))
+    findings = list(_time(times, learned))
+    batch = np.broadcast_shapes(
+        joints.shape[:-1], *(frame.batch_shape for frame in frames.values())
+    )
     rows = joints.expand(*batch, kinematics.n_joints)
     values, lower, upper = map(as_array, (rows, kinematics.lower, kinematics.upper))
     excess = np.maximum(lower - values, values - upper)
-    starts = rows if first <= begin + START * (end - begin) else None
-    novelty = np.zeros(batch) if summary is None else summary.novelty(starts, poses)
-    worst = np.unravel_index(
-        int(np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelty).argmax()), batch
-    )
+    begin, end = float(learned[0]), float(learned[-1])
+    starts = rows if float(times.min()) <= begin + START * (end - begin) else None
+    novelties = np.zeros((1, *batch))
+    if summaries:
+        each = [one.novelty(starts, frames) for one in summaries]
+        novelties = np.stack(np.broadcast_arrays(*each, novelties[0])[:-1])
+    unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelties.min(axis=0))
+    worst = np.unravel_index(int(unlike.argmax()), batch)
     label = f"situation {worst[0]}, " if len(batch) == 1 and batch[0] > 1 else ""
     joint = int(excess[worst].argmax())
     name, value = kinematics.joint_names[joint], values[*worst, joint]
@@ -80,9 +73,23 @@ def check_situations(
         )
         remedy = "Is the posture in degrees? Convert all of it (np.deg2rad)"
         findings.append(Finding("units", message, remedy, (name,), impossible=True))
-    elif summary is not None:
-        here = {name: frame.expand(batch)[worst] for name, frame in poses.items()}
-        start = None if starts is None else starts[worst]
-        findings += summary.findings(start, here, label)
-    subject = f"{batch[0]} situations" if label else "the situation"
-    return Report.of(findings, subject)
+    elif summaries:
+        here = {name: frame.expand(batch)[worst] for name, frame in frames.items()}
+        nearest = summaries[int(np.argmin([one[worst] for one in novelties]))]
+        findings += nearest.findings(None if starts is None else starts[worst], here, label)
+    return Report.of(findings, f"{batch[0]} situations" if label else "the situation")
+
+
+def _time(times: Tensor, learned: Tensor) -> Iterator[Finding]:
+    """Times that lie before or after the skill by more than it lasts."""
+    begin, end = float(learned[0]), float(learned[-1])
+    first, last = float(times.min()), float(times.max())
+    if first < 2 * begin - end or last > 2 * end - begin:
+        message = (
+            f"references are wanted from {first:.4g} to {last:.4g} s, the skill goes from "
+            f"{begin:.4g} to {end:.4g} s"
+        )
+        remedy = (
+            "Is time in seconds, and from the same zero? Without one the skill's own is used"
+        )
+        yield Finding("time", message, remedy, value=last)

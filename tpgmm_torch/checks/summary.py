@@ -11,7 +11,7 @@ import torch
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, listed
-from tpgmm_torch.checks.training import EpisodeSummary
+from tpgmm_torch.checks.training import EpisodeSummary, PathSummary
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import quaternion_groups
@@ -24,9 +24,10 @@ __all__ = ["ALIKE", "FrameSummary", "Region", "TrainingSummary"]
 ALIKE = {"start": 0.02, "place": 0.01, "turn": 0.05}
 #: Of fewer demonstrations the spread is not known, and taken for this standard deviation.
 FEWEST, SPREAD = 3, {"start": 0.2, "place": 0.05, "turn": float(np.deg2rad(20.0))}
-#: The distance of the furthest of demonstrations that hardly differ is at least this (1 is the
-#: edge of their region).
-SMALLEST_LIMIT = 0.5
+#: The unit of novelty is the distance of the furthest demonstration (1 is the edge of the
+#: region of the others), but at least and at most this: demonstrations that hardly differ, and
+#: one that is unlike the others, say little of how far new situations may be.
+LIMITS = 0.5, 2.0
 #: So many demonstrations, evenly chosen, are left out one at a time: more take long.
 MOST_LEFT_OUT = 200
 #: A situation is unlikely beyond this novelty: of generated situations like the demonstrations,
@@ -50,6 +51,13 @@ class Region:
 
     mean: Sequence[float]
     covariance: Sequence[Sequence[float]]
+
+    def __post_init__(self) -> None:
+        d = len(self.mean)
+        _check_numbers(self, mean=(d,), covariance=(d, d) if d else (0,))
+        matrix = np.reshape(self.covariance, (d, d))
+        if d and (not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] <= 0):
+            raise DataError("a covariance is not symmetric and positive definite")
 
     @classmethod
     def of(cls, vectors: Array, kind: str, fewest: int = FEWEST) -> Self:
@@ -113,12 +121,44 @@ class FrameSummary:
     moves: bool = False
     link: str | None = None
 
+    def __post_init__(self) -> None:
+        _check_numbers(self, low=(3,), high=(3,), orientation=(4,), angle=())
+        if not len(self.place.mean) == len(self.turn.mean) == 3 or type(self.moves) is not bool:
+            raise DataError("a frame has a place and a turn of 3 numbers, and moves or not")
+
+    @classmethod
+    def of(cls, paths: Sequence[PathSummary], links: Mapping[str, Frame]) -> Self:
+        """Summarise the poses of a frame in all demonstrations.
+
+        Parameters
+        ----------
+        paths : sequence of PathSummary
+            One of each demonstration.
+        links : mapping of str to Frame
+            Poses of the robot's links at their starts.
+        """
+        first = _first_poses(paths)
+        places, turns = as_array(first.position), as_array(first.orientation)
+        # the eigenvector of sum q q^T: F. L. Markley et al., Averaging Quaternions,
+        # Journal of Guidance, Control, and Dynamics 30 (2007), eq. (12)
+        mean = np.linalg.eigh(turns.T @ turns)[1][:, -1]
+        rotations = _rotation_vectors(mean, turns)
+        fixed = not any(path.recorded for path in paths)
+        same = [name for name, pose in links.items() if fixed and _same(pose, first)]
+        return cls(
+            np.min([path.low for path in paths], axis=0).tolist(),
+            np.max([path.high for path in paths], axis=0).tolist(),
+            mean.tolist(),
+            float(np.linalg.norm(rotations, axis=-1).max()),
+            Region.of(places, "place"),
+            Region.of(rotations, "turn"),
+            any(path.moves for path in paths),
+            same[0] if same else None,
+        )
+
     def rotation_vectors(self, orientations: Array) -> Array:
         """Rotation vectors [rad] from the mean to orientations (..., 4), the shorter way."""
-        mean = torch.tensor(self.orientation, dtype=torch.float64)
-        given = torch.from_numpy(np.array(orientations))
-        turns = quaternions.product(quaternions.conjugate(mean), given)
-        return as_array(quaternions.log(turns))
+        return _rotation_vectors(np.array(self.orientation), orientations)
 
 
 @dataclass(frozen=True)
@@ -136,7 +176,8 @@ class TrainingSummary:
     start : Region
         Of the compared joints of start postures [rad or m].
     limit : float
-        The largest distance of a demonstration from the others: the unit of novelty.
+        The largest distance of a demonstration from the others, within 0.5 and 2: the unit of
+        novelty.
     frames : mapping of str to FrameSummary
     events : mapping of str to float
         Median times of events that all demonstrations have, as shares of the duration.
@@ -158,6 +199,24 @@ class TrainingSummary:
             f"frames={sorted(self.frames)})"
         )
 
+    def __post_init__(self) -> None:
+        n, count = len(self.joint_names), self.n_demonstrations
+        compared = [j for j in self.compared if type(j) is int and 0 <= j < n]
+        _check_numbers(
+            self,
+            n_demonstrations=(),
+            limit=(),
+            start_low=(n,),
+            start_high=(n,),
+            compared=(len({*compared}),),
+        )
+        if type(count) is not int or count < 1 or self.limit <= 0:
+            raise DataError(f"there are {count} demonstrations, and the limit is {self.limit}")
+        if len(self.start.mean) != len(compared):
+            raise DataError(f"{len(self.start.mean)} joints are compared, not {len(compared)}")
+        if not all(0 <= at <= 1 for at in self.events.values()):
+            raise DataError(f"events are shares of the duration, got {self.events}")
+
     @classmethod
     def of(cls, episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Self:
         """Summarise demonstrations.
@@ -174,45 +233,26 @@ class TrainingSummary:
         angular = {i for s in kinematics.quaternion_starts for i in range(s, s + 4)}
         angular |= {i for group in quaternion_groups(kinematics.joint_names) for i in group}
         compared = [i for i in range(kinematics.n_joints) if i not in angular]
-        vectors = {("start", ""): starts[:, compared]}
-        frames = {}
+        vectors, frames = [("start", starts[:, compared])], dict[str, FrameSummary]()
         for name in episodes[0].frames:
             paths = [episode.frames[name] for episode in episodes]
-            places = np.stack([path.position for path in paths])
-            turns = np.stack([path.orientation for path in paths])
-            # the eigenvector of sum q q^T: F. L. Markley et al., Averaging Quaternions,
-            # Journal of Guidance, Control, and Dynamics 30 (2007), eq. (12)
-            mean = np.linalg.eigh(turns.T @ turns)[1][:, -1]
-            place = Region.of(places, "place")
-            bare = FrameSummary([], [], mean.tolist(), 0.0, place, place)
-            rotations = bare.rotation_vectors(turns)
-            vectors["place", name], vectors["turn", name] = places, rotations
-            first = Frame(places, turns)
-            fixed = not any(path.recorded for path in paths)
-            same = [n for n, pose in links.items() if fixed and _same(pose, first)]
-            frames[name] = FrameSummary(
-                np.min([path.low for path in paths], axis=0).tolist(),
-                np.max([path.high for path in paths], axis=0).tolist(),
-                bare.orientation,
-                float(np.linalg.norm(rotations, axis=-1).max()),
-                place,
-                Region.of(rotations, "turn"),
-                any(path.moves for path in paths),
-                same[0] if same else None,
-            )
+            first, frames[name] = _first_poses(paths), FrameSummary.of(paths, links)
+            rotations = frames[name].rotation_vectors(as_array(first.orientation))
+            vectors += [("place", as_array(first.position)), ("turn", rotations)]
+        common = set.intersection(*(set(episode.events) for episode in episodes))
         return cls(
             len(episodes),
             tuple(kinematics.joint_names),
             starts.min(axis=0).tolist(),
             starts.max(axis=0).tolist(),
             compared,
-            Region.of(vectors["start", ""], "start"),
+            Region.of(starts[:, compared], "start"),
             _largest_distance(vectors),
             frames,
             {
                 name: float(np.median([episode.events[name] for episode in episodes]))
                 for name in episodes[0].events
-                if all(name in episode.events for episode in episodes)
+                if name in common
             },
         )
 
@@ -221,7 +261,8 @@ class TrainingSummary:
 
         It is the 4-norm of the distances of the start posture, of each frame's position and of
         each frame's orientation from their regions, there where the skill begins, divided by
-        ``limit``, the largest such distance of a demonstration from the region of the others.
+        ``limit``, the largest such distance of a demonstration from the region of the others,
+        within 0.5 and 2: one that is unlike the others does not make all situations likely.
         Of N + 1 situations of one kind the new one is the furthest with the chance 1 / (N + 1):
         about so often, or less, novelty is above 1 for what is like the demonstrations.
 
@@ -288,26 +329,26 @@ class TrainingSummary:
             Empty where the novelty is at most 1.5.
         """
         distances = self._distances(joints, frames)
-        if not _joined(distances.values()) / self.limit > UNLIKELY:
-            return []
         ratios = {key: float(value) / self.limit for key, value in distances.items()}
+        if not _joined(distances.values()) > UNLIKELY * self.limit:
+            return []
         least = min(UNLIKELY, max(ratios.values()))
         describe = {"start": self._start, "place": self._place, "turn": self._turn}
-        return [
-            Finding(kind, f"{label}{message}", remedy, names or (name,), value=ratio)
-            for (kind, name), ratio in ratios.items()
-            if ratio >= least
-            for message, remedy, names in [describe[kind](name, joints, frames.get(name))]
-        ]
+        found = []
+        for (kind, name), ratio in ratios.items():
+            if ratio >= least:
+                value = joints if kind == "start" else frames[name]
+                message, remedy, names = describe[kind](name, value)
+                text = f"{label}{message}"
+                found.append(Finding(kind, text, remedy, names or (name,), value=ratio))
+        return found
 
     def config(self) -> dict[str, Any]:
         """All of it, ready for JSON."""
         return asdict(self) | {"joint_names": list(self.joint_names)}
 
     @classmethod
-    def from_config(
-        cls, config: Mapping[str, Any], kinematics: Kinematics | None = None
-    ) -> Self:
+    def from_config(cls, config: Mapping[str, Any], kinematics: Kinematics) -> Self:
         """The inverse of :meth:`config`, for a model of these kinematics.
 
         Raises
@@ -324,11 +365,15 @@ class TrainingSummary:
                 for name, frame in fields["frames"].items()
             }
             summary = cls(**fields)
-            problem = _problem(summary, kinematics)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            problem = f"{type(error).__name__}: {error}"
-        if problem:
-            raise DataError(f"the summary of the demonstrations is damaged: {problem}")
+            linked = {frame.link for frame in summary.frames.values()} - {None}
+            if summary.joint_names != tuple(kinematics.joint_names):
+                raise DataError(f"joint_names are not {kinematics.joint_names}")
+            if not linked <= {*kinematics.links}:
+                raise DataError(f"links {linked} are not among {kinematics.links}")
+        except (AttributeError, DataError, KeyError, TypeError, ValueError) as error:
+            raise DataError(
+                f"the summary of the demonstrations is damaged: {error!r:.200}"
+            ) from error
         return summary
 
     def _distances(
@@ -346,7 +391,7 @@ class TrainingSummary:
                 found["turn", name] = known.turn.distance(turn)
         return found
 
-    def _start(self, name: str, joints: Any, frame: Any) -> tuple[str, str, tuple[str, ...]]:
+    def _start(self, _: str, joints: Any) -> tuple[str, str, tuple[str, ...]]:
         bounds = np.stack((self.start_low, self.start_high, _rows(joints)))[:, self.compared]
         low, high, values = bounds
         names = [self.joint_names[i] for i in self.compared]
@@ -357,42 +402,38 @@ class TrainingSummary:
         )
         return f"start posture: {outside} rad (or m)", remedy, odd
 
-    def _place(self, name: str, joints: Any, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
+    def _place(self, name: str, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
         low, high = np.array(self.frames[name].low), np.array(self.frames[name].high)
         outside, _ = _outside("xyz", low, high, as_array(frame.position))
         remedy = "Is it in metres, in the same base frame? Else show the skill there too"
         return f"{name}: {outside} m", remedy, ()
 
-    def _turn(self, name: str, joints: Any, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
+    def _turn(self, name: str, frame: Frame) -> tuple[str, str, tuple[str, ...]]:
         known, orientation = self.frames[name], as_array(frame.orientation)
         angle = np.linalg.norm(known.rotation_vectors(orientation))
         swapped = known.rotation_vectors(np.roll(orientation, 1))  # as if it were (x, y, z, w)
         remedy = "Is the quaternion (w, x, y, z)? Else show the skill so too"
         if known.turn.distance(swapped) <= UNLIKELY * self.limit:
             remedy = "Read as (x, y, z, w) it would fit: quaternions are (w, x, y, z)"
-        return (
-            f"{name}: turned by {np.rad2deg(angle):.0f} deg from the mean, shown up to "
-            f"{np.rad2deg(known.angle):.0f}",
-            remedy,
-            (),
-        )
+        degrees = f"{np.rad2deg(angle):.0f} deg from the mean, shown up to "
+        return f"{name}: turned by {degrees}{np.rad2deg(known.angle):.0f}", remedy, ()
 
 
-def _largest_distance(vectors: Mapping[tuple[str, str], Array]) -> float:
+def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
     """The largest distance of a demonstration from the regions of the others."""
-    n = len(vectors["start", ""])
+    n = len(vectors[0][1])
     if n < FEWEST:
         return 1.0
     tried = np.unique(np.linspace(0, n - 1, min(n, MOST_LEFT_OUT)).round().astype(int))
     distances = [
         _joined(
             Region.of(np.delete(given, i, axis=0), kind, fewest=2).distance(given[i])
-            for (kind, _), given in vectors.items()
+            for kind, given in vectors
             if given.shape[1]
         )
         for i in tried
     ]
-    return max(SMALLEST_LIMIT, *map(float, distances))
+    return float(np.clip(max(distances), *LIMITS))
 
 
 def _joined(distances: Iterable[Array]) -> Array:
@@ -430,43 +471,25 @@ def _outside(
     return listed(places) or beside, tuple(names[i] for i in odd)
 
 
-def _problem(summary: TrainingSummary, kinematics: Kinematics | None) -> str:
-    """Why a summary cannot be of a model of these kinematics; empty if it can."""
-    names, compared, frames = summary.joint_names, [*summary.compared], summary.frames
-    linked = {frame.link for frame in frames.values()} - {None}
-    n = len(names)
-    regions = {"start": (summary.start, len(compared))}
-    numbers: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "n_demonstrations": (summary.n_demonstrations, ()),
-        "limit": (summary.limit, ()),
-        "start_low": (summary.start_low, (n,)),
-        "start_high": (summary.start_high, (n,)),
-        "compared": (compared, (len(compared),)),
-    }
-    for name, frame in frames.items():
-        sizes = {"low": (3,), "high": (3,), "orientation": (4,), "angle": ()}
-        numbers |= {f"{name}.{field}": (getattr(frame, field), sizes[field]) for field in sizes}
-        regions |= {f"{name}.place": (frame.place, 3), f"{name}.turn": (frame.turn, 3)}
-    for name, (region, d) in regions.items():
-        numbers[f"{name}.mean"] = region.mean, (d,)
-        numbers[f"{name}.covariance"] = region.covariance, (d, d) if d else (0,)
-    numbers |= {f"event {name}": (at, ()) for name, at in summary.events.items()}
-    for name, (value, shape) in numbers.items():
-        array = np.asarray(value)
+def _first_poses(paths: Sequence[PathSummary]) -> Frame:
+    """The first pose of a frame in each demonstration, (N,)."""
+    return Frame(
+        np.stack([path.position for path in paths]),
+        np.stack([path.orientation for path in paths]),
+    )
+
+
+def _rotation_vectors(mean: Array, orientations: Array) -> Array:
+    turns = quaternions.product(
+        quaternions.conjugate(torch.from_numpy(mean)), torch.from_numpy(np.array(orientations))
+    )
+    return as_array(quaternions.log(turns))
+
+
+def _check_numbers(thing: Any, **shapes: tuple[int, ...]) -> None:
+    """Refuse fields that are no finite numbers of these shapes."""
+    for name, shape in shapes.items():
+        array = np.asarray(getattr(thing, name))
         numeric = array.dtype.kind in "iuf" or not array.size
         if not numeric or array.shape != shape or not np.isfinite(array).all():
-            return f"{name} is {str(value)[:60]}"
-        square = array.ndim == 2
-        if square and (not np.allclose(array, array.T) or np.linalg.eigvalsh(array)[0] <= 0):
-            return f"{name} is not symmetric and positive definite"
-    possible = {
-        "joint_names": kinematics is None or names == tuple(kinematics.joint_names),
-        "link": kinematics is None or linked <= {*kinematics.links},
-        "n_demonstrations": type(summary.n_demonstrations) is int
-        and summary.n_demonstrations > 0,
-        "limit": summary.limit > 0,
-        "compared": len({*map(repr, compared)} & {*map(repr, range(n))}) == len(compared),
-        "moves": all(type(frame.moves) is bool for frame in frames.values()),
-        "events": all(0 <= at <= 1 for at in summary.events.values()),
-    }
-    return ", ".join(f"{name} cannot be so" for name, fits in possible.items() if not fits)
+            raise DataError(f"{name} is {str(getattr(thing, name))[:60]}")

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from tpgmm_torch.checks.report import Finding, Report, listed
 from tpgmm_torch.data.arrays import Array, as_array
@@ -32,6 +33,9 @@ __all__ = [
 
 #: Nothing turns a joint so far beyond its limits [rad]: the values are in another unit.
 IMPOSSIBLE = 2 * math.pi
+#: Limits and calibrations are not exact: values may be beyond by this share of the range, and
+#: at most by this [rad or m].
+BEYOND_SHARE, BEYOND = 0.1, 0.1
 #: Nothing that a robot handles is so far from its base [m].
 FAR = 10.0
 #: No robot is recorded so slowly [s]; a set in milliseconds, or in numbers of frames, is.
@@ -201,67 +205,104 @@ def check(
 def unit_findings(
     episodes: Sequence[EpisodeSummary], kinematics: Kinematics | None
 ) -> Iterator[Finding]:
-    """Joints that cannot be radians, frames that can hardly be metres, time not in seconds.
+    """Joints beyond the robot's limits, frames hardly in metres, time not in seconds.
 
     Parameters
     ----------
     episodes : sequence of EpisodeSummary
+        With their joints in the order of the kinematics.
     kinematics : Kinematics or None
-        Whose limits hold; optional in effect.
+        Whose limits hold; None knows of none.
     """
-    low = np.min([episode.low for episode in episodes], axis=0)
-    high = np.max([episode.high for episode in episodes], axis=0)
-    names = episodes[0].joint_names or tuple(f"joint {i}" for i in range(len(low)))
-    lower: Array = np.full(len(low), np.nan)
-    upper = lower
     if kinematics is not None:
-        names = kinematics.joint_names
-        lower, upper = as_array(kinematics.lower), as_array(kinematics.upper)
-    excess = np.fmax(lower - low, high - upper)
-    beyond = [int(i) for i in np.argsort(-excess) if excess[i] > IMPOSSIBLE]
-    if beyond:
-        places = [
-            f"{names[i]!r} from {low[i]:.4g} to {high[i]:.4g}, limits {lower[i]:.4g} to "
-            f"{upper[i]:.4g}"
-            for i in beyond
-        ]
-        yield Finding(
-            "units",
-            "joints are in radians (metres, where they slide), these cannot be: "
-            f"{listed(places)}",
-            "Are they in degrees? If one joint is, all are: convert the whole joint vector "
-            "(np.deg2rad; load_lerobot(..., units='deg'); --units deg)",
-            tuple(names[i] for i in beyond),
-            value=float(excess[beyond[0]]),
-            impossible=True,
-        )
+        yield from _limits(episodes, kinematics)
     for name in episodes[0].frames:
         first = [one.frames[name].position for one in episodes if name in one.frames]
         distance = float(np.median(np.linalg.norm(first, axis=1)))
         if distance > FAR:
-            yield Finding(
-                "units",
-                f"frame {name!r} is {distance:.4g} m away from the base of the robot",
+            message = f"frame {name!r} is {distance:.4g} m away from the base of the robot"
+            remedy = (
                 "Positions are in metres: are these in millimetres or centimetres? "
-                "(load_lerobot: FramePose(..., scale=0.001))",
-                (name,),
-                value=distance,
+                "(load_lerobot: FramePose(..., scale=0.001))"
             )
+            yield Finding("units", message, remedy, (name,), value=distance)
     step = float(np.median([episode.step for episode in episodes]))
     if step >= SLOWEST_STEP:
-        yield Finding(
-            "time",
-            f"time is in seconds, and a typical step of it is {step:.3g} s",
-            "Is it in milliseconds, or numbers of frames? Convert it",
-            value=step,
+        message = f"time is in seconds, and a typical step of it is {step:.3g} s"
+        remedy = "Is it in milliseconds, or numbers of frames? Convert it"
+        yield Finding("time", message, remedy, value=step)
+
+
+def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Iterator[Finding]:
+    """Joints beyond the limits: in another unit, in another order, or of another robot."""
+    low = np.min([episode.low for episode in episodes], axis=0)
+    high = np.max([episode.high for episode in episodes], axis=0)
+    limits = np.stack((as_array(kinematics.lower), as_array(kinematics.upper)))
+    allowed = np.minimum(BEYOND_SHARE * (limits[1] - limits[0]), BEYOND)
+    # of the joints of the robot (rows) in the columns that were given
+    excess = np.maximum(limits[0][:, None] - low, high - limits[1][:, None])
+    own, names = excess.diagonal(), kinematics.joint_names
+    impossible, unnamed = own.max(initial=0) > IMPOSSIBLE, episodes[0].joint_names is None
+    least = np.full_like(allowed, IMPOSSIBLE) if impossible else allowed
+    beyond = [int(j) for j in np.argsort(-own) if own[j] > least[j]]
+    if not beyond:
+        return
+    about, value = tuple(names[j] for j in beyond), float(own[beyond[0]])
+    places = ranges(names, beyond, low, high, limits)
+    cost = (excess - allowed[:, None]).clip(min=0)
+    rows, columns = linear_sum_assignment(cost)
+    if impossible:
+        check = "units"
+        message = f"joints are in radians (metres, where they slide), these cannot be: {places}"
+        remedy = (
+            "Are they in degrees? If one joint is, all are: convert the whole joint vector "
+            "(np.deg2rad; load_lerobot(..., units='deg'); --units deg)"
         )
+    elif unnamed and not cost[rows, columns].any():
+        check = "order"
+        message = (
+            f"the joints are unnamed, and their order does not fit the limits: {places}; the "
+            f"columns {columns.tolist()} would fit the joints of the robot"
+        )
+        remedy = "Name the columns: Demonstration(..., joint_names=[...])"
+    else:
+        check, message = "limits", f"joints are beyond the robot's limits: {places}"
+        remedy = "Check their zeros, units and order, that it is this robot"
+        remedy += ", and name them (joint_names=[...])" if unnamed else ""
+    yield Finding(check, message, remedy, about, value=value, impossible=bool(impossible))
+
+
+def ranges(
+    names: Sequence[str], columns: Sequence[int], low: Array, high: Array, limits: Array
+) -> str:
+    """Ranges of some joints in words, beside their limits (2, n_joints) where there are any.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of all joints.
+    columns : sequence of int
+        Which joints to list.
+    low, high : array of shape (n_joints,)
+    limits : array of shape (2, n_joints)
+    """
+    places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
+    bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]
+    known = bool(np.isfinite(limits).any())
+    return listed([a + b * known for a, b in zip(places, bounds, strict=True)])
 
 
 def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
-    """Demonstrations that show different things at one time."""
-    durations = np.array([episode.duration for episode in episodes])
+    """Demonstrations that show different things at one time.
+
+    Segments of the skill in its time, such as corrections, begin later than most and end
+    within them; they are on the clock.
+    """
     begins = np.array([episode.begin for episode in episodes])
-    tolerance = ONE_CLOCK * float(np.median(durations))
+    ends = begins + [episode.duration for episode in episodes]
+    tolerance = ONE_CLOCK * float(np.median(ends - begins))
+    segment = (begins > np.median(begins) + tolerance) & (ends < np.median(ends) + tolerance)
+    begins, durations = begins[~segment], (ends - begins)[~segment]
     values, message = (
         durations,
         "last from {:.4g} to {:.4g} s: at one time they show other things",
@@ -269,13 +310,12 @@ def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
     if np.ptp(durations) <= tolerance:
         values, message = begins, "begin at different times, from {:.6g} to {:.6g} s"
     if np.ptp(values) > tolerance:
-        yield Finding(
-            "alignment",
-            f"the demonstrations {message.format(values.min(), values.max())}",
+        message = f"the demonstrations {message.format(values.min(), values.max())}"
+        remedy = (
             "Let each begin at 0, and align them: "
-            "DynamicTimeWarping().fit_transform(demonstrations)",
-            value=float(np.ptp(values)),
+            "DynamicTimeWarping().fit_transform(demonstrations)"
         )
+        yield Finding("alignment", message, remedy, value=float(np.ptp(values)))
 
 
 def _freedom(

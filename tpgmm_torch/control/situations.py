@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import check_situations
+from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
@@ -42,10 +43,9 @@ def completed_frames(
     UnknownNameError
         If a frame that the skill needs is missing, or has the name of a link.
     """
-    complete, summary = dict(frames), skill.summary
-    if summary is not None:
-        start = skill.kinematics.joint_tensor(joints)
-        complete |= summary.start_frames(start, skill.kinematics, frames)
+    complete, start = dict(frames), skill.kinematics.joint_tensor(joints)
+    for summary in _summaries(skill):
+        complete |= summary.start_frames(start, skill.kinematics, complete)
     for name in skill.frame_names:
         if name not in complete:
             raise UnknownNameError("frame", name, "the situation", complete)
@@ -83,7 +83,7 @@ def completed_situations(
             torch.stack([one.time[[0, -1]] for one in situations if one.time is not None]),
             skill.kinematics,
             _span(skill),
-            skill.summary,
+            _summaries(skill),
         )
         report.act()
     return situations
@@ -125,7 +125,13 @@ def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None
     start = skill.kinematics.joint_tensor(joints)
     span = _span(skill)
     known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
-    check_situations(start, known, span[0], skill.kinematics, span, skill.summary).act()
+    check_situations(start, known, span[0], skill.kinematics, span, _summaries(skill)).act()
+
+
+def _summaries(skill: Skill) -> list[TrainingSummary]:
+    """Summary of the demonstrations of a skill, or of each of its ways until one is chosen."""
+    ways = getattr(skill, "skills", ()) if skill.summary is None else ()
+    return [one.summary for one in (skill, *ways) if one.summary is not None]
 
 
 def _span(skill: Skill) -> Tensor:
@@ -143,12 +149,14 @@ def with_novelty(
     skill : Skill
     situations, trajectories : sequence of Situation, sequence of Trajectory
     """
-    if skill.summary is None:
+    summaries = _summaries(skill)
+    if not summaries:
         return list(trajectories)
     found = []
     for one, situation in zip(trajectories, situations, strict=True):
-        novelty = skill.summary.novelty(situation.joints, at_first(situation))
-        found.append(replace(one, novelty=float(novelty)))
+        here = situation.joints, at_first(situation)
+        novelty = min(float(summary.novelty(*here)) for summary in summaries)
+        found.append(replace(one, novelty=novelty))
     return found
 
 

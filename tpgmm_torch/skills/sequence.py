@@ -92,8 +92,17 @@ class Sequence(CompositeSkill):
 
     @property
     def summary(self) -> TrainingSummary | None:
-        """See :attr:`Skill.summary`."""
-        return self.skills[0].summary
+        """Of the first skill, with those objects that only later ones know."""
+        first = self.skills[0].summary
+        if first is None:
+            return None
+        frames = [one.summary.frames for one in self.skills[1:] if one.summary is not None]
+        later = {
+            name: replace(frame, link=None)  # where a link is at the start of that skill
+            for own in reversed(frames)
+            for name, frame in own.items()
+        }
+        return replace(first, frames=later | {**first.frames})
 
     def estimate(
         self,

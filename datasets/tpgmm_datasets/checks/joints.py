@@ -1,16 +1,15 @@
-"""Findings about joints: order, limits, speeds, wraps, jumps, clipped and stuck values."""
+"""Findings about joints: units, speeds, wraps, jumps, clipped and stuck values."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_datasets.units import LARGEST_ANGLE
 from tpgmm_torch.checks.report import Finding, listed
-from tpgmm_torch.checks.training import FAR, IMPOSSIBLE
+from tpgmm_torch.checks.training import FAR, IMPOSSIBLE, ranges
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.pose_names import is_gripper, quaternion_groups
 from tpgmm_torch.robots.kinematics import Kinematics
@@ -18,9 +17,6 @@ from tpgmm_torch.robots.tracked_poses import Poses
 
 __all__ = ["joint_findings", "quaternion_columns"]
 
-#: Limits and calibrations are not exact: values may be beyond by this share of the range, and
-#: at most by this [rad or m].
-BEYOND_SHARE, BEYOND = 0.1, 0.1
 #: Differences of noisy positions are larger than speeds: by so much the 98 % quantile and the
 #: largest may be.
 FAST, FASTEST = 1.2, 3.0
@@ -41,7 +37,7 @@ def quaternion_columns(
 def joint_findings(
     episodes: Sequence[RecordingSummary], robot: Kinematics | None
 ) -> Iterator[Finding]:
-    """Order, limits, units without limits, speeds, wraps, jumps, clipped and stuck values.
+    """Units where there are no limits, speeds, wraps, jumps, clipped and stuck values.
 
     Parameters
     ----------
@@ -52,8 +48,7 @@ def joint_findings(
     """
     low = np.min([episode.low for episode in episodes], axis=0)
     high = np.max([episode.high for episode in episodes], axis=0)
-    given = episodes[0].joint_names
-    names = (robot.joint_names if robot is not None else given) or tuple(
+    names = (robot.joint_names if robot is not None else episodes[0].joint_names) or tuple(
         f"joint {i}" for i in range(len(low))
     )
     quaternion = {i for group in quaternion_columns(names, robot) for i in group}
@@ -63,9 +58,7 @@ def joint_findings(
     if robot is not None:
         limits = np.stack((as_array(robot.lower), as_array(robot.upper)))
     excess = np.maximum(limits[0] - low, high - limits[1])
-    if np.isfinite(limits).any():
-        yield from _limits(names, low, high, limits, given is None)
-    else:
+    if not np.isfinite(limits).any():
         yield from _units(
             names, low, high, angles, FAR if isinstance(robot, Poses) else LARGEST_ANGLE
         )
@@ -76,41 +69,6 @@ def joint_findings(
     yield from _stuck(episodes, names)
 
 
-def _ranges(
-    names: Sequence[str], columns: Sequence[int], low: Array, high: Array, limits: Array
-) -> str:
-    places = [f"{names[j]!r} from {low[j]:.4g} to {high[j]:.4g}" for j in columns]
-    bounds = [f", limits {a:.4g} to {b:.4g}" for a, b in limits.T[list(columns)]]
-    known = bool(np.isfinite(limits).any())
-    return listed([a + b * known for a, b in zip(places, bounds, strict=True)])
-
-
-def _limits(
-    names: Sequence[str], low: Array, high: Array, limits: Array, unnamed: bool
-) -> Iterator[Finding]:
-    """Positions beyond the limits: another order, or another robot."""
-    allowed = np.minimum(BEYOND_SHARE * (limits[1] - limits[0]), BEYOND)
-    excess = np.maximum(limits[0] - low, high - limits[1])
-    beyond = [int(j) for j in np.argsort(-excess) if excess[j] > allowed[j]]
-    if not beyond or excess[beyond[0]] > IMPOSSIBLE:  # which is of units
-        return
-    places, about = _ranges(names, beyond, low, high, limits), tuple(names[j] for j in beyond)
-    # columns for the joints of the robot, in its order, such that all are within their limits
-    cost = np.maximum(limits[0][:, None] - low, high - limits[1][:, None]) - allowed[:, None]
-    rows, columns = linear_sum_assignment(cost.clip(min=0))
-    if unnamed and (cost[rows, columns] <= 0).all():
-        message = (
-            f"the joints are unnamed, and their order does not fit the limits: {places}; the "
-            f"columns {columns.tolist()} would fit the joints of the robot"
-        )
-        remedy = "Name the columns: Demonstration(..., joint_names=[...])"
-        yield Finding("order", message, remedy, about)
-        return
-    remedy = "Check their zeros, units and order, that it is this robot"
-    remedy += ", and name them (joint_names=[...])" if unnamed else ""
-    yield Finding("limits", f"joints are beyond the robot's limits: {places}", remedy, about)
-
-
 def _units(
     names: Sequence[str], low: Array, high: Array, angles: Sequence[int], limit: float
 ) -> Iterator[Finding]:
@@ -119,7 +77,7 @@ def _units(
     odd = sorted((i for i in angles if largest[i] > limit), key=lambda i: -largest[i])
     if odd:
         unlimited = np.full((2, len(low)), np.inf)
-        places = _ranges(names, odd, low, high, unlimited * [[-1], [1]])
+        places = ranges(names, odd, low, high, unlimited * [[-1], [1]])
         message = (
             f"joints are in radians (metres, where they slide), these hardly are: {places}"
         )

@@ -16,6 +16,8 @@ from tests.support.worlds import upper_body
 from tpgmm_datasets import check, load_lerobot
 from tpgmm_torch import Demonstration, quaternions
 from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.checks import check as fit_check
+from tpgmm_torch.checks.training import summarize
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, TPGMMError
 from tpgmm_torch.robots import Poses
 
@@ -46,6 +48,24 @@ def messages(mistake: Mistake, folder: Path) -> list[str]:
 def test_a_mistake_is_noticed_once_and_by_its_name(mistake, tmp_path):
     [message] = messages(mistake, tmp_path)
     assert re.search(mistake.told, message), message
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda q: q + 2.5, lambda q: q.flip(1), lambda q: q.roll(3, 1), torch.rad2deg]
+)
+@pytest.mark.parametrize("named", [True, False])
+def test_fit_and_loaders_agree_on_limits_and_order(spoil, named):
+    robot, known = upper_body(), ("units", "limits", "order")
+    names = robot.joint_names if named else None
+    shown = [
+        replace(one, joints=spoil(one.joints), joint_names=names)
+        for one in generator().demonstrations(3, seed=0)
+    ]
+    found = [
+        [str(finding) for finding in report if finding.check in known]
+        for report in (check(shown, robot), fit_check(summarize(shown, robot), robot))
+    ]
+    assert found[0] == found[1] != []
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -25,9 +25,9 @@ def learned():
 
 def report(joints, frames, time=0.0, summarised=True):
     model = small_bottle()
-    summary = model.summary_ if summarised else None
+    known = [model.summary_] if summarised else []
     now = torch.as_tensor(time)
-    return check_situations(joints, frames, now, model.kinematics_, model.time_, summary)
+    return check_situations(joints, frames, now, model.kinematics_, model.time_, known)
 
 
 def test_a_batch_names_the_most_unlike_robot():

@@ -87,10 +87,22 @@ def test_it_is_the_same_however_the_base_is_turned():
 
 def test_the_furthest_demonstration_sets_the_unit():
     starts = np.random.default_rng(0).normal(size=(7, 2))
-    starts[3] = (6.0, 6.0)
+    starts[3] = (2.0, 2.5)
     others = Region.of(np.delete(starts, 3, axis=0), "start")
     summary = learned(np.zeros((7, 3)), starts)
     assert summary.limit == pytest.approx(float(others.distance(starts[3])))
+
+
+def test_one_odd_demonstration_does_not_make_far_objects_likely():
+    rng = np.random.default_rng(0)
+    places, starts = 0.02 * rng.normal(size=(5, 3)), 0.05 * rng.normal(size=(5, 7))
+    apart, bent = places.copy(), starts.copy()
+    apart[4, 0] += 0.5
+    bent[4] += 1.0
+    for summary in (learned(apart, starts), learned(places, bent)):
+        assert summary.limit == 2.0
+        [finding] = summary.findings(starts[0], {"cup": Frame([4.0, 0.0, 0.0])})
+        assert finding.check == "place" and "cup: x = 4, shown" in finding.message
 
 
 def test_few_or_equal_demonstrations_have_fixed_units():

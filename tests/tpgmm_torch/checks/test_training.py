@@ -63,6 +63,29 @@ def test_joints_beyond_their_limits_by_a_turn_cannot_be():
     assert finding.check == "units" and finding.impossible and "degrees" in finding.remedy
 
 
+def limited():
+    """A robot whose last joint may not go where the others may."""
+    robot = JointSpace(("a", "b", "c"))
+    robot.lower = robot.lower.new_tensor([-1.2, -1.2, -0.2])
+    robot.upper = robot.upper.new_tensor([1.2, 1.2, 1.2])
+    return robot
+
+
+def test_joints_somewhat_beyond_their_limits_and_in_another_order_are_unlikely():
+    shown = [replace(d, joint_names=None) for d in waves(3)]
+    assert found(shown, limited()) == []
+    swapped = [replace(d, joints=d.joints[:, [2, 1, 0]]) for d in shown]
+    [finding] = found(swapped, limited())
+    assert finding.check == "order" and "0] would fit the joints" in finding.message
+    beyond = [replace(d, joints=d.joints + 2.0, joint_names=SPACE.joint_names) for d in shown]
+    [finding] = found(beyond, limited())
+    assert (finding.check, finding.impossible) == ("limits", False)
+    assert set(finding.names) == {"a", "b", "c"} and "joint_names" not in finding.remedy
+    model = TaskParameterizedGMM(2, [Canonical()], limited(), random_state=0)
+    with pytest.warns(PlausibilityWarning, match="order does not fit the limits"):
+        model.fit(swapped)
+
+
 def test_frames_and_time_in_other_units():
     far = [replace(d, frames={"cup": Frame([300, 20, 10])}) for d in waves(3)]
     assert [f.names for f in found(far)] == [("cup",)]
@@ -76,6 +99,17 @@ def test_demonstrations_on_several_clocks():
     for items, text in ((longer, "last from"), (later, "begin at different times")):
         [finding] = found(items)
         assert finding.check == "alignment" and text in finding.message
+
+
+def test_segments_in_the_time_of_the_skill_are_on_its_clock():
+    shown = waves(4)
+    middle = replace(shown[0], time=shown[0].time * 0.4 + 0.6)
+    assert found([*shown, middle]) == []
+    for short in (
+        replace(shown[0], time=shown[0].time * 0.5),
+        replace(middle, time=middle.time + 2),
+    ):
+        assert [f.check for f in found([*shown, short])] == ["alignment"]
 
 
 @pytest.mark.parametrize(

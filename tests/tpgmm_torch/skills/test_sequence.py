@@ -1,11 +1,13 @@
 """One skill after the other."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from tests.support.skills import canonical, handlings, hands_model, wave, waves
-from tpgmm_torch import Canonical, Controller, SelectOperators, Sequence, rollout
-from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch import Canonical, Controller, Frame, SelectOperators, Sequence, rollout
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.structure.fit_parts import fit_parts
 
 
@@ -39,6 +41,16 @@ def test_each_part_has_operators_of_its_own():
         hands_model(), handlings(6), [1.0], SelectOperators(robot=hands_model().robot)
     )
     assert len(found.skills) == 2
+
+
+def test_objects_of_later_skills_are_compared_with_the_demonstrations():
+    early, late = fit_parts(hands_model(), handlings(), [1.0]).skills
+    unaware = replace(early, summary=replace(early.summary, frames={}))
+    assert list(Sequence((unaware, late)).summary.frames) == ["cup"]
+    [one] = handlings(5)[4:]
+    away = {"cup": Frame(one.frames["cup"].position + 4.0, one.frames["cup"].orientation)}
+    with pytest.warns(PlausibilityWarning, match="place: cup: "):
+        Controller(Sequence((unaware, late)), one.joints[0], away)
 
 
 def test_controllers_localise_in_it():

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from tests.support.two_ways import Handles, Obstacle, another_handle_each, fitted
-from tpgmm_torch import Controller, Frame, Ways, rollout
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch import Controller, Frame, Situation, Ways, rollout
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 
 @pytest.mark.parametrize("task", [Obstacle, Handles])
@@ -57,6 +57,19 @@ def test_a_controller_runs_the_way_that_was_chosen():
         running = Controller(skill, situation.joints, situation.frames, clock="even")
         commands.append(torch.stack([running.step(0.05).reference for _ in range(20)]))
     torch.testing.assert_close(*commands, rtol=0, atol=1e-6)
+
+
+def test_objects_far_from_those_of_every_way_are_named():
+    skill, [one] = fitted(Obstacle).skill_, Obstacle().situations(1, 2)
+    [known] = rollout(skill, [one])  # warnings are errors
+    name = next(iter(one.frames))
+    pose = one.frames[name]
+    away = {**one.frames, name: Frame(pose.position + 4.0, pose.orientation)}
+    with pytest.warns(PlausibilityWarning, match=f"place: {name}: .* shown") as caught:
+        [done] = rollout(skill, [Situation(one.joints, away)])
+    with pytest.warns(PlausibilityWarning, match=f"place: {name}: .* shown"):
+        Controller(skill, one.joints, away)
+    assert len(caught) == 1 and known.novelty < 1.5 < done.novelty
 
 
 def test_ways_that_do_not_fit_together_are_refused():
