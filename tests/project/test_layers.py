@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
     "tpgmm_torch": (
         ("exceptions",),
-        ("atomic", "constraints", "quaternions", "gaussians", "notebook"),
+        ("atomic", "constraints", "quaternions", "gaussians"),
         ("data",),
         ("robots", "alignment", "mixture"),
         ("operators", "impedance"),

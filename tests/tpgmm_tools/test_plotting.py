@@ -164,7 +164,9 @@ def test_candidates_that_matter_stand_above_the_others():
     [axes] = figure(1, "").axes
     plot_relevance(axes, selection)
     labels = [label.get_text() for label in axes.get_yticklabels()]
-    kept = {format_operator(selection.candidates_[j]) for j in selection.get_support(True)}
+    kept = {
+        format_operator(selection.candidates_[j]) for j in np.flatnonzero(selection.support_)
+    }
     assert set(labels[: len(kept)]) == kept and len(labels) == len(selection.candidates_)
     [image] = axes.images
     column = [format_operator(one) for one in selection.candidates_].index(labels[0])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
-__all__ = ["Finding", "Report", "listed"]
+__all__ = ["Finding", "Report", "in_columns", "listed"]
 
 #: Largest numbers of examples of one finding, and of findings, in a message; a report has
 #: them all.
@@ -143,3 +143,24 @@ def listed(items: Sequence[str]) -> str:
     shown = ", ".join(items[:MOST_EXAMPLES])
     more = len(items) - MOST_EXAMPLES
     return f"{shown} and {more} more" if more > 0 else shown
+
+
+def in_columns(lines: Sequence[Sequence[str]]) -> str:
+    """Lines of cells as text, with columns as wide as they need.
+
+    Parameters
+    ----------
+    lines : sequence of sequence of str
+        As many cells in each.
+
+    Examples
+    --------
+    >>> print(in_columns([("joint", "range"), ("lift", "0 to 2")]))
+    joint  range
+    lift   0 to 2
+    """
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    )

@@ -10,7 +10,7 @@ operators are compared by one number in the units of the joints, whatever their 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,52 +18,39 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.robots.held_objects import held_objects
-from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.training_rows import typical_time
 
-__all__ = ["Evidence", "Fused", "gather_evidence"]
+__all__ = ["Evidence", "gather_evidence"]
 
 #: No sensor agrees with itself to less [m or rad]: what never varies stays finite.
 RESOLUTION = 1e-3
 #: Demonstrations that are left out in turn; of more, so many are taken, evenly.
 MOST_LEFT_OUT = 20
-
-
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """Product of the Gaussians of some operators, for M demonstrations left out.
-
-    Parameters
-    ----------
-    precision : Tensor of shape (M, T, n, n)
-    vector : Tensor of shape (M, T, n)
-        Precision times mean.
-    """
-
-    precision: Tensor
-    vector: Tensor
+#: Degrees of freedom of a variance's prior, whose scale is that of all demonstrations: of 3,
+#: two are left, and their agreement by chance would decide.
+PRIOR_DEGREES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What C operators say of M demonstrations left out, at T instants.
+    """Gaussians of C operators over the joints of M demonstrations left out, at T instants.
 
     Parameters
     ----------
     time : Tensor of shape (T,)
         Of a typical demonstration [s].
-    jacobians : list of Tensor of shape (M, T, m, n)
-        One per operator.
-    residuals : list of Tensor of shape (M, T, m)
-        ``M (mu - X)``: by how much it is wrong itself.
-    rows : list of Tensor of shape (M, T, m, n + 1)
-        Both side by side, whitened by the Cholesky factor of S.
-    nothing : Fused
-        What is known without operators: each joint's mean and variance over everything.
+    jacobians, residuals : tuple of Tensor of shape (M, T, m, n), (M, T, m)
+        J, and ``M (mu - X)``, by how much an operator is wrong itself; one per operator.
+    precisions, vectors : tuple of Tensor of shape (M, T, n, n), (M, T, n)
+        ``J^T S^-1 J`` and ``J^T S^-1 M (mu - X)``; one per operator.
+    nothing : tuple of Tensor
+        The same without operators: each joint's mean and variance over everything.
     floor : Tensor of shape (n,)
         Variances below which agreement of the joints means nothing.
     degrees : float
@@ -71,45 +58,37 @@ class Evidence:
     """
 
     time: Tensor
-    jacobians: list[Tensor]
-    residuals: list[Tensor]
-    rows: list[Tensor]
-    nothing: Fused
+    jacobians: tuple[Tensor, ...]
+    residuals: tuple[Tensor, ...]
+    precisions: tuple[Tensor, ...]
+    vectors: tuple[Tensor, ...]
+    nothing: tuple[Tensor, Tensor]
     floor: Tensor
     degrees: float
 
-    def added(self, fused: Fused, operator: int) -> Fused:
-        """The ``fused`` product with the Gaussian of one more ``operator``, by number."""
-        rows = self.rows[operator]
-        jacobian, residual = rows[..., :-1], rows[..., -1:]
-        return Fused(
-            fused.precision + jacobian.mT @ jacobian,
-            fused.vector + (jacobian.mT @ residual)[..., 0],
-        )
-
-    def of(self, operators: Sequence[int]) -> Fused:
-        """The product of the Gaussians of some ``operators``, by number."""
-        fused = self.nothing
+    def _fused(self, operators: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Covariance and mean (..., n, 1) of the product of some operators' Gaussians."""
+        precision, vector = self.nothing
         for operator in operators:
-            fused = self.added(fused, operator)
-        return fused
+            precision = precision + self.precisions[operator]
+            vector = vector + self.vectors[operator]
+        covariance = torch.linalg.inv(precision)
+        return covariance, covariance @ vector[..., None]
 
-    def log_likelihood(self, fused: Fused) -> Tensor:
-        """Of the demonstrations left out, given the ``fused`` product, in nats, (M, T)."""
-        covariance = torch.linalg.inv(fused.precision)
-        step = covariance @ fused.vector[..., None]
+    def log_likelihood(self, operators: Sequence[int]) -> Tensor:
+        """Of the demonstrations left out, given some operators by number, in nats, (M, T)."""
+        covariance, step = self._fused(operators)
         floored, name = covariance + self.floor.diag(), "the covariance of what is expected"
         return gaussians.log_density(step, floored, name, self.degrees)[..., 0]
 
-    def errors(self, operator: int, fused: Fused) -> tuple[Tensor, Tensor]:
+    def errors(self, operator: int, others: Sequence[int]) -> tuple[Tensor, Tensor]:
         """How far demonstrations left out are from what is expected, root mean square.
 
         Parameters
         ----------
         operator : int
             Whose coordinates are meant.
-        fused : Fused
-            The others.
+        others : sequence of int
 
         Returns
         -------
@@ -117,10 +96,11 @@ class Evidence:
             From what the operator expects, and from what the others do, as far as the joints
             can tell: in metres, radians, or numbers of a quaternion.
         """
-        step = torch.linalg.solve(fused.precision, fused.vector[..., None])
-        others = (self.jacobians[operator] @ step)[..., 0]
+        _, step = self._fused(others)
+        of_others = (self.jacobians[operator] @ step)[..., 0]
         own, other = (
-            each.square().sum(-1).mean(0).sqrt() for each in (self.residuals[operator], others)
+            each.square().sum(-1).mean(0).sqrt()
+            for each in (self.residuals[operator], of_others)
         )
         return own, other
 
@@ -133,7 +113,6 @@ def gather_evidence(
     tolerance: float,
     n_instants: int,
     holds: Sequence[Hold] = (),
-    prior_degrees: float = 0.0,
 ) -> Evidence:
     """Leave each demonstration out, and ask operators about it.
 
@@ -149,87 +128,80 @@ def gather_evidence(
         T, at most: evenly spread.
     holds : sequence of Hold, default=()
         Objects that the robot held.
-    prior_degrees : float, default=0
-        Degrees of freedom d0 of a scaled inverse chi-squared prior of each variance, whose
-        scale is the variance of all N demonstrations: those that are left have N - 2, and a
-        variance is ``((N - 2) s^2 + d0 s0^2) / (N - 2 + d0)``. Of three demonstrations two
-        are left, which agree by chance in what the third shows to differ.
     """
     time = typical_time(demonstrations).to(kinematics.lower)
-    count = min(n_instants, *map(len, demonstrations))
-    phase = torch.linspace(0, 1, count)
-    seen = [_at_phase(one, phase) for one in demonstrations]
+    phase = torch.linspace(0, 1, min(n_instants, *map(len, demonstrations)))
+    seen = [one.at_steps(((len(one) - 1) * phase).round().long()) for one in demonstrations]
     # quaternions among the joints on one side, from here on
-    joints = torch.stack([row[:, 1:] for row in local_data(seen, [Canonical()], kinematics)])
-    names = kinematics.joint_names
-    seen = [
-        replace(one, joints=own, joint_names=names)
-        for one, own in zip(seen, joints, strict=True)
-    ]
+    joints = torch.stack(local_data(seen, [Canonical()], kinematics))[..., 1:]
+    names, number = kinematics.joint_names, len(seen)
+    seen = [replace(d, joints=q, joint_names=names) for d, q in zip(seen, joints, strict=True)]
     data = torch.stack(local_data(seen, operators, kinematics, holds=holds))  # (N, T, ...)
-    number = len(seen)
-    # s0^2 has a share in each variance, and none where nothing is asked of a prior
-    prior, degrees = data.var(0), number - 2.0
-    share = prior_degrees / (degrees + prior_degrees) if prior_degrees else 0.0
+    widths = [1 + operator.dimension(kinematics) for operator in operators]
+    blocks = [block[..., 1:] for block in data.split(widths, -1)]
     left_out = torch.linspace(0, number - 1, min(number, MOST_LEFT_OUT)).round().long()
-    shape = (len(left_out), count)
-    jacobians: list[list[Tensor]] = [[] for _ in operators]
-    residuals: list[list[Tensor]] = [[] for _ in operators]
-    rows: list[list[Tensor]] = [[] for _ in operators]
+    terms = []
     for index in left_out.tolist():
-        demonstration = seen[index]
         state = kinematics.state(joints[index])
-        frames = {name: f.to(time) for name, f in demonstration.frames.items()}
+        frames = {name: frame.to(time) for name, frame in seen[index].frames.items()}
         if holds:
-            there = demonstration.time.to(time)
+            there = seen[index].time.to(time)
             state, frames = held_objects(state, there, frames, holds, attached=True)
-        others = [other for other in range(number) if other != index]
-        column = 0
-        for j, operator in enumerate(operators):
-            size = operator.dimension(kinematics)
-            local = data[..., column + 1 : column + 1 + size]
-            column += 1 + size
-            own = local[others].var(0) * number / (number - 1)
-            whole = prior[..., column - size : column] * (number + 1) / number
-            variance = (1 - share) * own + share * whole + RESOLUTION**2
-            gap = local[others].mean(0) - local[index]
-            present = operator.coordinates(state, frames)
-            for start in operator.quaternion_starts(kinematics):
-                block = slice(start, start + 4)  # M is that of the quaternion as it is now
-                along = (present[:, block] * local[index, :, block]).sum(-1, keepdim=True)
-                gap[:, block] = torch.where(along < 0, -gap[:, block], gap[:, block])
-            at = operator.linearize(state, frames)
-            if at.matrix is None:
-                covariance = variance.diag_embed()
-            else:
-                gap = (at.matrix @ gap[..., None])[..., 0]
-                covariance = at.matrix @ variance.diag_embed() @ at.matrix.mT
-            if at.noise is not None:
-                covariance = covariance + at.noise.diag_embed()
-            jacobian = at.jacobian
-            if jacobian is None:
-                jacobian = torch.eye(joints.shape[-1]).to(joints)
-            jacobian = jacobian.expand(*gap.shape, -1)
-            jacobians[j].append(jacobian)
-            residuals[j].append(gap)
-            factor, both = torch.linalg.cholesky(covariance), (jacobian, gap[..., None])
-            white = torch.linalg.solve_triangular(factor, torch.cat(both, -1), upper=False)
-            rows[j].append(white)
+        for operator, local in zip(operators, blocks, strict=True):
+            terms.append(_term(operator, local, index, kinematics, state, frames))
+    count = len(operators)
+    stacked = [
+        tuple(map(torch.stack, zip(*terms[j::count], strict=True))) for j in range(count)
+    ]
+    jacobians, residuals, precisions, vectors = zip(*stacked, strict=True)
     floor = torch.tensor(Canonical(tolerance).tolerances(kinematics)).to(time).square()
     spread = joints.flatten(0, 1).var(0) + floor
     gap = joints.mean((0, 1)) - joints[left_out]
+    prior = (1 / spread).diag().expand(*gap.shape, -1), gap / spread
+    instants = time[((len(time) - 1) * phase).round().long()]
     return Evidence(
-        time[((len(time) - 1) * phase).round().long()],
-        list(map(torch.stack, jacobians)),
-        list(map(torch.stack, residuals)),
-        list(map(torch.stack, rows)),
-        nothing=Fused((1 / spread).diag().expand(*shape, -1, -1), gap / spread),
-        floor=floor,
-        degrees=max(degrees, 1.0),
+        instants,
+        jacobians,
+        residuals,
+        precisions,
+        vectors,
+        prior,
+        floor,
+        max(number - 2.0, 1.0),
     )
 
 
-def _at_phase(demonstration: Demonstration, phase: Tensor) -> Demonstration:
-    """The demonstration at some of its time steps, at equal ``phase`` from 0 to 1."""
-    steps = ((len(demonstration) - 1) * phase).round().long()
-    return demonstration.at_steps(steps)
+def _term(
+    operator: Operator,
+    local: Tensor,
+    index: int,
+    kinematics: Kinematics,
+    state: RobotState,
+    frames: Mapping[str, Frame],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Jacobian, residual, precision and vector of an operator, one demonstration left out."""
+    number = len(local)
+    others, degrees = torch.arange(number) != index, number - 2.0
+    share = PRIOR_DEGREES / (degrees + PRIOR_DEGREES)
+    own = local[others].var(0) * number / (number - 1)
+    whole = local.var(0) * (number + 1) / number
+    covariance = ((1 - share) * own + share * whole + RESOLUTION**2).diag_embed()
+    gap = local[others].mean(0) - local[index]
+    present = operator.coordinates(state, frames)
+    for start in operator.quaternion_starts(kinematics):
+        block = slice(start, start + 4)  # M is that of the quaternion as it is now
+        along = (present[:, block] * local[index, :, block]).sum(-1, keepdim=True)
+        gap[:, block] = torch.where(along < 0, -gap[:, block], gap[:, block])
+    at = operator.linearize(state, frames)
+    if at.matrix is not None:
+        gap = (at.matrix @ gap[..., None])[..., 0]
+        covariance = at.matrix @ covariance @ at.matrix.mT
+    if at.noise is not None:
+        covariance = covariance + at.noise.diag_embed()
+    joints = state.joints
+    jacobian = torch.eye(joints.shape[-1]).to(joints) if at.jacobian is None else at.jacobian
+    jacobian = jacobian.expand(*gap.shape, -1)
+    factor, both = torch.linalg.cholesky(covariance), (jacobian, gap[..., None])
+    white = torch.linalg.solve_triangular(factor, torch.cat(both, -1), upper=False)
+    rows, residual = white[..., :-1], white[..., -1:]
+    return jacobian, gap, rows.mT @ rows, (rows.mT @ residual)[..., 0]

@@ -15,6 +15,7 @@ from sklearn.base import clone
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, UnknownNameError
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.skills.sequence import Sequence as SkillSequence
 from tpgmm_torch.structure.select_operators import SelectOperators
 
@@ -51,6 +52,23 @@ def fit_parts(
         of operators than parts, or as of the model's ``fit``.
     """
     known = check_demonstrations(demonstrations)
+    edges = _edges(known, cuts)
+    stretches = list(pairwise(edges))
+    if isinstance(operators, SelectOperators):
+        operators = [_selected(operators, known, *own) for own in stretches]
+    of_parts = [model.operators] * len(stretches) if operators is None else list(operators)
+    if len(of_parts) != len(stretches):
+        raise DataError(f"there are operators for {len(of_parts)} of {len(stretches)} parts")
+    numbers = _shares(model.n_components, np.diff(edges))
+    parts = []
+    for number, own, interval in zip(numbers, of_parts, stretches, strict=True):
+        part = clone(model).set_params(n_components=number, operators=own)
+        parts.append(part.fit(known, interval=interval).skill)
+    return SkillSequence(tuple(parts))
+
+
+def _edges(known: Sequence[Demonstration], cuts: Sequence[float | str]) -> list[float]:
+    """When parts begin and the last ends [s]."""
     begin = max(float(one.time[0]) for one in known)
     end = min(float(one.time[-1]) for one in known)
     edges = [begin, *(time for cut in cuts for time in _times(cut, known)), end]
@@ -60,25 +78,15 @@ def fit_parts(
                 f"parts follow on each other between {begin:.4g} and {end:.4g} s: the cut at "
                 f"{late:.4g} s is not after {early:.4g} s"
             )
-    if isinstance(operators, SelectOperators):
-        stretches = [[_stretch(one, *own) for one in known] for own in pairwise(edges)]
-        operators = [clone(operators).fit(own).operators_ for own in stretches]
-    of_parts = [model.operators] * (len(edges) - 1) if operators is None else list(operators)
-    if len(of_parts) != len(edges) - 1:
-        raise DataError(
-            f"there are operators for {len(of_parts)} parts, and {len(edges) - 1} parts"
-        )
-    numbers = _shares(model.n_components, np.diff(edges))
-    parts = []
-    for number, own, interval in zip(numbers, of_parts, pairwise(edges), strict=True):
-        part = clone(model).set_params(n_components=number, operators=own)
-        parts.append(part.fit(known, interval=interval).skill)
-    return SkillSequence(tuple(parts))
+    return edges
 
 
-def _stretch(demonstration: Demonstration, begin: float, end: float) -> Demonstration:
-    inside = (demonstration.time >= begin) & (demonstration.time < end)
-    return demonstration.at_steps(inside)
+def _selected(
+    select: SelectOperators, known: Sequence[Demonstration], begin: float, end: float
+) -> tuple[Operator, ...]:
+    """The operators that matter from ``begin`` to ``end``."""
+    part = [one.at_steps((one.time >= begin) & (one.time < end)) for one in known]
+    return clone(select).fit(part).operators_
 
 
 def _times(cut: float | str, demonstrations: Sequence[Demonstration]) -> list[float]:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain, combinations, permutations
+from itertools import combinations, permutations
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
+from torch import Tensor
 
+from tpgmm_torch.checks.report import in_columns
 from tpgmm_torch.constraints import Interval, check_parameters
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import DataError, NotFittedError
-from tpgmm_torch.notebook import in_columns
 from tpgmm_torch.operators import (
     AbsoluteOrientation,
     AbsolutePosition,
@@ -37,9 +37,6 @@ __all__ = ["Judgement", "SelectOperators", "arranged", "candidate_operators"]
 
 #: Of two, one is left to learn from, and has no variance.
 FEWEST = 3
-#: What demonstrations show together is worth one more that a variance is learned from: with
-#: three, of which two are left, their chance agreement else decides.
-PRIOR_DEGREES = 1.0
 POSITIONS = AbsolutePosition, RelativePosition
 ORIENTATIONS = AbsoluteOrientation, RelativeOrientation
 
@@ -118,9 +115,6 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         Gains at each instant, given the others that were kept [nats].
     time_ : array of shape (T,)
         The instants [s].
-    frame_relevance_ : dict of str to array of shape (T,)
-        The same for each frame that matters: what all operators gain together that were kept
-        and see from it, of which one may say what another says [nats].
     judgements_ : tuple of Judgement
         One per candidate: why.
 
@@ -194,12 +188,7 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
                 "which operators matter is seen from demonstrations that differ: it takes at "
                 f"least {FEWEST}, got {len(demonstrations)}; name the operators instead"
             )
-        given = self.candidates
-        if given is None:
-            # what is held is a thing of its own, to be brought to a place
-            carried = list(dict.fromkeys(one.frame for one in demonstrations[0].holds or ()))
-            given = candidate_operators(self.robot, demonstrations[0], carried)
-        operators = check_operators(given)
+        operators = check_operators(self._given(demonstrations[0]))
         kinematics = kinematics_for(demonstrations, operators, self.robot, "float64", "cpu")
         holds = demonstrated_holds(demonstrations, operators, kinematics)
         # one frame in a wrong place hides that it matters
@@ -213,137 +202,101 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
             tolerance=self.tolerance,
             n_instants=self.n_instants,
             holds=holds,
-            prior_degrees=PRIOR_DEGREES,
         )
         joints = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
         free = [j for j, one in enumerate(operators) if not one.determines_joints]
-        chosen = self._select(evidence, joints, free)
+        chosen = self._dropped(evidence, self._added(evidence, joints), free)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
         self.operators_ = arranged([operators[j] for j in chosen])
-        self._judge(evidence, chosen, joints, kinematics)
+        judged = [
+            self._judge(evidence, j, chosen, joints, kinematics) for j in range(len(operators))
+        ]
+        self.judgements_ = tuple(judgement for judgement, _ in judged)
+        self.relevance_ = torch.stack([gains for _, gains in judged], -1).cpu().numpy()
         return self
 
-    def get_support(self, indices: bool = False) -> NDArray[Any]:
-        """Which candidates matter, as scikit-learn's selectors say it.
-
-        Parameters
-        ----------
-        indices : bool, default=False
-            Whether to return their numbers rather than a mask.
-        """
-        self._check_fitted()
-        return np.flatnonzero(self.support_) if indices else self.support_
+    def _given(self, demonstration: Demonstration) -> Sequence[Operator]:
+        if self.candidates is not None:
+            return self.candidates
+        # what is held is a thing of its own, to be brought to a place
+        held = list(dict.fromkeys(hold.frame for hold in demonstration.holds or ()))
+        return candidate_operators(self.robot, demonstration, held)
 
     def report(self) -> str:
         """A table of the candidates, those that gain most first: which were kept, and why."""
         self._check_fitted()
         order = sorted(self.judgements_, key=lambda one: (not one.kept, -one.gain, -one.alone))
-        lines = [
+        lines: list[tuple[str, ...]] = [
             ("", "operator", "gain", "alone", "at", "left out is off by", "others by", "why")
         ]
         for one in order:
-            if one.kept and one.gain < self.threshold:
-                why = "decides what the others leave free"
-            elif one.kept:
-                why = "decides there"
-            elif one.alone >= self.threshold:
-                why = "says what those kept say"
-            else:
-                why = "tells nothing of what was left out"
-            lines.append(
-                (
-                    "kept" if one.kept else "",
-                    format_operator(one.operator),
-                    f"{one.gain:.2f}",
-                    f"{one.alone:.2f}",
-                    f"{one.time:.2f} s",
-                    f"{one.error:.3g} {one.unit}".rstrip(),
-                    f"{one.error_of_others:.3g} {one.unit}".rstrip(),
-                    why,
-                )
-            )
+            gains = one.gain, one.alone
+            numbers = *(f"{gain:.2f}" for gain in gains), f"{one.time:.2f} s"
+            errors = (f"{e:.3g} {one.unit}".rstrip() for e in (one.error, one.error_of_others))
+            kept, name = "kept" * one.kept, format_operator(one.operator)
+            lines.append((kept, name, *numbers, *errors, self._why(one)))
         return in_columns(lines)
 
-    def _select(
-        self, evidence: Evidence, joints: Sequence[int], free: Sequence[int]
-    ) -> list[int]:
-        """Add what gains most, then drop of those ``free`` to go what gains too little."""
+    def _why(self, one: Judgement) -> str:
+        if one.kept:
+            return (
+                "decides there"
+                if one.gain >= self.threshold
+                else "decides what the others leave free"
+            )
+        if one.alone >= self.threshold:
+            return "says what those kept say"
+        return "tells nothing of what was left out"
+
+    def _added(self, evidence: Evidence, joints: Sequence[int]) -> list[int]:
+        """The operators of ``joints``, and what gains most beside them, one after the other."""
         chosen = list(joints)
-        everyone = range(len(evidence.jacobians))
-        fused = evidence.of(chosen)
-        likely = evidence.log_likelihood(fused).mean()
-        while rest := [j for j in everyone if j not in chosen]:
-            gains = [
-                float(evidence.log_likelihood(evidence.added(fused, j)).mean() - likely)
-                for j in rest
-            ]
-            best = int(np.argmax(gains))
-            if chosen and gains[best] <= self.threshold:
+        likely = float(evidence.log_likelihood(chosen).mean())
+        while rest := [j for j in range(len(evidence.vectors)) if j not in chosen]:
+            means = [float(evidence.log_likelihood([*chosen, j]).mean()) for j in rest]
+            best = int(np.argmax(means))
+            if chosen and means[best] - likely <= self.threshold:
                 break
             chosen.append(rest[best])
-            fused, likely = evidence.added(fused, rest[best]), likely + gains[best]
+            likely = means[best]
+        return chosen
+
+    def _dropped(self, evidence: Evidence, chosen: list[int], free: Sequence[int]) -> list[int]:
+        """What is left of the ``chosen`` when those ``free`` to go that gain too little do."""
+        likely = float(evidence.log_likelihood(chosen).mean())
         while len(chosen) > 1 and (spare := [j for j in chosen if j in free]):
-            losses = [
-                float(likely - evidence.log_likelihood(evidence.of(_without(chosen, j))).mean())
-                for j in spare
-            ]
-            least = int(np.argmin(losses))
-            if losses[least] > self.threshold:
+            rests = [_without(chosen, j) for j in spare]
+            means = [float(evidence.log_likelihood(rest).mean()) for rest in rests]
+            best = int(np.argmax(means))
+            if likely - means[best] > self.threshold:
                 break
-            likely = likely - losses[least]
-            chosen = _without(chosen, spare[least])
+            chosen, likely = rests[best], means[best]
         return sorted(chosen)
 
     def _judge(
         self,
         evidence: Evidence,
+        j: int,
         chosen: Sequence[int],
         joints: Sequence[int],
         kinematics: Kinematics,
-    ) -> None:
-        """Say of each candidate what it gains, when, and in its own units."""
-        whole, base = evidence.of(chosen), evidence.of(joints)
-        likely, before = evidence.log_likelihood(whole), evidence.log_likelihood(base)
-        relevance, judgements = [], []
-        for j, operator in enumerate(self.candidates_):
-            others = evidence.of(_without(chosen, j)) if j in chosen else whole
-            if j in chosen:
-                gains = (likely - evidence.log_likelihood(others)).mean(0)
-            else:
-                gains = (evidence.log_likelihood(evidence.added(whole, j)) - likely).mean(0)
-            if j in joints:
-                alone = evidence.log_likelihood(evidence.of([j])) - evidence.log_likelihood(
-                    evidence.nothing
-                )
-            else:
-                alone = evidence.log_likelihood(evidence.added(base, j)) - before
-            peak = int(gains.argmax())
-            factor, unit = _unit(operator, evidence.jacobians[j].shape[-2], kinematics)
-            error, of_others = (
-                float(each[peak]) * factor for each in evidence.errors(j, others)
-            )
-            relevance.append(gains)
-            judgements.append(
-                Judgement(
-                    operator,
-                    bool(self.support_[j]),
-                    float(gains.mean()),
-                    float(alone.mean()),
-                    float(evidence.time[peak]),
-                    error,
-                    of_others,
-                    unit,
-                )
-            )
-        self.relevance_ = torch.stack(relevance, -1).cpu().numpy()
-        self.frame_relevance_ = {}
-        for name in dict.fromkeys(chain(*(self.candidates_[j].references() for j in chosen))):
-            if name not in kinematics.links:
-                apart = [j for j in chosen if name not in self.candidates_[j].references()]
-                without = evidence.log_likelihood(evidence.of(apart))
-                self.frame_relevance_[name] = (likely - without).mean(0).cpu().numpy()
-        self.judgements_ = tuple(judgements)
+    ) -> tuple[Judgement, Tensor]:
+        """What candidate j gains, when, and in its own units; and its gains (T,)."""
+        operator, others = self.candidates_[j], _without(chosen, j)
+        base = () if j in joints else joints
+
+        def gained(beside: Sequence[int]) -> Tensor:
+            with_it = evidence.log_likelihood([*beside, j])
+            return (with_it - evidence.log_likelihood(beside)).mean(0)
+
+        gains = gained(others)
+        peak = int(gains.argmax())
+        factor, unit = _unit(operator, evidence.jacobians[j].shape[-2], kinematics)
+        error, of_others = (float(each[peak]) * factor for each in evidence.errors(j, others))
+        numbers = float(gains.mean()), float(gained(base).mean()), float(evidence.time[peak])
+        judgement = Judgement(operator, j in chosen, *numbers, error, of_others, unit)
+        return judgement, gains
 
     def _check_fitted(self) -> None:
         if not hasattr(self, "support_"):

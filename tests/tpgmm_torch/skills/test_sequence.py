@@ -71,7 +71,7 @@ def test_parts_that_do_not_follow_are_refused():
         fit_parts(model, shown, ["grasp"])
     with pytest.raises(DataError, match="need a component each"):
         fit_parts(canonical(n_components=1), shown, [1.0])
-    with pytest.raises(DataError, match="operators for 1 parts, and 2 parts"):
+    with pytest.raises(DataError, match="operators for 1 of 2 parts"):
         fit_parts(model, shown, [1.0], [[Canonical()]])
     early, late = fit_parts(model, shown, [1.0]).skills
     with pytest.raises(DataError, match="cannot follow"):

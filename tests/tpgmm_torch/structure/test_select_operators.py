@@ -30,7 +30,9 @@ from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 
 def relative(selection):
     """Texts of what was kept and refers to a frame."""
-    texts = {format_operator(selection.candidates_[j]) for j in selection.get_support(True)}
+    texts = {
+        format_operator(selection.candidates_[j]) for j in np.flatnonzero(selection.support_)
+    }
     return {text for text in texts if "@" in text}
 
 

@@ -40,7 +40,7 @@ def info(
     """
     from tpgmm_datasets.description import describe_lerobot
     from tpgmm_datasets.errors import summed_up
-    from tpgmm_torch.notebook import in_columns
+    from tpgmm_torch.checks.report import in_columns
 
     description = describe_lerobot(path)
     for name, value in _summary(description).items():
