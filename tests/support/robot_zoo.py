@@ -2,6 +2,7 @@
 
 import math
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,9 @@ from torch import Tensor
 
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.robots.kinematic_tree import MovingTree, reduce
+from tpgmm_torch.robots.kinematic_tree import Body
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot
-from tpgmm_torch.robots.urdf import read_urdf
 
 HANDS = ("l_hand", "r_hand")
 G1_PATH = Path(
@@ -149,41 +149,27 @@ class Pinocchio:
         return place.translation, place.rotation, np.array(columns).T
 
 
-def tree_of(robot: Robot) -> MovingTree:
-    """The tree of a robot without tools."""
-    config = robot.config()
-    model = read_urdf(config["urdf"])
-    columns = {n: i for i, n in enumerate(robot.joint_names) if n in model.joint}
-    links = [(link, np.eye(4)) for link in robot.links]
-    return reduce(model, config["base"], links, columns, config["locked"])
-
-
-def written_out(tree: MovingTree, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (L, 4, 4) and geometric Jacobians (L, 6, n), joint by joint."""
-    poses: list[np.ndarray] = []
-    axes: list[np.ndarray] = []
-    for frame in tree.frames:
-        value = frame.multiplier * joints[frame.joint] + frame.shift
+def written_out(tree: Sequence[Body], joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (N, 4, 4) and geometric Jacobians (N, 6, n) of all bodies, joint by joint."""
+    poses, jacobians = [np.eye(4)], [np.zeros((6, len(joints)))]
+    for body in tree[1:]:
         motion = np.eye(4)
-        if frame.prismatic:
-            motion[:3, 3] = value * frame.axis
-        else:
-            motion[:3, :3] = Rotation.from_rotvec(value * frame.axis).as_matrix()
-        carrier = poses[frame.parent] if frame.parent >= 0 else np.eye(4)
-        poses.append(carrier @ frame.offset @ motion)
-        axes.append((carrier @ frame.offset)[:3, :3] @ frame.axis)
-    links, jacobians = [], []
-    for link in tree.links:
-        pose = (poses[link.frame] if link.frame >= 0 else np.eye(4)) @ link.pose
-        jacobian = np.zeros((6, len(joints)))
-        for index in tree.moved_by(link.frame):
-            frame, axis = tree.frames[index], axes[index]
-            arm = pose[:3, 3] - poses[index][:3, 3]
-            column = (axis, 0 * axis) if frame.prismatic else (np.cross(axis, arm), axis)
-            jacobian[:, frame.joint] += frame.multiplier * np.concatenate(column)
-        links.append(pose)
-        jacobians.append(jacobian)
-    return np.array(links), np.array(jacobians)
+        if body.joint is not None:
+            value = body.multiplier * joints[body.joint] + body.shift
+            if body.slides:
+                motion[2, 3] = value
+            else:
+                motion[:3, :3] = Rotation.from_rotvec([0, 0, value]).as_matrix()
+        before = poses[body.parent]
+        pose = before @ body.pose @ motion
+        carried = jacobians[body.parent].copy()
+        carried[:3] += np.cross(carried[3:].T, pose[:3, 3] - before[:3, 3]).T
+        if body.joint is not None:
+            axis = body.multiplier * pose[:3, 2]
+            carried[slice(3) if body.slides else slice(3, 6), body.joint] += axis
+        poses.append(pose)
+        jacobians.append(carried)
+    return np.array(poses), np.array(jacobians)
 
 
 def assert_agrees(

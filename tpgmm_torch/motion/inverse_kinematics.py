@@ -260,25 +260,27 @@ def _model(robot: Robot) -> tuple[Any, list[int]]:
     spec.compiler.degree = False
     bodies = [spec.worldbody]
     columns: list[int] = []
-    for frame in robot.tree.frames:
-        name = robot.joint_names[frame.joint]
-        if frame.joint in columns or (frame.multiplier, frame.shift) != (1.0, 0.0):
+    links = iter(robot.links)
+    for one in robot.tree[1:]:
+        if one.joint is None:
+            bodies.append(_add(bodies[one.parent], next(links), one.pose))
+            continue
+        name = robot.joint_names[one.joint]
+        if one.joint in columns or (one.multiplier, one.shift) != (1.0, 0.0):
             raise DataError(
                 f"joint {name!r} moves several links by mimicry, which inverse kinematics does "
                 "not know: lock it, locked={...}, or name links that do not need it"
             )
-        columns.append(frame.joint)
-        slide = mujoco.mjtJoint.mjJNT_SLIDE if frame.prismatic else mujoco.mjtJoint.mjJNT_HINGE
-        body = _add(bodies[frame.parent + 1], f"frame {len(columns)}", frame.offset)
-        ends = [float(limit[frame.joint]) for limit in (robot.lower, robot.upper)]
+        columns.append(one.joint)
+        slide = mujoco.mjtJoint.mjJNT_SLIDE if one.slides else mujoco.mjtJoint.mjJNT_HINGE
+        body = _add(bodies[one.parent], f"frame {len(columns)}", one.pose)
+        ends = [float(limit[one.joint]) for limit in (robot.lower, robot.upper)]
         bounded = all(map(math.isfinite, ends))
-        joint = body.add_joint(name=name, type=slide, axis=frame.axis)
+        joint = body.add_joint(name=name, type=slide, axis=(0.0, 0.0, 1.0))
         joint.limited = int(bounded)
         if bounded:
             joint.range = ends
         bodies.append(body)
-    for link, place in zip(robot.links, robot.tree.links, strict=True):
-        _add(bodies[place.frame + 1], link, place.pose)
     model = spec.compile()
     names = [model.joint(i).name for i in range(model.njnt)]
     return model, [robot.joint_names.index(name) for name in names]

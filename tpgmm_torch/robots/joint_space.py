@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import torch
 
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.robots.kinematics import Described, RobotState
 
 __all__ = ["JointSpace"]
 
 
-class JointSpace(Kinematics):
+class JointSpace(Described):
     """Joints of those ``joint_names`` and nothing else: enough for :class:`Canonical` alone.
 
     ``dtype`` and ``device`` are those of its states.
@@ -25,6 +25,7 @@ class JointSpace(Kinematics):
         device: torch.device | str = "cpu",
     ) -> None:
         self.joint_names = tuple(joint_names)
+        self._config = {"joint_names": list(self.joint_names)}
         self.links = ()
         unbounded = torch.full((len(self.joint_names),), torch.inf, dtype=dtype, device=device)
         self.lower, self.upper, self.velocity = -unbounded, unbounded, unbounded
@@ -33,26 +34,13 @@ class JointSpace(Kinematics):
         """The state with no link in it; see :meth:`Kinematics.state`."""
         joints = self.joint_tensor(joints)
         shapes = (0, 3), (0, 4), (0, 6, self.n_joints)
-        positions, orientations, jacobians = (
-            joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes
-        )
-        names = self.joint_names
-        return RobotState(joints, (), positions, orientations, jacobians, joint_names=names)
-
-    def config(self) -> dict[str, Any]:
-        """Arguments of :meth:`from_config`, ready for JSON."""
-        return {"joint_names": list(self.joint_names)}
+        p, o, jacobians = (joints.new_zeros(*joints.shape[:-1], *shape) for shape in shapes)
+        return RobotState(joints, (), p, o, jacobians, (), self.joint_names)
 
     @classmethod
-    def from_config(cls, config: dict[str, Any]) -> JointSpace:
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
         """The inverse of :meth:`config`."""
         return cls(config["joint_names"])
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, JointSpace) and self.joint_names == other.joint_names
-
-    def __hash__(self) -> int:
-        return hash(self.joint_names)
 
     def __repr__(self) -> str:
         return f"JointSpace({len(self.joint_names)} joints)"

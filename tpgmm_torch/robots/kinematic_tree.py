@@ -1,4 +1,4 @@
-"""The part of a URDF that moves some links with respect to a base: a tree of moving frames.
+"""The part of a URDF that moves some links with respect to a base: a tree of bodies.
 
 :func:`reduce` hangs the tree on the base link, whichever it is, keeps the joints on the way
 from there to the wanted links, and folds all that does not move (fixed and locked joints,
@@ -6,7 +6,6 @@ tools) into constant matrices. Seen from the base a joint on the way *up* to the
 the other way round, so a base that is itself moved by joints needs no formulas of its own.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -14,62 +13,38 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.urdf import FREEDOMS, UrdfJoint, UrdfModel
+from tpgmm_torch.robots.urdf import FREEDOMS, UrdfJoint, UrdfModel, motion
 
-__all__ = ["Attachment", "MovingFrame", "MovingTree", "motion", "reduce"]
+__all__ = ["Body", "reduce"]
 
 
 @dataclass(frozen=True, eq=False)
-class MovingFrame:
-    """The frame behind one moving joint.
+class Body:
+    """A frame in that of another body; if a joint moves it, about or along its z axis.
 
-    Its pose is the parent's pose times ``offset`` times the motion by
-    ``multiplier * q[joint] + shift`` about (or, if ``prismatic``, along) ``axis``.
+    Its pose is the parent's pose times ``pose`` times the motion by
+    ``multiplier * q[joint] + shift``.
 
     Attributes
     ----------
-    parent, joint : int
-        Indices of the moving frame that carries it, -1 the base; and of what moves it in the
-        joint vector.
-    offset, axis : ndarray of shape (4, 4) and (3,)
-        Pose of the joint in the parent frame, and a unit vector in the frame.
-    prismatic : bool
-        Whether it slides instead of turning.
+    parent : int
+        Index of the body that carries it; 0 is the base, which carries itself.
+    pose : ndarray of shape (4, 4)
+        In the parent's frame, where the motion is zero.
+    joint : int or None
+        Index in the joint vector of what moves it; None if it is fixed to its parent.
+    slides : bool
+        Whether it moves along its axis, instead of about it.
     multiplier, shift : float
         How it follows that joint; 1 and 0 unless it mimics.
     """
 
     parent: int
-    offset: Array
-    axis: Array
-    prismatic: bool
-    joint: int
-    multiplier: float
-    shift: float
-
-
-@dataclass(frozen=True, eq=False)
-class Attachment:
-    """Where something sits: ``pose`` (4, 4) in the moving frame ``frame``; -1 is the base."""
-
-    frame: int
     pose: Array
-
-
-@dataclass(frozen=True, eq=False)
-class MovingTree:
-    """Moving frames, parents first, and where the wanted links sit on them."""
-
-    frames: tuple[MovingFrame, ...]
-    links: tuple[Attachment, ...]
-
-    def moved_by(self, frame: int) -> set[int]:
-        """Indices of the moving frames from the base to ``frame``, itself included."""
-        moving: set[int] = set()
-        while frame >= 0:
-            moving.add(frame)
-            frame = self.frames[frame].parent
-        return moving
+    joint: int | None = None
+    slides: bool = False
+    multiplier: float = 1.0
+    shift: float = 0.0
 
 
 def reduce(
@@ -78,7 +53,7 @@ def reduce(
     links: Sequence[tuple[str, Array]],
     joints: Mapping[str, int],
     locked: Mapping[str, float],
-) -> MovingTree:
+) -> tuple[Body, ...]:
     """Reduce the description ``model`` to what moves ``links`` with respect to ``base``.
 
     Parameters
@@ -92,13 +67,18 @@ def reduce(
     locked : mapping of str to float
         Values at which all other actuated joints stand [rad or m].
 
+    Returns
+    -------
+    tuple of Body
+        The base, what joints move, parents first, and the wanted links.
+
     Raises
     ------
     DataError
         If a joint of several degrees of freedom lies between the base and a link.
     """
-    frames: list[MovingFrame] = []
-    places = {base: Attachment(-1, np.eye(4))}
+    bodies = [Body(0, np.eye(4))]
+    places = {base: (0, np.eye(4))}  # of each link, the body that it is fixed to, and where
     steps = _steps_from(model, base)
     for link, _ in links:
         way = [link]
@@ -106,11 +86,20 @@ def reduce(
             way.append(steps[way[-1]][1])
         for far in reversed(way[:-1]):
             joint, near = steps[far]
-            places[far] = _cross(model, joint, near, places[near], joints, locked, frames)
-    attached = [
-        Attachment(places[link].frame, places[link].pose @ pose) for link, pose in links
-    ]
-    return MovingTree(tuple(frames), tuple(attached))
+            carrier, pose = places[near]
+            before, axis, after = _crossing(joint, near)
+            leader = model.leader(joint.name) if joint.movable else None
+            if leader and leader.joint in joints:
+                turn = _z_to(axis)
+                column, slides = joints[leader.joint], joint.type == "prismatic"
+                follow = column, slides, leader.multiplier, leader.offset
+                bodies.append(Body(carrier, pose @ before @ turn, *follow))
+                places[far] = len(bodies) - 1, turn.T @ after
+            else:
+                at = leader.multiplier * locked[leader.joint] + leader.offset if leader else 0.0
+                places[far] = carrier, pose @ before @ motion(joint.type, axis, at) @ after
+    ends = [(places[link], pose) for link, pose in links]
+    return (*bodies, *(Body(carrier, place @ pose) for (carrier, place), pose in ends))
 
 
 def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:
@@ -126,64 +115,24 @@ def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]
     return steps
 
 
-def _cross(
-    model: UrdfModel,
-    joint: UrdfJoint,
-    near: str,
-    place: Attachment,
-    joints: Mapping[str, int],
-    locked: Mapping[str, float],
-    frames: list[MovingFrame],
-) -> Attachment:
-    """Where the far link of a joint sits; a joint that moves adds its frame to ``frames``."""
+def _crossing(joint: UrdfJoint, near: str) -> tuple[Array, Array, Array]:
+    """From the near link of a joint to the far one: a pose, the axis of a motion, a pose."""
     if FREEDOMS[joint.type] > 1:
         raise DataError(
             f"joint {joint.name!r} of type {joint.type!r} lies between the base and the links: "
             "joints of several degrees of freedom are not supported; give a base beyond it, "
             f"base={joint.child!r} or below, or describe it by prismatic and revolute joints"
         )
-    downwards = joint.parent == near
-    before = place.pose @ joint.origin if downwards else place.pose
-    if not joint.movable:
-        return Attachment(place.frame, before if downwards else before @ _inverse(joint.origin))
-    after = np.eye(4) if downwards else _inverse(joint.origin)
-    leader = model.leader(joint.name)
-    axis = joint.axis if downwards else -joint.axis
-    if leader.joint in joints:
-        prismatic, column = joint.type == "prismatic", joints[leader.joint]
-        frames.append(
-            MovingFrame(
-                place.frame, before, axis, prismatic, column, leader.multiplier, leader.offset
-            )
-        )
-        return Attachment(len(frames) - 1, after)
-    value = leader.multiplier * locked[leader.joint] + leader.offset
-    return Attachment(place.frame, before @ motion(joint.type, axis, value) @ after)
+    if joint.parent == near:
+        return joint.origin, joint.axis, np.eye(4)
+    back = np.asarray(np.linalg.inv(joint.origin), np.float64)
+    return np.eye(4), -joint.axis, back
 
 
-def motion(kind: str, axis: Array, value: float) -> Array:
-    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation).
-
-    Parameters
-    ----------
-    kind : str
-        A type of URDF joints; "prismatic" slides, others turn.
-    axis : ndarray of shape (3,)
-        A unit vector.
-    value : float
-        Metres or radians.
-    """
+def _z_to(axis: Array) -> Array:
+    """A rotation that takes the z axis to a unit vector, as a homogeneous matrix."""
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first /= np.linalg.norm(first)
     matrix = np.eye(4)
-    if kind == "prismatic":
-        matrix[:3, 3] = value * axis
-        return matrix
-    cross = np.cross(axis, np.eye(3)).T
-    matrix[:3, :3] += math.sin(value) * cross + (1.0 - math.cos(value)) * (cross @ cross)
+    matrix[:3, :3] = np.column_stack((first, np.cross(axis, first), axis))
     return matrix
-
-
-def _inverse(pose: Array) -> Array:
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse

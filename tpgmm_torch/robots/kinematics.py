@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import abc
 import copy
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
@@ -23,29 +24,22 @@ from tpgmm_torch.data.pose_names import is_gripper
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.gaussians import common_shape
 
-__all__ = ["Kinematics", "RobotState", "dtype_name", "dtype_named"]
-
-DTYPES = {"float32": torch.float32, "float64": torch.float64}
+__all__ = ["Described", "Kinematics", "RobotState", "checked_dtype"]
 
 
-def dtype_named(name: Any) -> torch.dtype:
-    """The dtype of a robot by ``name``, ``"float32"`` or ``"float64"``.
+def checked_dtype(dtype: Any) -> torch.dtype:
+    """The ``dtype`` of a robot, also given by its name, ``"float32"`` or ``"float64"``.
 
     Raises
     ------
     DataError
         If it is another.
     """
-    if name not in DTYPES:
-        raise DataError(f"a robot's dtype is one of {list(DTYPES)}, got {name!r}")
-    return DTYPES[name]
-
-
-def dtype_name(dtype: torch.dtype) -> str:
-    """The inverse of :func:`dtype_named`, for a ``dtype`` that a robot can have."""
+    known = {"float32": torch.float32, "float64": torch.float64}
     name = str(dtype).removeprefix("torch.")
-    dtype_named(name)
-    return name
+    if name not in known:
+        raise DataError(f"a robot's dtype is one of {list(known)}, got {dtype!r}")
+    return known[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,39 +178,33 @@ class RobotState:
             orientation = torch.where(where[..., None], orientation, self.orientation(name))
             jacobian = torch.where(where[..., None, None], jacobian, self.jacobian(name))
             carrier = torch.where(where, carrier, self.carrier(name))
-        known = self._without(name) if name in self.links else self
-        shape = carrier.shape if isinstance(carrier, Tensor) else torch.Size()
-        batch = common_shape(known.joints.shape[:-1], position.shape[:-1], shape)
+        kept = [i for i, one in enumerate(self.links) if one != name]
+        carriers = (
+            *(
+                self.carriers[i - len(self.robot_links)]
+                for i in kept
+                if i >= len(self.robot_links)
+            ),
+            carrier,
+        )
+        shapes = [one.shape for one in carriers if isinstance(one, Tensor)]
+        batch = common_shape(self.joints.shape[:-1], position.shape[:-1], *shapes)
 
         def joined(links: Tensor, new: Tensor, rank: int) -> Tensor:
-            tail = new.shape[-rank:]
-            one = new.expand(*batch, *tail).unsqueeze(-1 - rank)
-            return torch.cat((links.expand(*batch, -1, *tail), one), -1 - rank)
+            shape = *batch, *new.shape[new.ndim - rank :]
+            old = (links.select(-1 - rank, i).expand(shape) for i in kept)
+            return torch.stack((*old, new.expand(shape)), -1 - rank)
 
-        return replace(
-            known,
-            joints=known.joints.expand(*batch, -1),
-            links=(*known.links, name),
-            positions=joined(known.positions, position, 1),
-            orientations=joined(known.orientations, orientation, 1),
-            jacobians=joined(known.jacobians, jacobian, 2),
-            carriers=tuple(
-                one.expand(batch) if isinstance(one, Tensor) else one
-                for one in (*known.carriers, carrier)
-            ),
-        )
-
-    def _without(self, name: str) -> Self:
-        """The state without one of its objects."""
-        kept = [i for i, link in enumerate(self.links) if link != name]
-        first = len(self.robot_links)
         return replace(
             self,
-            links=tuple(self.links[i] for i in kept),
-            positions=self.positions[..., kept, :],
-            orientations=self.orientations[..., kept, :],
-            jacobians=self.jacobians[..., kept, :, :],
-            carriers=tuple(self.carriers[i - first] for i in kept[first:]),
+            joints=self.joints.expand(*batch, -1),
+            links=(*(self.links[i] for i in kept), name),
+            positions=joined(self.positions, position, 1),
+            orientations=joined(self.orientations, orientation, 1),
+            jacobians=joined(self.jacobians, jacobian, 2),
+            carriers=tuple(
+                one.expand(batch) if isinstance(one, Tensor) else one for one in carriers
+            ),
         )
 
     def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
@@ -362,7 +350,13 @@ class Kinematics(abc.ABC):
             If a value is not finite.
         """
         if isinstance(joints, Mapping):
-            joints = self._by_name(joints)
+            for name in self.joint_names:
+                if name not in joints:
+                    raise UnknownNameError("joint", name, "the joints given", joints)
+            columns = [as_tensor(joints[name], f"joint {name!r}") for name in self.joint_names]
+            if len(shapes := {tuple(column.shape) for column in columns}) > 1:
+                raise ShapeError(f"joints given by name have one shape, got {sorted(shapes)}")
+            joints = torch.stack([column.to(self.lower) for column in columns], -1)
         tensor = as_tensor(joints, "joints").to(self.lower.device, self.lower.dtype)
         if tensor.ndim == 0 or tensor.shape[-1] != self.n_joints:
             raise ShapeError(
@@ -370,16 +364,6 @@ class Kinematics(abc.ABC):
                 f"{list(self.joint_names)}, got {tuple(tensor.shape)}"
             )
         return tensor
-
-    def _by_name(self, joints: Mapping[str, Any]) -> Tensor:
-        for name in self.joint_names:
-            if name not in joints:
-                raise UnknownNameError("joint", name, "the joints given", joints)
-        columns = [as_tensor(joints[name], f"joint {name!r}") for name in self.joint_names]
-        shapes = {tuple(column.shape) for column in columns}
-        if len(shapes) > 1:
-            raise ShapeError(f"joints given by name have one shape, got {sorted(shapes)}")
-        return torch.stack([column.to(self.lower) for column in columns], -1)
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
@@ -395,3 +379,19 @@ class Kinematics(abc.ABC):
 
     def __sklearn_clone__(self) -> Self:
         return self
+
+
+class Described(Kinematics):
+    """Kinematics that a dict for JSON, ``_config``, defines but for their device."""
+
+    _config: dict[str, Any]
+
+    def config(self) -> dict[str, Any]:
+        """Arguments of ``from_config``, ready for JSON."""
+        return copy.deepcopy(self._config)
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and other._config == self._config
+
+    def __hash__(self) -> int:
+        return hash((type(self), json.dumps(self._config, sort_keys=True)))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-import json
+import itertools
 import math
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any, Self
+from xml.etree import ElementTree
 
 import numpy as np
 import torch
@@ -18,13 +18,20 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
-from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
+from tpgmm_torch.robots.kinematics import Described, Kinematics, RobotState, checked_dtype
 from tpgmm_torch.robots.mjcf import mjcf_to_urdf
-from tpgmm_torch.robots.urdf import UrdfJoint, UrdfModel, description_text, parse_xml, read_urdf
-from tpgmm_torch.robots.urdf_writer import joined
+from tpgmm_torch.robots.urdf import (
+    X_AXIS,
+    UrdfJoint,
+    UrdfModel,
+    description_text,
+    free_name,
+    joint_element,
+    parse_xml,
+    read_urdf,
+)
 
 __all__ = ["Kinematics", "Robot", "RobotState"]
 
@@ -32,7 +39,7 @@ __all__ = ["Kinematics", "Robot", "RobotState"]
 MOST_JOINTS = 1000
 
 
-class Robot(Kinematics):
+class Robot(Described):
     """A robot described by a URDF; made by :meth:`from_urdf`, or from what becomes one.
 
     Arms which share a waist share its columns in the stacked Jacobian. Two robots are equal if
@@ -104,12 +111,12 @@ class Robot(Kinematics):
         config = {
             "urdf": model.text,
             "links": list(_names("links", links)),
-            "joints": list(columns),
+            "joints": columns,
             "locked": fixed,
             "coordinates": list(extra),
             "base": model.root if base is None else base,
             "tools": {name: _tool(name, tool) for name, tool in dict(tools or {}).items()},
-            "dtype": dtype_name(dtype),
+            "dtype": str(dtype).removeprefix("torch."),
         }
         return cls(model, config, device)
 
@@ -151,32 +158,6 @@ class Robot(Kinematics):
         ([0.5, 0.0, 1.3], [2.0])
         """
         return cls.from_urdf(mjcf_to_urdf(mjcf), links, **settings)
-
-    @classmethod
-    def from_chain(cls, chain: Any, links: Sequence[str], **settings: Any) -> Self:
-        """Build the kinematics of some frames of a ``pytorch_kinematics.Chain``.
-
-        That library reads SDF, too. It reads in single precision: its poses are 1e-8 to 1e-7 m
-        and rad away from those of the file, here as there, and what mimics another joint
-        moves freely. Of a URDF and an MJCF :meth:`from_urdf` and :meth:`from_mjcf` keep every
-        digit. A chain that was built in float64 keeps its digits here.
-
-        Parameters
-        ----------
-        chain : pytorch_kinematics.Chain
-            Or what is derived from it; it is not kept.
-        links : sequence of str
-            Names of the frames (or ``tools``) whose poses are wanted.
-        **settings
-            As for :meth:`from_urdf`. Everything is seen from where the chain begins,
-            ``world``, unless ``base`` is given.
-
-        Raises
-        ------
-        DataError, UnknownNameError
-            If it is no chain, or as for :meth:`from_urdf`.
-        """
-        return cls.from_urdf(chain_to_urdf(chain), links, **settings)
 
     @classmethod
     def from_file(
@@ -244,18 +225,37 @@ class Robot(Kinematics):
         """
         if not robots or not all(isinstance(robot, Robot) for robot in robots.values()):
             raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
-        for name in poses or ():
-            if name not in robots:
-                raise UnknownNameError("robot", name, "the robots to combine", robots)
-        parts = {}
+        for name in set(poses or ()) - set(robots):
+            raise UnknownNameError("robot", name, "the robots to combine", robots)
+        still = Frame([0.0, 0.0, 0.0])
+        roots = dict(fixed or {})
+        settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
+        settings |= {"locked": {}, "tools": {}}
+        parts = []
         for name, robot in robots.items():
-            place = _matrix(poses[name]) if poses and name in poses else np.eye(4)
-            parts[name] = robot.model, place @ robot._root_in_base(name)
-        settings = _side_by_side({name: robot._config for name, robot in robots.items()})
-        still = {link: _matrix(pose) for link, pose in dict(fixed or {}).items()}
+            config, place = robot._config, (poses or {}).get(name, still)
+            roots[f"{name}_{robot.model.root}"] = place.to(torch.float64).compose(robot._root())
+            parts += _prefixed(name, robot.model)
+            for key in ("links", "joints", "coordinates"):
+                settings[key] += [f"{name}_{one}" for one in config[key]]
+            settings["locked"] |= {
+                f"{name}_{joint}": at for joint, at in config["locked"].items()
+            }
+            for tool, (parent, *pose) in config["tools"].items():
+                settings["tools"][f"{name}_{tool}"] = f"{name}_{parent}", *pose
+        urdf = ElementTree.Element("robot", name=" and ".join(robots))
+        urdf.extend(
+            ElementTree.Element("link", name=link) for link in ("world", *(fixed or ()))
+        )
+        urdf.extend(parts)
+        taken = [part.get("name", "") for part in parts]
+        for link, frame in roots.items():
+            mount = free_name(f"{link}_mount", taken)
+            joint = UrdfJoint(mount, "fixed", "world", link, _matrix(frame), X_AXIS)
+            urdf.append(joint_element(joint))
         first = next(iter(robots.values())).lower
-        options: dict[str, Any] = {"dtype": first.dtype, "device": first.device}
-        return cls.from_urdf(joined(parts, "world", still), base=base, **settings, **options)
+        settings |= {"base": base, "dtype": first.dtype, "device": first.device}
+        return cls.from_urdf(ElementTree.tostring(urdf, encoding="unicode"), **settings)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -270,16 +270,16 @@ class Robot(Kinematics):
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
         self.angles = tuple(i for i in column.values() if i not in self.lengths)
-        tree = reduce(model, *_wanted(model, config), column, config["locked"])
-        if max(len(self.joint_names), len(tree.frames)) > MOST_JOINTS:
+        #: What moves the links with respect to the base, these last; see ``reduce``.
+        self.tree = reduce(model, *_wanted(model, config), column, config["locked"])
+        moving = len(self.tree) - len(self.links) - 1
+        if max(self.n_joints, moving) > MOST_JOINTS:
             raise DataError(
-                f"the robot has {len(self.joint_names)} joints, {len(tree.frames)} of them "
-                f"between its base and links; more than {MOST_JOINTS} are not supported: "
-                "choose some, joints=[...], or lock some, locked={...}"
+                f"the robot has {self.n_joints} joints, {moving} of them between its base and "
+                f"links; more than {MOST_JOINTS} are not supported: choose some, "
+                "joints=[...], or lock some, locked={...}"
             )
-        #: What moves the links with respect to the base.
-        self.tree = tree
-        options: dict[str, Any] = {"dtype": dtype_named(config["dtype"]), "device": device}
+        options: dict[str, Any] = {"dtype": checked_dtype(config["dtype"]), "device": device}
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
@@ -287,7 +287,9 @@ class Robot(Kinematics):
             self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
                 **options
             )
-            self.forward_kinematics = TreeKinematics(tree, self.n_joints, **options)
+            self.forward_kinematics = TreeKinematics(
+                self.tree, len(self.links), self.n_joints, **options
+            )
 
     def state(self, joints: Any) -> RobotState:
         """Poses and Jacobians of all links at ``joints``, array-like of shape (..., n_joints).
@@ -306,61 +308,52 @@ class Robot(Kinematics):
         elif len(batch) > 1:
             parts = tuple(part.unflatten(0, batch) for part in parts)
         positions, orientations, jacobians = parts
-        names = self.joint_names
         return RobotState(
-            joints, self.links, positions, orientations, jacobians, joint_names=names
+            joints, self.links, positions, orientations, jacobians, (), self.joint_names
         )
 
     def to(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> Self:
         """The robot of another dtype or on another device; itself if nothing changes."""
-        name = dtype_name(dtype or self.lower.dtype)
+        name = str(dtype or self.lower.dtype).removeprefix("torch.")
         device = self.lower.device if device is None else torch.device(device)
         if name == self._config["dtype"] and device == self.lower.device:
             return self
         return self.from_config({**self._config, "dtype": name}, device)
 
-    def config(self) -> dict[str, Any]:
-        """Everything that defines the robot but its device, ready for JSON."""
-        return copy.deepcopy(self._config)
-
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """The robot that gave this :meth:`config`."""
-        settings = dict(config)
-        dtype = dtype_named(settings.pop("dtype", None))
-        expected = {"urdf", "links", "joints", "locked", "coordinates", "base", "tools"}
-        text = settings.get("urdf")
-        if set(settings) != expected:
+        expected = {
+            "urdf",
+            "links",
+            "joints",
+            "locked",
+            "coordinates",
+            "base",
+            "tools",
+            "dtype",
+        }
+        if set(config) != expected:
             raise DataError(
-                f"a robot's configuration has the keys {sorted(expected)} and 'dtype', got "
-                f"{sorted(settings)}"
+                f"a robot's configuration has the keys {sorted(expected)}, got {sorted(config)}"
             )
-        if not isinstance(text, str) or not text.startswith("<"):
+        if not isinstance(config["urdf"], str) or not config["urdf"].startswith("<"):
             raise DataError("a robot's configuration holds the text of its URDF, not a path")
-        return cls.from_urdf(**settings, dtype=dtype, device=device)
+        dtype = checked_dtype(config["dtype"])
+        return cls.from_urdf(**{**config, "dtype": dtype, "device": device})
 
-    def _root_in_base(self, name: str) -> Array:
+    def _root(self) -> Frame:
         """Where the root of the description is in the frame of the base, which it must hold."""
-        model, base, root = self.model, self._config["base"], [(self.model.root, np.eye(4))]
-        columns = {joint: i for i, joint in enumerate(self.joint_names) if joint in model.joint}
-        [place] = reduce(model, base, root, columns, self._config["locked"]).links
-        if place.frame >= 0:
+        config = self._config | {"links": [self.model.root], "dtype": "float64"}
+        state = self.from_config(config).state(torch.zeros(self.n_joints))
+        if state.jacobians.any():
             raise DataError(
-                f"the base {base!r} of the robot {name!r} is moved by its joints: give it a "
-                f"base that stands still to combine it, base={model.root!r}"
+                f"the base {config['base']!r} of a robot is moved by its joints: give it one "
+                f"that stands still to combine it, base={self.model.root!r}"
             )
-        return place.pose
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and other._config == self._config
-
-    def __hash__(self) -> int:
-        return hash((type(self), json.dumps(self._config, sort_keys=True)))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(self).from_config, (self._config, str(self.lower.device))
+        return state.pose(self.model.root)
 
     def __repr__(self) -> str:
         dtype = "" if self._config["dtype"] == "float64" else f", {self._config['dtype']}"
@@ -384,82 +377,53 @@ def _joint_vector(
     joints: str | Sequence[str] | None,
     coordinates: tuple[str, ...],
     locked: Mapping[str, float],
-) -> tuple[tuple[str, ...], dict[str, float]]:
+) -> tuple[list[str], dict[str, float]]:
     """Names of the joint vector, and where all other actuated joints stand."""
     chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
-    columns = _columns_named(model, chosen, coordinates)
-    fixed = _locked(model, locked, columns)
+    columns, standing = _fitting(model, chosen, coordinates), _fitting(model, locked)
+    fixed = {
+        name: float(locked[given])
+        for name, given in standing.items()
+        if name == given or name not in columns
+    }
     if joints is None:
-        columns = {name: None for name in model.actuated if name not in fixed}
-    columns |= dict.fromkeys(coordinates)
-    _check_joints(model, columns, coordinates, fixed)
+        columns = {name: name for name in model.actuated if name not in fixed}
+    columns |= {name: name for name in coordinates}
+    for name in columns.keys() & fixed.keys():
+        raise DataError(f"joint {name!r} is both in the joint vector and locked")
+    for name, value in fixed.items():
+        if not math.isfinite(value):
+            raise DataError(f"joint {name!r} is locked at {value}: expected a finite number")
+    for name in model.joint.keys() & set(coordinates):
+        raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
     still = (name for name in model.actuated if name not in columns)
-    return tuple(columns), {name: float(fixed.get(name, 0.0)) for name in still}
+    return list(columns), {name: fixed.get(name, 0.0) for name in still}
 
 
-def _columns_named(
-    model: UrdfModel, names: Sequence[str], coordinates: Sequence[str]
-) -> dict[str, None]:
-    """The names, with the joints that fit the patterns among them in the place of each."""
-    named, columns = model.joint.keys() & names, dict[str, None]()
+def _fitting(
+    model: UrdfModel, names: Collection[str], coordinates: Sequence[str] = ()
+) -> dict[str, str]:
+    """The joints or coordinates of some names and patterns, each with what it is named by.
+
+    A pattern stands for the actuated joints that fit it and are not named themselves.
+    """
+    found: dict[str, str] = {}
     for name in names:
-        fits = [name] if name in coordinates else _fitting(model, name)
-        columns |= dict.fromkeys(fit for fit in fits if fit == name or fit not in named)
-    return columns
-
-
-def _locked(
-    model: UrdfModel, locked: Mapping[str, float], columns: Collection[str]
-) -> dict[str, float]:
-    """Where joints are locked; patterns stand for those that are neither named nor move."""
-    fixed = {name: value for name, value in locked.items() if name in model.joint}
-    for name in locked:
-        if name not in model.joint:
-            fits = [fit for fit in _fitting(model, name) if fit not in columns]
-            if not fits:
-                raise DataError(
-                    f"locked has {name!r}, and all joints that it names are in the joint vector"
-                )
-            fixed = dict.fromkeys(fits, locked[name]) | fixed
-    return fixed
-
-
-def _fitting(model: UrdfModel, name: str) -> list[str]:
-    """The joint of that name, or the actuated ones that fit it as a pattern."""
-    if name in model.joint or not set(name) & set("*?["):
-        return [name]
-    fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
-    if not fits:
-        raise UnknownNameError("joint", name, "the movable joints of the URDF", model.actuated)
-    return fits
-
-
-def _check_joints(
-    model: UrdfModel,
-    columns: Collection[str],
-    coordinates: Sequence[str],
-    locked: Mapping[str, float],
-) -> None:
-    """Whether each coordinate, joint and locked joint can be what it is said to be."""
-    for name in coordinates:
-        if name in model.joint:
-            raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
-    for name in (*(name for name in columns if name not in coordinates), *locked):
-        mimic = model.movable[name].mimic if name in model.movable else None
-        if mimic is not None:
+        joint = model.movable.get(name)
+        if joint is not None and joint.mimic is not None:
             raise DataError(
-                f"joint {name!r} mimics {mimic.joint!r} and cannot be chosen or locked: "
+                f"joint {name!r} mimics {joint.mimic.joint!r} and cannot be chosen or locked: "
                 f"choose or lock {model.leader(name).joint!r}"
             )
-        if name not in model.movable:
+        fits = [joint for joint in model.actuated if fnmatchcase(joint, name)]
+        if joint is not None or name in coordinates:
+            fits = [name]
+        if not fits:
             where = "the movable joints of the URDF (a coordinate without kinematics, like a "
             where += "gripper, is named in coordinates)"
             raise UnknownNameError("joint", name, where, model.actuated)
-    for name, value in locked.items():
-        if name in columns:
-            raise DataError(f"joint {name!r} is both in the joint vector and locked")
-        if not math.isfinite(value):
-            raise DataError(f"joint {name!r} is locked at {value}: expected a finite number")
+        found |= {fit: name for fit in fits if fit == name or fit not in {*names, *found}}
+    return found
 
 
 def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
@@ -499,17 +463,15 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
     return config["base"], [places[link] for link in config["links"]]
 
 
-def _side_by_side(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Settings of robots by name, which stands before the names of what is theirs."""
-    settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
-    settings |= {"locked": {}, "tools": {}}
-    for robot, config in configs.items():
-        for key in ("links", "joints", "coordinates"):
-            settings[key] += [f"{robot}_{name}" for name in config[key]]
-        settings["locked"] |= {f"{robot}_{name}": at for name, at in config["locked"].items()}
-        for tool, (parent, *pose) in config["tools"].items():
-            settings["tools"][f"{robot}_{tool}"] = f"{robot}_{parent}", *pose
-    return settings
+def _prefixed(prefix: str, model: UrdfModel) -> list[ElementTree.Element]:
+    """Links, joints and materials of a robot, with a prefix before all their names."""
+    robot = parse_xml(model.text)
+    parts = [part for part in robot if part.tag in ("link", "joint", "material")]
+    for element in itertools.chain.from_iterable(part.iter() for part in parts):
+        for key in ("name", "link", "joint"):
+            if element.get(key):
+                element.set(key, f"{prefix}_{element.get(key)}")
+    return parts
 
 
 def _matrix(pose: Frame) -> Array:
@@ -525,7 +487,8 @@ def _matrix(pose: Frame) -> Array:
 def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
     """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
 
-    Coordinates without kinematics have no limits, and lack none.
+    What mimics a joint limits it too. Coordinates without kinematics have no limits, and lack
+    none.
     """
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
     without = set()
@@ -536,26 +499,24 @@ def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, 
         if endless or math.isinf(joint.velocity):
             without.add(name)
     for joint in model.movable.values():
-        if joint.mimic is not None:
-            without |= _limit_leader(model, joint, rows)
-    limits = torch.tensor(list(rows.values()), dtype=torch.float64, device="cpu")
+        if joint.mimic is not None and not _limit_leader(model, joint, rows):
+            without.add(model.leader(joint.name).joint)
+    limits = torch.tensor(list(rows.values()), dtype=torch.float64)
     return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
 
 
-def _limit_leader(
-    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]]
-) -> set[str]:
+def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]]) -> bool:
     """Apply the limits of a joint that mimics another to that other, which moves with it.
 
-    Limits that leave it a single point, as where a sign was forgotten, are none: its name is
-    returned.
+    Limits that leave it a single point, as where a sign was forgotten, are none: the answer
+    is False.
     """
     try:
         leader = model.leader(joint.name)
     except TPGMMError:  # raised where it matters: for a link that depends on it
-        return set()
+        return True
     if leader.joint not in rows or leader.multiplier == 0:
-        return set()
+        return True
     row, factor = rows[leader.joint], leader.multiplier
     rates = joint.velocity, joint.acceleration, joint.jerk
     row[2:] = [min(old, new / abs(factor)) for old, new in zip(row[2:], rates, strict=True)]
@@ -568,6 +529,6 @@ def _limit_leader(
             f"{leader.joint} + {leader.offset:g}: correct one of them in the URDF"
         )
     if high - low < 1e-9 < row[1] - row[0]:
-        return {leader.joint}
+        return False
     row[:2] = low, high
-    return set()
+    return True

@@ -17,7 +17,7 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState, dtype_name, dtype_named
+from tpgmm_torch.robots.kinematics import Described, RobotState, checked_dtype
 
 __all__ = ["Poses", "PosesState"]
 
@@ -44,7 +44,7 @@ class PosesState(RobotState):
         return slice(end - 4, end)
 
 
-class Poses(Kinematics):
+class Poses(Described):
     """Tracked bodies in place of a robot: the joint vector holds their poses.
 
     Parameters
@@ -73,6 +73,8 @@ class Poses(Kinematics):
             raise DataError(f"links is a sequence of different names, got {links!r}")
         self.links = tuple(links)
         self.orientation = bool(orientation)
+        name = str(dtype).removeprefix("torch.")
+        self._config = {"links": list(links), "orientation": self.orientation, "dtype": name}
         parts = ("x", "y", "z", "qw", "qx", "qy", "qz")[: 7 if orientation else 3]
         self.joint_names = tuple(f"{link}.{part}" for link in self.links for part in parts)
         width, n = len(parts), self.n_joints
@@ -111,14 +113,9 @@ class Poses(Kinematics):
             unit = quaternions.identity(joints.dtype, joints.device)
             orientations, angular = unit.expand(*poses.shape[:-1], 4), torch.zeros_like(linear)
         jacobians = torch.cat((linear, angular), dim=-2)
-        return PosesState(
-            joints,
-            self.links,
-            poses[..., :3],
-            orientations,
-            jacobians,
-            joint_names=self.joint_names,
-        )
+        names = self.joint_names
+        parts = poses[..., :3], orientations, jacobians
+        return PosesState(joints, self.links, *parts, joint_names=names)
 
     def retract(self, joints: Tensor) -> Tensor:
         """Bring the quaternions in (..., n_joints) back to unit norm."""
@@ -161,11 +158,6 @@ class Poses(Kinematics):
                 columns.append(quaternions.continuous(turn) if turn.ndim > 1 else turn)
         return torch.cat(columns, dim=-1)
 
-    def config(self) -> dict[str, Any]:
-        """Everything that defines the poses but their device, ready for JSON."""
-        dtype = dtype_name(self.lower.dtype)
-        return {"links": list(self.links), "orientation": self.orientation, "dtype": dtype}
-
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """The poses that gave this :meth:`config`."""
@@ -175,14 +167,8 @@ class Poses(Kinematics):
                 f"the configuration of poses has the keys {sorted(expected)}, got "
                 f"{sorted(config)}"
             )
-        dtype = dtype_named(config["dtype"])
+        dtype = checked_dtype(config["dtype"])
         return cls(config["links"], config["orientation"], dtype, device)
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is type(self) and other.config() == self.config()
-
-    def __hash__(self) -> int:
-        return hash((type(self), self.links, self.orientation))
 
     def __repr__(self) -> str:
         return f"Poses(links={self.links}, orientation={self.orientation})"

@@ -1,4 +1,4 @@
-"""Reader of URDF robot descriptions: the links, and the joints that hold them together.
+"""Reader and writer of URDF robot descriptions: the links, and the joints between them.
 
 Only kinematics is read: meshes, inertia, transmissions and plugins are passed over. What
 the `URDF specification <https://wiki.ros.org/urdf/XML>`_ leaves out of a joint has its
@@ -7,8 +7,9 @@ default there (axis ``1 0 0``, no offset). Numbers stay float64.
 
 import math
 import os
-import re
-from collections.abc import Sequence
+import sys
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,10 +28,17 @@ __all__ = [
     "UrdfJoint",
     "UrdfModel",
     "description_text",
+    "free_name",
     "is_text",
+    "joint_element",
+    "motion",
+    "numbers",
+    "origin",
     "parse_xml",
     "placement",
     "read_urdf",
+    "roll_pitch_yaw",
+    "write_urdf",
 ]
 
 #: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.
@@ -45,11 +53,6 @@ FREEDOMS = {
 XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
 #: What may stand before the first element of a text: a byte order mark, and space.
 BEFORE_XML = "\ufeff \t\r\n"
-#: What to do with a description that begins with another element.
-OTHER_FORMATS = {
-    "mujoco": ": that is an MJCF, Robot.from_mjcf reads it",
-    "sdf": ": that is an SDF; pytorch_kinematics reads it, Robot.from_chain takes its chain",
-}
 #: The axis of a joint that names none.
 X_AXIS = np.array([1.0, 0.0, 0.0])
 #: Lengths [m] and factors beyond this are mistakes, and their products would not be finite.
@@ -171,6 +174,37 @@ class UrdfModel:
         raise DataError(f"joint {name!r} follows joints that mimic one another in a circle")
 
 
+def is_text(source: str | bytes | os.PathLike[str]) -> bool:
+    """Whether a description, ``source``, is given as text, and not as the path of a file."""
+    return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
+
+
+def description_text(source: str | bytes | os.PathLike[str]) -> str:
+    """The text of a robot's description.
+
+    Parameters
+    ----------
+    source : str, bytes or path
+        A path, or the text itself (bytes, or a string that begins with ``<``).
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, or is not UTF-8.
+    """
+    if is_text(source):
+        return str(source).lstrip(BEFORE_XML)
+    try:
+        content = source if isinstance(source, bytes) else read_whole(Path(source))
+        return content.decode("utf-8-sig").lstrip()
+    except UnicodeDecodeError as error:
+        raise DataError(
+            f"the robot's description is not UTF-8 text, convert it: {error}"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise DataError(f"the robot's description cannot be read: {error}") from error
+
+
 def parse_xml(text: str) -> ElementTree.Element:
     """The outermost element of a description; prefixes and namespaces mean nothing.
 
@@ -217,63 +251,44 @@ def read_urdf(source: str | bytes | os.PathLike[str]) -> UrdfModel:
     text = description_text(source)
     root = parse_xml(text)
     if root.tag != "robot":
-        other = OTHER_FORMATS.get(root.tag, "")
-        raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{other}")
+        hint = ": that is an MJCF, Robot.from_mjcf reads it" if root.tag == "mujoco" else ""
+        raise DataError(f"a URDF has the root element <robot>, got <{root.tag}>{hint}")
     if any(element.tag.startswith("xacro:") for element in root.iter()):
         raise DataError(XACRO)
-    links = tuple(_names(root, "link"))
-    if not links:
-        raise DataError("the URDF has no link")
-    _names(root, "joint")
+    links, _ = _names(root, "link"), _names(root, "joint")
     joints = tuple(map(_joint, root.findall("joint")))
     return UrdfModel(root.get("name", ""), text, _root_link(links, joints), links, joints)
 
 
-def is_text(source: str | bytes | os.PathLike[str]) -> bool:
-    """Whether a description, ``source``, is given as text, and not as the path of a file."""
-    return isinstance(source, str) and source.lstrip(BEFORE_XML).startswith("<")
+def _names(root: ElementTree.Element, tag: str) -> tuple[str, ...]:
+    names = [element.get("name", "") for element in root.findall(tag)]
+    if not all(names):
+        raise DataError(f"<{tag}> number {names.index('') + 1} of the URDF has no name")
+    name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+    if count > 1:
+        raise DataError(f"the URDF has two {tag}s named {name!r}")
+    return tuple(names)
 
 
-def description_text(source: str | bytes | os.PathLike[str]) -> str:
-    """The text of a robot's description, in the encoding that it declares.
-
-    Parameters
-    ----------
-    source : str, bytes or path
-        A path, or the text itself (bytes, or a string that begins with ``<``).
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is no text in that encoding.
-    """
-    if is_text(source):
-        return str(source).lstrip(BEFORE_XML)
-    if not isinstance(source, bytes):
-        try:
-            source = read_whole(Path(source))
-        except (OSError, ValueError) as error:
-            raise DataError(f"the robot's description cannot be read: {error}") from error
-    declared = re.match(rb"""\s*<\?xml[^>]*\bencoding\s*=\s*["']([\w.-]+)""", source)
-    encoding = declared[1].decode() if declared else "utf-8-sig"
-    try:
-        return source.decode(encoding).lstrip()
-    except (LookupError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"the robot's description is not text in the encoding {encoding}: {error}"
-        ) from error
-
-
-def _names(root: ElementTree.Element, tag: str) -> list[str]:
-    names: dict[str, None] = {}
-    for number, element in enumerate(root.findall(tag), 1):
-        name = element.get("name")
-        if not name:
-            raise DataError(f"<{tag}> number {number} of the URDF has no name")
-        if name in names:
-            raise DataError(f"the URDF has two {tag}s named {name!r}")
-        names[name] = None
-    return list(names)
+def _root_link(links: Sequence[str], joints: Sequence[UrdfJoint]) -> str:
+    """The one link from which all others hang."""
+    known, above, below = set(links), set[str](), defaultdict[str, list[str]](list)
+    for joint in joints:
+        for link in {joint.parent, joint.child} - known:
+            raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
+        if joint.child in above:
+            raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")
+        above.add(joint.child)
+        below[joint.parent].append(joint.child)
+    roots = [link for link in links if link not in above]
+    reached = list(roots)
+    for link in reached:  # which grows
+        reached += below[link]
+    if len(roots) > 1 or not links:
+        raise DataError(f"the URDF has {len(roots)} links without a parent, not one: {roots}")
+    if cycle := known - set(reached):
+        raise DataError(f"the joints of the URDF form a cycle of the links {sorted(cycle)}")
+    return roots[0]
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
@@ -290,17 +305,12 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     joint = UrdfJoint(name, kind, ends[0], ends[1], placement(xyz, rpy), X_AXIS)
     if not joint.movable:
         return joint
-    return replace(joint, axis=_axis(element), mimic=_mimic(element), **_limits(element))
-
-
-def _axis(element: ElementTree.Element) -> Array:
     axis = np.array(_numbers(element, "axis", "xyz", *X_AXIS))
     if not axis.any():
-        name = element.get("name")
         raise DataError(f"joint {name!r} has the axis 0 0 0: it needs a direction")
     axis /= np.abs(axis).max()  # a direction alone: the square of a length may overflow
-    unit: Array = axis / np.linalg.norm(axis)
-    return unit
+    axis /= np.linalg.norm(axis)
+    return replace(joint, axis=axis, mimic=_mimic(element), **_limits(element))
 
 
 def _limits(element: ElementTree.Element) -> dict[str, Any]:
@@ -308,18 +318,19 @@ def _limits(element: ElementTree.Element) -> dict[str, Any]:
 
     Without a range ``<limit>`` gives effort and velocity alone.
     """
-    limit, lower, upper = element.find("limit"), -math.inf, math.inf
-    given = set() if limit is None or element.get("type") == "continuous" else set(limit.keys())
-    if given & {"lower", "upper"}:
+
+    def rate(key: str) -> float:
+        [given] = _numbers(element, "limit", key, math.inf)
+        return given if given > 0 else math.inf
+
+    limits = {key: rate(key) for key in ("velocity", "acceleration", "jerk")}
+    limits["acceleration"] = min(limits["acceleration"], rate("deceleration"))
+    limit = element.find("limit")
+    if element.get("type") != "continuous" and limit is not None:
         [low], [high] = (_numbers(element, "limit", key, 0.0) for key in ("lower", "upper"))
-        lower, upper = (low, high) if low <= high else (lower, upper)
-    velocity, acceleration, deceleration, jerk = (
-        rate if rate > 0 else math.inf
-        for key in ("velocity", "acceleration", "deceleration", "jerk")
-        for rate in _numbers(element, "limit", key, math.inf)
-    )
-    limits = {"lower": lower, "upper": upper, "velocity": velocity, "jerk": jerk}
-    return {**limits, "acceleration": min(acceleration, deceleration)}
+        if low <= high and {"lower", "upper"} & limit.attrib.keys():
+            limits |= {"lower": low, "upper": high}
+    return limits
 
 
 def _mimic(element: ElementTree.Element) -> Mimic | None:
@@ -341,24 +352,18 @@ def _numbers(
     text = None if child is None else child.get(attribute)
     if text is None:
         return [*default]
-    what = f"joint {element.get('name')!r}: <{tag} {attribute}>"
-    shown = repr(text if len(text) <= 100 else f"{text[:100]} ...")
-    values = _finite(text)
-    if len(values) != len(default):
-        hint = f". {XACRO}" if "${" in text or "$(" in text else ""
-        raise DataError(f"{what} needs {len(default)} finite number(s), got {shown}{hint}")
-    if tag in ("origin", "mimic") and max(map(abs, values)) > LARGEST:
-        raise DataError(f"{what} is {shown}, and no robot's is beyond {LARGEST:g}")
-    return values
-
-
-def _finite(text: str) -> list[float]:
-    """The numbers of a text; none if something in it is no finite number."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
-        return []
-    return values if all(map(math.isfinite, values)) else []
+        values = []
+    largest = LARGEST if tag in ("origin", "mimic") else sys.float_info.max
+    if len(values) != len(default) or not all(abs(value) <= largest for value in values):
+        hint = f". {XACRO}" if "${" in text or "$(" in text else ""
+        raise DataError(
+            f"joint {element.get('name')!r}: <{tag} {attribute}> needs {len(default)} finite "
+            f"number(s) up to {largest:g}, got {text[:100]!r}{hint}"
+        )
+    return values
 
 
 def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
@@ -370,41 +375,109 @@ def placement(xyz: Sequence[float], rpy: Sequence[float]) -> Array:
         Metres, radians.
     """
     pose = np.eye(4)
+    for axis, angle in zip(np.eye(3), rpy, strict=True):
+        pose = motion("revolute", axis, angle) @ pose
     pose[:3, 3] = xyz
-    for angle, (i, j) in zip(rpy, ((1, 2), (2, 0), (0, 1)), strict=True):
-        turn = np.eye(4)
-        turn[[i, j], [i, j]] = math.cos(angle)
-        turn[i, j], turn[j, i] = -math.sin(angle), math.sin(angle)
-        pose[:3, :3] = turn[:3, :3] @ pose[:3, :3]
     return pose
 
 
-def _root_link(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> str:
-    """The one link from which all others hang."""
-    above = _parents(links, joints)
-    roots = [link for link in links if link not in above]
-    if len(roots) > 1:
-        raise DataError(f"the URDF has {len(roots)} links without a parent, not one: {roots}")
-    reached = set(roots)
-    for link in links:
-        way = dict[str, None]()
-        while link not in reached and link not in way:
-            way[link] = None
-            link = above[link]
-        if link in way:
-            raise DataError(f"the joints of the URDF form a cycle: {' < '.join([*way, link])}")
-        reached.update(way)
-    return roots[0]
+def motion(kind: str, axis: Array, value: float) -> Array:
+    """Homogeneous matrix of a joint's motion (Rodrigues' formula, or a translation).
+
+    Parameters
+    ----------
+    kind : str
+        A type of URDF joints; "prismatic" slides, others turn.
+    axis : ndarray of shape (3,)
+        A unit vector.
+    value : float
+        Metres or radians.
+    """
+    matrix = np.eye(4)
+    if kind == "prismatic":
+        matrix[:3, 3] = value * axis
+        return matrix
+    cross = np.cross(axis, np.eye(3)).T
+    matrix[:3, :3] += math.sin(value) * cross + (1.0 - math.cos(value)) * (cross @ cross)
+    return matrix
 
 
-def _parents(links: tuple[str, ...], joints: tuple[UrdfJoint, ...]) -> dict[str, str]:
-    """The parent of each link that has one."""
-    known, above = set(links), dict[str, str]()
-    for joint in joints:
-        for link in (joint.parent, joint.child):
-            if link not in known:
-                raise UnknownNameError("link", link, f"the URDF (joint {joint.name!r})", links)
-        if joint.child in above:
-            raise DataError(f"link {joint.child!r} is the child of two joints: not a tree")
-        above[joint.child] = joint.parent
-    return above
+def write_urdf(
+    name: str,
+    root: str,
+    joints: Iterable[UrdfJoint],
+    visuals: Mapping[str, Sequence[ElementTree.Element]] | None = None,
+) -> str:
+    """The text of a description, its numbers to the last digit of float64.
+
+    Parameters
+    ----------
+    name, root : str
+        Of the robot, and of the link from which all others hang.
+    joints : iterable of UrdfJoint
+        The links are the root and their children.
+    visuals : mapping of str to sequence of Element, optional
+        The ``<visual>`` elements of links by name.
+    """
+    robot = ElementTree.Element("robot", name=name)
+    joints = list(joints)
+    for link in (root, *(joint.child for joint in joints)):
+        ElementTree.SubElement(robot, "link", name=link).extend((visuals or {}).get(link, ()))
+    robot.extend(map(joint_element, joints))
+    ElementTree.indent(robot, "")
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
+def joint_element(joint: UrdfJoint) -> ElementTree.Element:
+    """The ``<joint>`` of a joint."""
+    element = ElementTree.Element("joint", name=joint.name, type=joint.type)
+    ElementTree.SubElement(element, "parent", link=joint.parent)
+    ElementTree.SubElement(element, "child", link=joint.child)
+    element.append(origin(joint.origin))
+    if not joint.movable:
+        return element
+    ElementTree.SubElement(element, "axis", xyz=numbers(joint.axis))
+    keys = ("lower", "upper", "velocity", "acceleration", "jerk")
+    limits = {
+        key: numbers([value]) for key in keys if abs(value := getattr(joint, key)) < math.inf
+    }
+    if limits:
+        ElementTree.SubElement(element, "limit", limits)
+    if joint.mimic is not None:
+        line = {k: numbers([getattr(joint.mimic, k)]) for k in ("multiplier", "offset")}
+        ElementTree.SubElement(element, "mimic", line, joint=joint.mimic.joint)
+    return element
+
+
+def origin(pose: Array) -> ElementTree.Element:
+    """The ``<origin>`` of a homogeneous matrix ``pose``."""
+    rpy = roll_pitch_yaw(pose[:3, :3])
+    return ElementTree.Element("origin", xyz=numbers(pose[:3, 3]), rpy=numbers(rpy))
+
+
+def numbers(values: Iterable[float]) -> str:
+    """The ``values`` of an attribute, to the last digit."""
+    return " ".join(repr(float(value)) for value in values)
+
+
+def roll_pitch_yaw(rotation: Array) -> Array:
+    """The angles of which :func:`placement` makes a rotation again.
+
+    With the yaw undone a rotation is ``R_y(pitch) R_x(roll)``, whatever the yaw: where the
+    pitch is a right angle and leaves it open, any will do, and no digits are lost nearby.
+
+    Parameters
+    ----------
+    rotation : ndarray of shape (3, 3)
+    """
+    yaw = math.atan2(rotation[1, 0], rotation[0, 0])
+    back = motion("revolute", np.eye(3)[2], -yaw)[:3, :3] @ rotation
+    roll = math.atan2(-back[1, 2], back[1, 1])
+    return np.array([roll, math.atan2(-back[2, 0], back[0, 0]), yaw])
+
+
+def free_name(name: str, taken: Iterable[str]) -> str:
+    """``name``, with as many underscores behind it as make it one that is not ``taken``."""
+    while name in taken:
+        name += "_"
+    return name

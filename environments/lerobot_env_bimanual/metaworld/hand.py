@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tpgmm_torch import Canonical, RelativePosition, Robot
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.robots.urdf import UrdfJoint
-from tpgmm_torch.robots.urdf_writer import write_urdf
+from tpgmm_torch.robots.urdf import UrdfJoint, write_urdf
 
 __all__ = [
     "ACTION_SCALE", "FPS", "FRAMES", "JOINTS", "displacement", "effort", "metaworld_operators",

@@ -135,7 +135,7 @@ class MovesPolicy(SituatedPolicy):
     @property
     def free(self) -> list[int]:
         """The coordinates that move no link, like a gripper."""
-        moved = {frame.joint for frame in self.robot.tree.frames}
+        moved = {body.joint for body in self.robot.tree}
         return [i for i in range(self.robot.n_joints) if i not in moved]
 
     def targets(self, move: Move, seen: Observed) -> dict[str, list[Frame]]:

@@ -17,7 +17,7 @@ from tests.support.robot_zoo import (
     zoo,
 )
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.kinematic_tree import MovingTree, reduce
+from tpgmm_torch.robots.kinematic_tree import Body, reduce
 from tpgmm_torch.robots.urdf import placement, read_urdf
 
 COLUMNS = {name: column for column, name in enumerate(ZOO_JOINTS)}
@@ -25,7 +25,7 @@ COLUMNS = {name: column for column, name in enumerate(ZOO_JOINTS)}
 
 def tree(
     links: Any, base: str = "ground", joints: Any = COLUMNS, **locked: float
-) -> MovingTree:
+) -> tuple[Body, ...]:
     others = dict.fromkeys(set(ZOO_JOINTS) - set(joints), 0.0)
     wanted = [(link, np.eye(4)) for link in links]
     return reduce(read_urdf(ZOO), base, wanted, joints, others | locked)
@@ -39,8 +39,8 @@ def test_poses_and_jacobians_are_those_of_pinocchio_from_any_base(base, locked):
     oracle = Pinocchio(pin.buildModelFromXML(ZOO), ZOO_FOLLOWERS)
     for joints in random_joints(zoo(joints=names), 5).numpy():
         oracle.run(locked | dict(zip(names, joints.tolist(), strict=True)))
-        poses, jacobians = written_out(reduced, joints)
-        for link, pose, jacobian in zip(ZOO_LINKS, poses, jacobians, strict=True):
+        ends = (part[-len(ZOO_LINKS) :] for part in written_out(reduced, joints))
+        for link, pose, jacobian in zip(ZOO_LINKS, *ends, strict=True):
             position, rotation, expected = oracle.link(link, base, tuple(names))
             np.testing.assert_allclose(pose[:3, 3], position, rtol=0, atol=1e-12)
             np.testing.assert_allclose(pose[:3, :3], rotation, rtol=0, atol=1e-12)
@@ -49,18 +49,14 @@ def test_poses_and_jacobians_are_those_of_pinocchio_from_any_base(base, locked):
 
 def test_only_joints_on_the_way_are_kept_and_parents_come_first():
     reduced = tree(("flange", "tail"))
-    assert [frame.joint for frame in reduced.frames] == [0, 1, 2, 4]
-    assert [frame.parent for frame in reduced.frames] == [-1, 0, 1, -1]
-    assert [frame.prismatic for frame in reduced.frames] == [True, False, False, False]
-    assert [link.frame for link in reduced.links] == [2, 3]
-    assert reduced.moved_by(2) == {0, 1, 2}
-    assert reduced.moved_by(3) == {3}
-    assert reduced.moved_by(-1) == set()
+    assert [body.joint for body in reduced] == [None, 0, 1, 2, 4, None, None]
+    assert [body.parent for body in reduced] == [0, 0, 1, 2, 0, 3, 4]
+    assert [body.slides for body in reduced] == [False, True, *[False] * 5]
 
 
 def test_followers_say_how_they_follow():
     reduced = tree(("r_finger", "tip"))
-    following = {(f.joint, f.multiplier, f.shift) for f in reduced.frames}
+    following = {(b.joint, b.multiplier, b.shift) for b in reduced[1:-2]}
     assert following == {
         (0, 1.0, 0.0),
         (1, 1.0, 0.0),
@@ -73,25 +69,24 @@ def test_followers_say_how_they_follow():
 
 def test_what_two_links_share_is_there_once():
     reduced = tree(("l_finger", "r_finger", "flange", "flange"))
-    assert len(reduced.frames) == 5
-    assert [link.frame for link in reduced.links] == [3, 4, 2, 2]
+    assert [body.parent for body in reduced] == [0, 0, 1, 2, 3, 3, 4, 5, 3, 3]
 
 
 def test_seen_from_beyond_a_joint_its_axis_is_the_other_way_round():
-    down, up = tree(("column",)), tree(("ground",), "column")
-    assert down.frames[0].axis.tolist() == [0, 0, 1]
-    assert up.frames[0].axis.tolist() == [0, 0, -1]
-    np.testing.assert_array_equal(down.links[0].pose, np.eye(4))
-    np.testing.assert_allclose(up.links[0].pose @ down.frames[0].offset, np.eye(4), atol=1e-15)
+    (_, down, below), (_, up, above) = tree(("column",)), tree(("ground",), "column")
+    origin = read_urdf(ZOO).joint["lift"].origin
+    np.testing.assert_allclose(down.pose[:3, 2], origin[:3, 2], atol=1e-15)
+    np.testing.assert_allclose(up.pose[:3, 2], [0, 0, -1], atol=1e-15)
+    np.testing.assert_allclose(down.pose @ below.pose, origin, atol=1e-15)
+    np.testing.assert_allclose(up.pose @ above.pose @ origin, np.eye(4), atol=1e-15)
 
 
 def test_the_pose_in_a_link_is_kept_behind_what_is_folded_into_it():
     tool = placement(np.array([0.1, 0.2, 0.3]), np.array([0.3, 0.2, 0.1]))
     weld = placement(np.array([0.2, 0.0, 0.0]), np.array([1.2, 0.4, -0.7]))
     reduced = reduce(read_urdf(ZOO), "arm", [("flange", tool)], COLUMNS, {})
-    assert reduced.frames == ()
-    assert reduced.links[0].frame == -1
-    np.testing.assert_allclose(reduced.links[0].pose, weld @ tool, atol=1e-15)
+    assert [body.joint for body in reduced] == [None, None]
+    np.testing.assert_allclose(reduced[1].pose, weld @ tool, atol=1e-15)
 
 
 def test_joints_of_several_degrees_of_freedom_are_refused_only_on_the_way():
@@ -100,6 +95,6 @@ def test_joints_of_several_degrees_of_freedom_are_refused_only_on_the_way():
         '<parent link="world"/><child link="ground"/></joint></robot>'
     )
     model, wanted = read_urdf(text), [("flange", np.eye(4))]
-    assert len(reduce(model, "ground", wanted, COLUMNS, {}).frames) == 3
+    assert len(reduce(model, "ground", wanted, COLUMNS, {})) == 5
     with pytest.raises(DataError, match="'free' of type 'floating' lies between"):
         reduce(model, "world", wanted, COLUMNS, {})

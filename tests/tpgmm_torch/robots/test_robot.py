@@ -167,8 +167,6 @@ class TestSettings:
         )
         with pytest.raises(UnknownNameError, match=r"joint 'm_\*' is not in the movable"):
             upper_body(locked={"m_*": 0.0})
-        with pytest.raises(DataError, match=r"'l_\*'.* are in the joint vector"):
-            upper_body(joints="l_*", locked={"l_*": 0.3})
 
     @pytest.mark.parametrize("kind", ["fixed", "revolute"])
     def test_a_description_of_thousands_of_links_is_read_at_once(self, kind: str) -> None:
@@ -487,9 +485,7 @@ class TestCombining:
             Robot.combine(left=Poses(["hand"]))  # type: ignore[arg-type]
         with pytest.raises(UnknownNameError, match=r"robot 'rihgt' .*\['left', 'right'\]"):
             Robot.combine({"rihgt": self.right}, left=arm, right=arm)
-        with pytest.raises(
-            DataError, match=r"'column' of the robot 'left' is moved .*'ground'"
-        ):
+        with pytest.raises(DataError, match=r"'column' of a robot is moved .*'ground'"):
             Robot.combine(left=zoo(("tip",), base="column"))
         with pytest.raises(DataError, match="two links named 'left_tip'"):
             Robot.combine(left=arm, fixed={"left_tip": self.left})

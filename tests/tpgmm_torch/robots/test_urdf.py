@@ -114,11 +114,6 @@ class TestReading:
         assert {model.text for model in models} == {text}
         assert {model.root for model in models} == {"base"}
 
-    def test_the_declared_encoding_counts(self) -> None:
-        text = '<?xml version="1.0" encoding="latin-1"?>' + one().replace('"j"', '"é"')
-        assert read_urdf(text.encode("latin-1")).actuated == ("é",)
-        assert read_urdf(text).actuated == ("é",)
-
 
 class TestRefusing:
     @pytest.mark.parametrize(
@@ -126,7 +121,7 @@ class TestRefusing:
         [
             ("<robot", "not well-formed XML"),
             ("<urdf/>", "root element <robot>, got <urdf>"),
-            ("<robot/>", "no link"),
+            ("<robot/>", "0 links"),
             (urdf(links="<link/>"), "<link> number 1 of the URDF has no name"),
             (urdf(links=LINKS + '<link name="a"/>'), "two links named 'a'"),
             (urdf(joint("j", "a", "b"), joint("j", "b", "c")), "two joints named 'j'"),
@@ -141,13 +136,19 @@ class TestRefusing:
             ),
             (urdf(joint("j", "a", "b")), r"2 links without a parent, not one: \['a', 'c'\]"),
             (urdf(joint("j", "a", "a")), r"2 links without a parent, not one: \['b', 'c'\]"),
-            (urdf(joint("j", "b", "c"), joint("k", "c", "b")), r"cycle: b < c < b"),
-            (urdf(joint("j", "a", "a"), links='<link name="a"/>'), r"cycle: a < a"),
+            (
+                urdf(joint("j", "b", "c"), joint("k", "c", "b")),
+                r"cycle of the links \['b', 'c'\]",
+            ),
+            (
+                urdf(joint("j", "a", "a"), links='<link name="a"/>'),
+                r"cycle of the links \['a'\]",
+            ),
             (one('<axis xyz="0 0 0"/>'), "joint 'j' has the axis 0 0 0"),
             (one('<axis xyz="0 1"/>'), "<axis xyz> needs 3 finite number.*got '0 1'"),
             (one('<origin xyz="0 nan 0"/>'), "<origin xyz> needs 3 finite"),
             (one('<origin rpy="0 ${pi} 0"/>'), "<origin rpy> needs 3 finite"),
-            (one('<origin xyz="0 1e200 0"/>'), "'0 1e200 0', and no robot's is beyond 1e.09"),
+            (one('<origin xyz="0 1e200 0"/>'), "up to 1e.09, got '0 1e200 0'"),
             (one('<limit lower="low" upper="1"/>'), "<limit lower> needs 1 finite"),
             (one('<limit jerk="x"/>'), "<limit jerk> needs 1 finite"),
             (one("<mimic/>"), "<mimic> does not name a joint"),
@@ -207,14 +208,6 @@ class TestRefusing:
             with pytest.raises(DataError, match="cannot be read"):
                 read_urdf(source)
 
-    @pytest.mark.parametrize(
-        "data",
-        [
-            b"\xff\xfe<\x00",
-            b'<?xml version="1.0" encoding="klingon"?><robot/>',
-            b'<?xml version="1.0" encoding="hex"?><robot/>',
-        ],
-    )
-    def test_bytes_that_are_not_text(self, data: bytes) -> None:
-        with pytest.raises(DataError, match="not text in the encoding"):
-            read_urdf(data)
+    def test_bytes_that_are_not_text(self) -> None:
+        with pytest.raises(DataError, match="not UTF-8 text"):
+            read_urdf(b"\xff\xfe<\x00")
