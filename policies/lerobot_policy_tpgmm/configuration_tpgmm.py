@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from draccus.parsers.decoding import decode as draccus_decode
+from draccus.utils import DecodingError
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -40,6 +42,11 @@ __all__ = [
 ]
 
 
+#: Said of policies of earlier releases.
+OLD = (
+    "a policy of release 0.1 or 0.2 is not read any more: fit it again, by lerobot-train or "
+    "tpgmm fit --format lerobot"
+)
 #: Robots that come with the package: what describes each, and its hands.
 ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
     "upper_body": (upper_body_urdf, HANDS),
@@ -87,6 +94,15 @@ def state_features(
     return {"input_features": inputs, "output_features": outputs}
 
 
+class Earlier:
+    """A value that the configurations of releases 0.1 and 0.2 alone have."""
+
+
+@draccus_decode.register(Earlier)  # type: ignore[untyped-decorator]
+def _refuse(raw_value: Any, path: Sequence[str] = ()) -> Earlier:
+    raise DecodingError(path, OLD)
+
+
 @PreTrainedConfig.register_subclass("tpgmm")
 @dataclass
 class TPGMMConfig(StatePolicyConfig):
@@ -98,6 +114,8 @@ class TPGMMConfig(StatePolicyConfig):
 
     Parameters
     ----------
+    n_steps : Earlier, optional
+        Of policies of releases 0.1 and 0.2, which are not read any more.
     n_components : int or "auto", default=10
         Number of Gaussians; "auto" finds it, :class:`tpgmm_torch.SelectComponents`.
     operators : list of str or dict, optional
@@ -162,6 +180,7 @@ class TPGMMConfig(StatePolicyConfig):
         If a value is none that exists.
     """
 
+    n_steps: Earlier | None = None
     n_components: int | str = 10
     # draccus tries the members of a union in order, and can turn anything into a str
     operators: list[dict[str, Any] | str] | None = None

@@ -282,7 +282,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     @classmethod
     def from_estimator(
         cls,
-        model: TaskParameterizedGMM,
+        model: Any,
         *,
         fps: float | None = None,
         state_names: Sequence[str] | None = None,

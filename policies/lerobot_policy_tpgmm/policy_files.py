@@ -17,7 +17,7 @@ from lerobot.utils.constants import (
     POLICY_PREPROCESSOR_DEFAULT_NAME,
 )
 
-from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
+from lerobot_policy_tpgmm.configuration_tpgmm import OLD, TPGMMConfig
 from lerobot_policy_tpgmm.processor_tpgmm import make_tpgmm_pre_post_processors
 from tpgmm_torch.atomic import read_whole, replacing
 from tpgmm_torch.exceptions import ModelFileError
@@ -107,10 +107,7 @@ def read_model(directory: Path) -> Any:
         _check_digests(directory)
         return model
     if config.exists() and (directory / SAFETENSORS_SINGLE_FILE).exists():
-        raise ModelFileError(
-            f"{directory} is a policy of release 0.1 or 0.2, which is not read any more: fit "
-            "it again, by lerobot-train or tpgmm fit --format lerobot"
-        )
+        raise ModelFileError(f"{directory}: {OLD}")
     raise ModelFileError(
         f"{directory} is not a saved policy, or was saved before it was fitted: {folder} is "
         "missing"

@@ -26,6 +26,8 @@ from tpgmm_evaluation.metaworld.nearness import Nearness
 from tpgmm_evaluation.metaworld.networks import NETWORKS, Network, Perceptron
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
+from tpgmm_torch.skills.sequence import Sequence as SkillSequence
+from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.training.hold_detection import with_holds
 
 __all__ = ["LEARNERS", "Actor", "Learner", "TaskParameterized", "switches"]
@@ -184,24 +186,25 @@ class TaskParameterized:
                 max(self.fewest, n_steps // self.steps_per_component),
                 metaworld_operators(present(episodes)),
                 robot,
-                **{
-                    "random_state": seed,
-                    **self.options,
-                },
-            ).fit(with_holds(demonstrations, ()))
+                **{"random_state": seed, **self.options},
+            )
+            shown, cuts = with_holds(demonstrations, ()), list(demonstrations[0].events)
+            # a gripper that closes is a step, which Gaussians across it would smear
+            parts: Any = fit_parts(model, shown, cuts).skills
         if self.nearness is not None:
-            model = self.nearness.applied(model, len(learned))
+            parts = tuple(self.nearness.applied(one, len(learned)) for one in parts)
+        skill = SkillSequence(parts, fade=1.5 / FPS / self.pace)  # parts are a step apart
         frames = {
             name: list(range(7 * i, 7 * i + 7))
             for i, name in enumerate(FRAMES)
-            if name in model.frame_names_
+            if name in skill.frame_names
         }
         policy = TPGMMPolicy.from_estimator(
-            model,
+            skill,
             fps=FPS,
             environment_names=[f"e{i}" for i in range(7 * len(FRAMES))],
             frames=frames,
-            chunk_size=round(float(model.time_[-1] - model.time_[0]) * FPS) + 1,
+            chunk_size=round(float(skill.time[-1] - skill.time[0]) * FPS) + 1,
             control=ControlConfig(
                 blend=0.0,
                 follow_frames=False,

@@ -7,13 +7,14 @@ place of the hand in a frame varies in proportion to its distance from the frame
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from tpgmm_torch import Canonical, TaskParameterizedGMM
+from tpgmm_torch import Canonical
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.regression.regression import Regression
 
 __all__ = ["Nearness"]
 
@@ -60,71 +61,26 @@ class Nearness:
         """The prior's standard deviation [m] at distances [m]."""
         return self.floor + self.ratio * self.reach * (distance / self.reach) ** self.power
 
-    def posterior(
-        self,
-        covariances: Tensor,
-        deviation: Tensor,
-        n_demonstrations: int,
-        lengths: Tensor | None = None,
-    ) -> Tensor:
-        """Covariances (K, 1 + D, 1 + D) under the prior; slopes over time stay.
-
-        Parameters
-        ----------
-        covariances : Tensor of shape (K, 1 + D, 1 + D)
-            Time first.
-        deviation : Tensor of shape (K, D)
-            The prior's standard deviations.
-        n_demonstrations : int
-        lengths : Tensor of shape (D,), dtype bool, optional
-            Which coordinates are lengths: given time, they are independent of the others.
-        """
-        slope = covariances[:, 1:, :1] / covariances[:, :1, :1]
-        steep = slope @ covariances[:, :1, 1:]
-        given_time = covariances[:, 1:, 1:] - steep
-        if lengths is not None:
-            given_time = given_time * (lengths[:, None] == lengths)
-        total = n_demonstrations + self.strength
-        blended = n_demonstrations * given_time + self.strength * (deviation**2).diag_embed()
-        result = covariances.clone()
-        result[:, 1:, 1:] = blended / total + steep
-        return result
-
-    def applied(
-        self, model: TaskParameterizedGMM, n_demonstrations: int
-    ) -> TaskParameterizedGMM:
-        """A fitted model under the prior; operators are ``Canonical`` and relative positions.
+    def applied(self, skill: Regression, n_demonstrations: int) -> Regression:
+        """A skill under the prior; its operators are ``Canonical`` and relative positions.
 
         Coordinates of ``Canonical`` that are no lengths keep their variance, and lose their
         covariance with those that are: a gripper does not close because a hand is elsewhere.
         """
-        covariances = []
-        for operator, mean, covariance in zip(
-            model.operators_, model.means_, model.covariances_, strict=True
-        ):
-            lengths = None
+        conditionals, total = [], n_demonstrations + self.strength
+        for operator, found in zip(skill.operators, skill.conditionals, strict=True):
+            covariance = found.covariance
             if isinstance(operator, Canonical):
-                lengths = torch.zeros(mean.shape[1] - 1, dtype=torch.bool)
-                lengths[list(model.kinematics_.lengths)] = True
-                deviation = self.deviation(torch.full_like(mean[:, 1:], self.reach))
+                lengths = torch.zeros(found.mean.shape[-1], dtype=torch.bool)
+                lengths[list(skill.kinematics.lengths)] = True
+                covariance = covariance * (lengths[:, None] == lengths)
+                deviation = self.deviation(torch.full_like(found.mean, self.reach))
                 deviation[:, ~lengths] = self.floor
             else:
-                distance = mean[:, 1:].norm(dim=1, keepdim=True)
-                deviation = self.deviation(distance).expand(-1, mean.shape[1] - 1)
-            covariances.append(self.posterior(covariance, deviation, n_demonstrations, lengths))
-        settings = model.get_params(deep=False) | {
-            "n_components": len(model.weights_),
-            "operators": list(model.operators_),
-            "robot": model.kinematics_,
-            "covariance_shrinkage": 0.0,  # the prior says what few demonstrations do not
-        }
-        return TaskParameterizedGMM.from_parameters(
-            model.weights_,
-            model.means_,
-            covariances,
-            model.time_,
-            n_demonstrations=model.n_demonstrations_,
-            peaks=model.skill.peaks,
-            summary=model.skill.summary,
-            **settings,
-        )
+                distance = found.mean.norm(dim=1, keepdim=True)
+                deviation = self.deviation(distance).expand_as(found.mean)
+            prior = self.strength * (deviation**2).diag_embed()
+            blended = (n_demonstrations * covariance + prior) / total
+            conditionals.append(replace(found, covariance=blended))
+        # the prior says what few demonstrations do not
+        return replace(skill, conditionals=conditionals, n_samples=None)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from lerobot_env_bimanual.metaworld.hand import metaworld_robot
+from lerobot_env_bimanual.metaworld.hand import metaworld_operators, metaworld_robot
 from lerobot_env_bimanual.metaworld.tasks import TASKS, TUNED, difficulty
 from tests.support.reaching import reaching
 from tpgmm_evaluation.cells import Cell, Results
@@ -41,7 +41,9 @@ from tpgmm_evaluation.metaworld.summary import (
     task_table,
 )
 from tpgmm_evaluation.report.tables import episode_table
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.training.hold_detection import with_holds
 
 
 def cell(task, n, solved, of=4, seed=0, policy="tpgmm", seconds=2.0, outcome="done"):
@@ -240,9 +242,11 @@ def test_second_tries_are_not_learned_from():
     assert direct(episodes[:1], longest=1.4) == episodes[:1]
     learner = TaskParameterized()
     few, all_of_them = (learner.fit(some, 0).policy for some in (episodes[:3], episodes[:4]))
-    assert torch.equal(few.mixture.means[0], all_of_them.mixture.means[0])
     most = replace(learner, longest=2.0).fit(episodes[:4], 0).policy
-    assert not torch.equal(few.mixture.means[0], most.mixture.means[0])
+    means = [
+        one.skill.skills[0].conditionals[0].mean.tolist() for one in (few, all_of_them, most)
+    ]
+    assert means[0] == means[1] != means[2]
 
 
 def test_a_gripper_that_switches_at_the_ends_or_twice_at_once_can_be_learned():
@@ -272,31 +276,22 @@ def test_a_rhythm_that_begins_after_different_waits_is_brought_into_step():
         assert largest / 3 < float(heights.std(0).mean()) < largest
 
 
-def test_the_prior_is_what_its_formula_says():
+def test_the_prior_is_what_its_formula_says_and_parts_the_gripper_from_the_hand():
     prior = Nearness(ratio=0.1, floor=0.0001, power=1.0, reach=0.3, strength=2.0)
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(5, 4, 4, generator=generator, dtype=torch.float64)
-    before = root @ root.mT
-    deviation = prior.deviation(torch.full((5, 3), 0.2, dtype=torch.float64))
-    assert deviation[0, 0].item() == pytest.approx(0.0201)
-    after = prior.posterior(before, deviation, 3)
-    # the slope over time stays, and what is left given time is a mean of five
-    assert torch.allclose(after[:, 0], before[:, 0])
-    given = [torch.linalg.inv(torch.linalg.inv(c)[:, 1:, 1:]) for c in (before, after)]
-    expected = (3 * given[0] + 2 * (deviation**2).diag_embed()) / 5
-    assert torch.allclose(given[1], expected)
-
-
-def test_the_prior_can_part_lengths_from_other_coordinates():
-    prior = Nearness()
-    root = torch.randn(5, 4, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    before = root @ root.mT
-    lengths = torch.tensor([True, True, False])
-    after = prior.posterior(before, torch.ones(5, 3, dtype=torch.float64), 3, lengths)
-    given = torch.linalg.inv(torch.linalg.inv(after)[:, 1:, 1:])
-    assert torch.allclose(given[:, 2, :2], torch.zeros(5, 2, dtype=torch.float64), atol=1e-9)
-    assert (given[:, 0, 1].abs() > 0.01).all()
-    assert torch.allclose(after[:, 0], before[:, 0])
+    assert prior.deviation(torch.tensor(0.2)).item() == pytest.approx(0.0201)
+    shown = with_holds([reaching(seed).demonstration() for seed in range(3)], ())
+    model = TaskParameterizedGMM(5, metaworld_operators(["goal"]), metaworld_robot())
+    before = model.fit(shown).skill
+    after = prior.applied(before, 3)
+    (joints, new), (seen, near) = zip(before.conditionals, after.conditionals, strict=True)
+    deviation = prior.deviation(seen.mean.norm(dim=1))[:, None].expand(-1, 3)
+    torch.testing.assert_close(
+        near.covariance, (3 * seen.covariance + 2 * (deviation**2).diag_embed()) / 5
+    )
+    for one, other in ((joints, new), (seen, near)):  # slopes over time stay
+        assert torch.equal(one.gain, other.gain)
+    assert not new.covariance[:, 3, :3].any() and joints.covariance[:, 3, :3].any()
+    assert new.covariance[:, 0, 1].abs().min() > 0
 
 
 def test_one_demonstration_is_enough_to_reach_another_goal():

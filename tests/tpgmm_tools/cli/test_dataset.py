@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -103,40 +102,16 @@ def test_layout_v21_becomes_v30_and_each_episode_keeps_its_task(arm, tmp_path):
     assert_equal(joints, joints_of(load_lerobot(tmp_path / "new"))[1:2])
 
 
-def recorded(root):
-    """The set with actions that are not the next joints; these, in degrees."""
-    ahead = np.random.default_rng(0).normal(size=(36, 3))
-    in_data("action", lambda values: np.degrees(ahead))(root)
-    in_data("observation.state", np.degrees)(root)
-    for name in ("action", "observation.state"):
-        change_info(root, lambda i, name=name: i["features"][name].pop("info"))
-    return ahead
-
-
 @pytest.mark.parametrize("rate", [FPS, FPS // 2])
-def test_recorded_actions_are_kept(tmp_path, rate):
-    root = tmp_path / "set"
-    written, ahead = write(root), recorded(root)
-    output("dataset", "convert", root, tmp_path / "new", *("--units", "deg", "--rate", rate))
-    found = load_lerobot(tmp_path / "new", joints="commanded")
-    start = 0
-    for item, demonstration in zip(found, written, strict=True):
-        actions = replace(demonstration, joints=ahead[start : start + len(demonstration)])
-        expected = resample(actions, rate).joints
-        assert item.joints.numpy() == pytest.approx(expected.numpy(), abs=1e-5)
-        start += len(demonstration)
-
-
-def test_actions_of_other_joints_are_not_kept_and_it_is_said(tmp_path):
+def test_joints_are_stored_in_radians_at_the_rate_that_is_asked_for(tmp_path, rate):
     root = tmp_path / "set"
     written = write(root)
-    change_info(root, lambda i: i["features"]["action"].update(names=list("xyz"), info=None))
-    in_data("action", lambda values: -values)(root)
-    result = run("dataset", "convert", root, tmp_path / "new")
-    assert result.exit_code == 0
-    assert "the recorded actions are not kept: " in result.stderr
-    [first, *_] = load_lerobot(tmp_path / "new", joints="commanded")
-    assert first.joints[:-1].numpy() == pytest.approx(written[0].joints[1:].numpy(), abs=1e-6)
+    in_data("observation.state", np.degrees)(root)
+    change_info(root, lambda i: i["features"]["observation.state"].pop("info"))
+    output("dataset", "convert", root, tmp_path / "new", *("--units", "deg", "--rate", rate))
+    for item, demonstration in zip(load_lerobot(tmp_path / "new"), written, strict=True):
+        expected = resample(demonstration, rate).joints
+        assert item.joints.numpy() == pytest.approx(expected.numpy(), abs=1e-5)
 
 
 @pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])

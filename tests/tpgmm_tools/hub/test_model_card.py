@@ -10,6 +10,10 @@ from tests.support.skills import small_bottle, waves
 from tests.support.two_ways import Handles, fitted
 from tpgmm_tools.hub import describe, model_card
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
+from tpgmm_torch.skills.sequence import Sequence
+from tpgmm_torch.skills.via_point import ViaPoint
+from tpgmm_torch.skills.via_points import ViaPoints
+from tpgmm_torch.skills.ways import Ways
 
 
 def rows(text: str, title: str) -> list[list[str]]:
@@ -29,8 +33,8 @@ def test_the_skill_and_its_limits_are_those_of_the_model():
     [bottle] = [row for row in rows(card, "Where it fails") if row[0] == "bottle"]
     shown = model.summary_.frames["bottle"]
     assert bottle[1] == f"{shown.low[0]:.3f} to {shown.high[0]:.3f}"
+    assert skill["demonstrations"] == str(model.summary_.n_demonstrations)
     learned = dict(row for row in rows(card, "How it was learned"))
-    assert learned["demonstrations"] == str(model.summary_.n_demonstrations)
     assert learned["converged"] == ("yes" if model.converged_ else "no")
 
 
@@ -85,10 +89,17 @@ def test_text_that_was_given_stays_in_its_cell():
     assert row == ["error \\| of a &lt;b>hand", "3"]
 
 
-def test_of_several_ways_each_is_described():
+def test_of_several_ways_and_parts_each_is_described():
     model = fitted(Handles)
-    card = describe(model, {"success": "50 of 50"})
+    card = describe(model.best_model_, {"success": "50 of 50"})
     for mode in range(2):
-        learned = dict(rows(card, f"How it was learned (way {mode})"))
-        assert learned["demonstrations"] == str((model.labels_ == mode).sum())
+        shown = dict(row[:2] for row in rows(card, f"The skill (way {mode + 1})"))
+        assert shown["demonstrations"] == str((model.labels_ == mode).sum())
     assert card.count("## Measured") == card.count("50 of 50") == 1
+    part = TaskParameterizedGMM(3).fit(waves()).skill
+    late = replace(part, begin=part.end, end=2 * part.end, time=part.time + part.end)
+    several = Sequence([part, late])
+    card = describe(ViaPoints(several, [ViaPoint.parse("0.5:canonical=a:0.1")]))
+    for number in (1, 2):
+        assert rows(card, f"What matters, and when (part {number})")
+    assert describe(Ways([several, several])).count("## Where it fails (way ") == 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
 from importlib.metadata import EntryPoint, version
 from typing import Annotated, Any
 
@@ -17,16 +16,14 @@ __all__ = ["app", "explain"]
 
 #: Commands of this package in the order of ``--help``; those of plugins follow.
 ORDER = ("demo", "fit", "reproduce", "plot", "view", "app", "dataset")
-#: Those that are imported when they run: where they are, and their line in ``--help``.
+#: Those that are imported when they run, and their line in ``--help``.
 LATE = {
-    "fit": (
-        EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
-        "Learn a skill from a LeRobot data set.",
-    ),
-    "app": (
-        EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS),
-        "Learn and look in the browser: a data set in, a moving picture out.",
-    ),
+    "fit": EntryPoint("fit", "tpgmm_tools.cli.fit:app", plugins.COMMANDS),
+    "app": EntryPoint("app", "tpgmm_tools.app.command:app", plugins.COMMANDS),
+}
+HELP = {
+    "fit": "Learn a skill from a LeRobot data set.",
+    "app": "Learn and look in the browser: a data set in, a moving picture out.",
 }
 #: Packages of the extra ``cli``.
 OPTIONAL = ("matplotlib", "pandas", "pyarrow")
@@ -43,23 +40,16 @@ class Commands(TyperGroup):
 
     debug = False
 
-    def main(
-        self,
-        args: Sequence[str] | None = None,
-        prog_name: str | None = None,
-        complete_var: str | None = None,
-        standalone_mode: bool = True,
-        windows_expand_args: bool = True,
-        **extra: Any,
-    ) -> Any:
+    def main(self, *args: Any, **extra: Any) -> Any:
         """Run with arguments and exit; as in click, ``standalone_mode=False`` returns."""
-        given = (args, prog_name, complete_var, False, windows_expand_args)
-        if not standalone_mode:
-            return super().main(*given, **extra)
+        standalone = extra.pop("standalone_mode", True)
+        extra["standalone_mode"] = False
+        if not standalone:
+            return super().main(*args, **extra)
         original = warnings.showwarning
         warnings.showwarning = lambda message, *_, **__: _say(f"warning: {message}")
         try:
-            code = super().main(*given, **extra)
+            code = super().main(*args, **extra)
         except Exception as error:
             message = None if self.debug else explain(error)
             if message is None:
@@ -72,41 +62,29 @@ class Commands(TyperGroup):
 
     def list_commands(self, ctx: Any) -> list[str]:
         """The commands of this package and those of plugins."""
-        names = {*super().list_commands(ctx), *LATE, *plugins.registered(plugins.COMMANDS)}
+        names = {*super().list_commands(ctx), *_late()}
         return sorted(names, key=lambda n: (ORDER.index(n) if n in ORDER else len(ORDER), n))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command by name; of one that is not imported yet, only the name and one line."""
-        command = super().get_command(ctx, cmd_name)
-        if command is None and (found := _late(cmd_name)) is not None:
-            command = TyperCommand(cmd_name, help=found[1])
+        command, late = super().get_command(ctx, cmd_name), _late()
+        if command is None and cmd_name in late:
+            origin = late[cmd_name].module.partition(".")[0]
+            text = f"A command of {origin}: tpgmm {cmd_name} --help"
+            command = TyperCommand(cmd_name, help=HELP.get(cmd_name, text))
         return command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is about to run, imported."""
-        if args[0] not in self.commands and (found := _late(args[0])) is not None:
-            self.add_command(_as_command(found[0]))
+        if args[0] not in self.commands and args[0] in (late := _late()):
+            command = typer.main.get_command(plugins.load(late[args[0]]))
+            command.name = args[0]
+            self.add_command(command)
         return super().resolve_command(ctx, args)
 
 
-def _late(name: str) -> tuple[EntryPoint, str] | None:
-    if name in LATE:
-        return LATE[name]
-    plugin = plugins.registered(plugins.COMMANDS).get(name)
-    if plugin is None:
-        return None
-    origin = plugin.dist.name if plugin.dist else plugin.module
-    return plugin, f"A command of {origin}: tpgmm {name} --help"
-
-
-def _as_command(plugin: EntryPoint) -> Any:
-    loaded = plugins.load(plugin)
-    if not isinstance(loaded, typer.Typer):
-        function, loaded = loaded, typer.Typer(add_completion=False)
-        loaded.command(plugin.name)(function)
-    command = typer.main.get_command(loaded)
-    command.name = plugin.name
-    return command
+def _late() -> dict[str, EntryPoint]:
+    return plugins.registered(plugins.COMMANDS) | LATE
 
 
 def explain(error: Exception) -> str | None:

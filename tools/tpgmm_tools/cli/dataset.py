@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,6 @@ from tpgmm_tools.cli import options
 if TYPE_CHECKING:
     from tpgmm_datasets.description import ColumnInfo, DatasetInfo
     from tpgmm_datasets.lerobot.layout import Episode
-    from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration
 
 __all__ = ["app"]
@@ -201,9 +200,9 @@ def convert(
 ) -> None:
     """Write a converted data set: layout v3.0, joints in radians, some episodes or joints.
 
-    Reads any set that the other commands read, v2.1 too. Joints, actions,
-    frames and events are kept, as float32; where there are no actions of the
-    same joints they become the next joint state. Pictures stay behind.
+    Reads any set that the other commands read, v2.1 too. Joints, frames and
+    events are kept, as float32; actions become the next joint state (--joints
+    commanded keeps those instead), pictures stay behind.
 
     Parameters
     ----------
@@ -216,66 +215,26 @@ def convert(
     task : str
         What is done, for all. Default: each episode's own.
     """
-    from tpgmm_datasets.conversion.timing import resample
     from tpgmm_datasets.reader import open_recording
 
-    given = data.arguments(described.read())
-    rate = given.pop("rate")
-    recording = open_recording(source, **given)
+    recording = open_recording(source, **data.arguments(described.read()))
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints
-    commanded = _commanded(source, given, recording, demonstrations)
-    if rate is not None:
-        demonstrations = [resample(item, rate) for item in demonstrations]
-        commanded = commanded and [resample(item, rate) for item in commanded]
     kept = demonstrations[0].joint_names or ()
     stored = {"m": "m", "mm": "m", "raw": "raw"}  # what is no angle once it is read
     _save(
         demonstrations,
         path,
         append,
-        fps=rate or layout.fps,
+        fps=data.rate or layout.fps,
         task=[task] * len(demonstrations) if task else _tasks(recording.episodes),
         robot_type=layout.robot_type,
-        actions=commanded and [item.joints for item in commanded],
         units={
             name: stored[unit]
             for name, unit in zip(columns.names or (), columns.units, strict=False)
             if name in kept and unit in stored
         },
     )
-
-
-def _commanded(
-    source: str,
-    given: Mapping[str, Any],
-    recording: Recording,
-    demonstrations: Sequence[Demonstration],
-) -> list[Demonstration] | None:
-    """The recorded actions as demonstrations; None where they follow from the joints."""
-    import torch
-
-    from tpgmm_datasets.errors import DatasetError
-    from tpgmm_datasets.lerobot.columns import ACTION
-    from tpgmm_datasets.reader import load_lerobot
-    from tpgmm_torch.exceptions import TPGMMError
-
-    assembly = recording.assembly
-    if ACTION not in assembly.layout.features or assembly.joints.feature.key == ACTION:
-        return None
-    names = demonstrations[0].joint_names
-    try:
-        commanded = load_lerobot(source, **{**given, "joints": ACTION, "frames": {}})
-        if names is not None:
-            commanded = [item.reordered(names) for item in commanded]
-        elif commanded[0].n_joints != demonstrations[0].n_joints:
-            raise DatasetError(f"they have {commanded[0].n_joints} values", column=ACTION)
-    except TPGMMError as error:
-        typer.echo(f"the recorded actions are not kept: {error}", err=True)
-        return None
-    pairs = zip(demonstrations, commanded, strict=True)
-    follow = all(torch.equal(d.joints[1:], c.joints[:-1]) for d, c in pairs)
-    return None if follow else commanded
 
 
 def _tasks(episodes: Sequence[Episode]) -> list[str]:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from tpgmm_tools.cli import options
 
 if TYPE_CHECKING:
-    from tpgmm_torch.data.demonstrations import Situation
     from tpgmm_torch.data.trajectories import Trajectory
     from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -18,7 +17,7 @@ __all__ = ["app"]
 
 app = typer.Typer()
 
-FORMATS = (".parquet", ".csv", ".npz")
+FORMATS = (".parquet", ".csv")
 EXAMPLE = (
     "tpgmm reproduce out/model --dataset out/demo/dataset --episodes 0:3 "
     "--out out/reproductions.csv"
@@ -43,16 +42,16 @@ def reproduce(
 ) -> None:
     """Reproduce a skill in new situations.
 
-    Writes joint references over time and their covariance: a table with one row per time step
-    (.parquet, .csv), as tpgmm_datasets.tables.demonstrations_from_frame reads it back, or
-    arrays (.npz). Prints a line per situation.
+    Writes joint references over time and their covariance: a table with one row per time step,
+    as tpgmm_datasets.tables.demonstrations_from_frame reads it back. Prints a line per
+    situation.
 
     Parameters
     ----------
     model : ``DIR``
         A model that 'tpgmm fit' saved.
     out : ``FILE``
-        Where they go: .parquet, .csv or .npz.
+        Where they go: .parquet or .csv.
     situations : ``FILE.json``
         Situations: start postures and frames.
     dataset : str
@@ -65,6 +64,7 @@ def reproduce(
     blend : float >= 0
         Seconds in which the start posture leads into the motion.
     """
+    from tpgmm_datasets.tables import trajectories_to_frame, write_table
     from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.control.situations import at_first
     from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -89,7 +89,9 @@ def reproduce(
             f"{error}. Say where it is in the data set, as to 'tpgmm fit': --frame "
             f"{error.name}=FEATURE or --frame {error.name}=LINK@EVENT"
         ) from error
-    _write(trajectories, wanted, out)
+    pairs = zip(trajectories, wanted, strict=True)
+    frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
+    write_table(trajectories_to_frame(trajectories, frames), out)
     for number, trajectory in enumerate(trajectories):
         typer.echo(f"{number:>4}  {_describe(trajectory, kinematics)}")
     for number, one in enumerate(wanted if isinstance(skill, Ways) else ()):
@@ -120,25 +122,3 @@ def _describe(trajectory: Trajectory, kinematics: Kinematics) -> str:
         f"{', '.join(problems) or 'within limits'}"
         f"{'' if novelty is None else f'  novelty {novelty:.2g}'}"
     )
-
-
-def _write(trajectories: list[Trajectory], situations: list[Situation], out: Path) -> None:
-    import numpy as np
-
-    from tpgmm_datasets.tables import trajectories_to_frame, write_table
-    from tpgmm_torch.atomic import replacing
-    from tpgmm_torch.data.arrays import as_array
-
-    if out.suffix != ".npz":
-        pairs = zip(trajectories, situations, strict=True)
-        frames = [situation.frames_at(one.time.cpu()) for one, situation in pairs]
-        write_table(trajectories_to_frame(trajectories, frames), out)
-        return
-    arrays: dict[str, Any] = {
-        name: np.concatenate([as_array(getattr(one, name)) for one in trajectories])
-        for name in ("time", "joints", "covariance")
-    }
-    arrays["episode"] = np.repeat(np.arange(len(trajectories)), list(map(len, trajectories)))
-    arrays["joint_names"] = np.array(trajectories[0].joint_names)
-    with replacing(out) as new:
-        np.savez(new, **arrays)

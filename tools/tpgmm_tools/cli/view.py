@@ -16,7 +16,7 @@ app = typer.Typer()
 
 SUFFIXES = {"html": ".html", "rerun": ".rrd"}
 EXAMPLE = (
-    "tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 0 --situation 1"
+    "tpgmm view out/demo --object bottle=cylinder:0.04,0.2 --situation 1"
     "\n\n"
     "Example: tpgmm view out/model --dataset out/demo/dataset --episodes 0:5 --live"
 )
@@ -31,7 +31,7 @@ def view(
     format_: Literal["html", "rerun"] = "html",
     dataset: str | None = None,
     situations: Path | None = None,
-    situation: list[int] = [0],  # noqa: B006
+    situation: int = 0,
     object_: list[str] | None = None,
     meshes: Path | None = None,
     fps: float = 25.0,
@@ -59,8 +59,8 @@ def view(
         A LeRobot data set: demonstrated paths, and their situations.
     situations : ``FILE.json``
         Situations, as 'tpgmm reproduce' takes them, instead of the data set's.
-    situation : int
-        Which of the situations is shown, counted from 0; several side by side.
+    situation : int >= 0
+        Which of the situations is shown, counted from 0.
     object_ : ``FRAME=SHAPE``
         What an object looks like, repeatable: box:X,Y,Z, cylinder:RADIUS,LENGTH or
         sphere:RADIUS in metres, at the origin of its frame; else a small box.
@@ -90,23 +90,23 @@ def view(
     where, place = model, out or Path(f"{model}{suffix}")
     if place.suffix != suffix:
         raise DataError(f"--out ends in {suffix}, got {str(place)!r}")
-    if format_ == "rerun" and (live or len(situation) > 1):
-        raise DataError("--format rerun records one situation, and nothing is served")
+    if format_ == "rerun" and live:
+        raise DataError("--live serves a page, --format rerun writes a file: give one of them")
     if (model / "model").is_dir() and (model / "dataset").is_dir():
         where, dataset = model / "model", dataset or str(model / "dataset")
     if situations is None and dataset is None:
         raise DataError("give --dataset DATASET or --situations FILE.json: what to show")
     fitted = load_model(where, device="cpu")
     wanted, demonstrations = options.wanted(situations, dataset, data, fitted.kinematics_)
-    if (last := max(situation)) >= len(wanted) or min(situation) < 0:
+    if situation >= len(wanted):
         raise DataError(
-            f"there are {len(wanted)} situations, counted from 0; got --situation {last}"
+            f"there are {len(wanted)} situations, counted from 0; got --situation {situation}"
         )
     pairs = [text.partition("=") for text in object_ or ()]
     objects = {name: parse_shape(shape) for name, _, shape in pairs}
     how: dict[str, Any] = {"objects": objects, "meshes": meshes, "fps": fps}
     if live:
-        at = {"host": host, "port": port, "first": situation[0], **how}
+        at = {"host": host, "port": port, "first": situation, **how}
         with (
             LiveView(fitted, wanted, demonstrations, **at) as shown,
             suppress(KeyboardInterrupt),
@@ -114,11 +114,8 @@ def view(
             typer.echo(f"open {shown.url} in a browser; stop with Ctrl-C")
             shown.run()
         return
-    chosen = [wanted[number] for number in situation]
-    how["title"] = f"{model.resolve().name}, situation {', '.join(map(str, situation))}"
-    if format_ == "rerun":
-        trajectory = write_rerun(place, fitted, chosen[0], demonstrations, **how)
-    else:
-        trajectory = write_motion(place, fitted, chosen, demonstrations, **how)
+    how["title"] = f"{model.resolve().name}, situation {situation}"
+    write = write_rerun if format_ == "rerun" else write_motion
+    trajectory = write(place, fitted, wanted[situation], demonstrations, **how)
     seconds = float(trajectory.time[-1] - trajectory.time[0])
     typer.echo(f"{seconds:.1f} s of motion, {place.stat().st_size / 1e6:.1f} MB, in {place}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from inspect import signature
 from typing import Any
@@ -15,15 +15,19 @@ from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Situation
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import PlausibilityWarning
 from tpgmm_torch.operators.text import format_operator
+from tpgmm_torch.regression.regression import Regression
+from tpgmm_torch.skills.via_points import ViaPoints
+from tpgmm_torch.skills.ways import Ways
 
 __all__ = ["describe", "model_card"]
 
 #: Rows of the table of what matters when.
 SPANS = 8
 #: Settings that a card has elsewhere, or that are of no interest to others.
-ELSEWHERE = {"n_components", "operators", "robot", "holds", "verbose", "device", "plausibility"}
+ELSEWHERE = {"n_components", "operators", "robot", "device"}
 USE = """```python
 from tpgmm_tools import hub
 
@@ -45,7 +49,7 @@ def model_card(
 
     Parameters
     ----------
-    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
+    model : TaskParameterizedGMM or Skill
         Fitted.
     repo_id : str
         ``"owner/name"``, its title and in the lines that load it.
@@ -74,41 +78,52 @@ def describe(model: Any, measured: Mapping[str, object] | None = None) -> str:
 
     Parameters
     ----------
-    model : TaskParameterizedGMM or MultimodalTaskParameterizedGMM
-        Fitted; of several ways, each is described.
+    model : TaskParameterizedGMM or Skill
+        Fitted; of several parts or ways, each is described.
     measured : mapping of str to object, optional
         As for :func:`model_card`.
     """
+    sections: dict[str, str] = {}
+    whole = model.skill if isinstance(model, TaskParameterizedGMM) else model
+    for name, skill in _parts(whole):
+        title = f" ({name})" if name else ""
+        sections |= {
+            f"The skill{title}": _skill(skill),
+            f"What matters, and when{title}": _influence(skill),
+            f"Where it fails{title}": _limits(skill),
+        }
     figures = "Nothing was stated."
     if measured:
         figures = _table(("what", "how much"), measured.items())
-    ways = getattr(model, "models_", [model])
-    # what was measured is of all ways, and comes before them
-    sections = {"Measured": figures} if len(ways) > 1 else {}
-    for number, way in enumerate(ways):
-        name = f" (way {number})" if len(ways) > 1 else ""
-        sections |= {
-            f"The skill{name}": _skill(way),
-            f"What matters, and when{name}": _influence(way),
-            "Measured": figures,
-            f"Where it fails{name}": _limits(way),
-            f"How it was learned{name}": _learning(way),
-        }
+    sections |= {"Measured": figures, "How it was learned": _learning(model)}
     return "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items())
 
 
-def _skill(model: Any) -> str:
-    robot, time = model.kinematics_, model.time_
-    seconds, steps = float(time[-1] - time[0]), len(time)
+def _parts(skill: Any, name: str = "") -> Iterator[tuple[str, Regression]]:
+    """The fitted mixtures of a skill, by the name that each has among them."""
+    if isinstance(skill, Regression):
+        yield name, skill
+    elif isinstance(skill, ViaPoints):
+        yield from _parts(skill.skill, name)
+    else:
+        kind = "way" if isinstance(skill, Ways) else "part"
+        for number, one in enumerate(skill.skills, start=1):
+            yield from _parts(one, f"{name}, {kind} {number}".lstrip(", "))
+
+
+def _skill(skill: Regression) -> str:
+    seconds, steps = float(skill.time[-1] - skill.time[0]), len(skill.time)
+    shown = skill.summary
     rows = [
         ("duration", f"{seconds:.2f} s, {steps} steps"),
-        ("joints", ", ".join(robot.joint_names)),
-        ("links", ", ".join(robot.links) or "none"),
-        ("frames that it needs", ", ".join(model.frame_names_) or "none"),
-        ("Gaussians", len(model.weights_)),
+        ("joints", ", ".join(skill.kinematics.joint_names)),
+        ("links", ", ".join(skill.kinematics.links) or "none"),
+        ("frames that it needs", ", ".join(skill.frame_names) or "none"),
+        ("Gaussians", len(skill.log_weights)),
+        ("demonstrations", "not known" if shown is None else shown.n_demonstrations),
     ]
-    rows += [("operator", f"`{format_operator(one)}`") for one in model.operators_]
-    rows += [("held", str(hold)) for hold in model.holds_]
+    rows += [("operator", f"`{format_operator(one)}`") for one in skill.operators]
+    rows += [("held", str(hold)) for hold in skill.holds]
     return (
         "A task-parameterised Gaussian mixture (TP-GMM). It gives joint references and their "
         "covariance over time, from a start posture and the poses of objects.\n\n"
@@ -116,14 +131,13 @@ def _skill(model: Any) -> str:
     )
 
 
-def _influence(model: Any) -> str:
+def _influence(skill: Regression) -> str:
     """Shares of the operators over time, in the middle of the demonstrated situations."""
-    situation = _middle(model)
+    situation = _middle(skill)
     if situation is None:
         return "Not known: it depends on the situation, and what was shown is not kept."
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PlausibilityWarning)
-        skill = model.skill
         [trajectory] = rollout(skill, [situation], bounds="robot", blend=1.0, candidates=True)
     time = as_array(trajectory.time - trajectory.time[0])
     shares = np.stack([as_array(100 * c.share.mean(-1)) for c in trajectory.candidates], -1)
@@ -135,7 +149,7 @@ def _influence(model: Any) -> str:
         )
         for span in spans
     ]
-    names = (f"`{format_operator(operator)}`" for operator in model.operators_)
+    names = (f"`{format_operator(operator)}`" for operator in skill.operators)
     return (
         "The share of each operator in what is known about the joints, their mean, where the "
         "start posture and the objects are in the middle of those shown.\n\n"
@@ -143,31 +157,31 @@ def _influence(model: Any) -> str:
     )
 
 
-def _middle(model: Any) -> Situation | None:
+def _middle(skill: Regression) -> Situation | None:
     """The situation amid those shown; None where they are not known."""
-    shown = model.skill.summary
-    if shown is None or not set(model.frame_names_) <= shown.frames.keys():
+    shown = skill.summary
+    if shown is None or not set(skill.frame_names) <= shown.frames.keys():
         return None
     joints = (np.array(shown.start_low) + np.array(shown.start_high)) / 2
-    for start in model.kinematics_.quaternion_starts:
+    for start in skill.kinematics.quaternion_starts:
         quaternion = joints[start : start + 4]
         if np.linalg.norm(quaternion) < 0.5:  # they lie too far apart to have a middle
             return None
         joints[start : start + 4] = quaternions.normalize(as_tensor(quaternion, "orientation"))
     frames = {
         name: Frame(shown.frames[name].place.mean, shown.frames[name].orientation)
-        for name in model.frame_names_
+        for name in skill.frame_names
     }
     return Situation(joints=joints, frames=frames, joint_names=shown.joint_names)
 
 
-def _limits(model: Any) -> str:
+def _limits(skill: Regression) -> str:
     text = (
         "Beyond its demonstrations it extrapolates, and may do anything within the robot's "
         "limits. It has no camera: frames are given to it. It knows nothing of "
         "collisions."
     )
-    shown = model.skill.summary
+    shown = skill.summary
     if shown is None:
         return f"{text} What was shown is not known."
     parts = [f"{text} `novelty` above 1 is further than any demonstration from the others."]
@@ -189,20 +203,18 @@ def _limits(model: Any) -> str:
 
 
 def _learning(model: Any) -> str:
-    shown = model.skill.summary
     rows: list[tuple[str, object]] = []
-    if shown is not None:
-        rows.append(("demonstrations", shown.n_demonstrations))
-    rows.append(("iterations of EM", model.n_iter_))
-    rows.append(("converged", "yes" if model.converged_ else "no"))
-    if np.isfinite(model.lower_bound_):
-        rows.append(("mean log-likelihood per time step", f"{model.lower_bound_:.3f}"))
-    defaults = signature(type(model)).parameters
-    rows += [
-        (f"`{name}`", value)
-        for name, value in model.get_params(deep=False).items()
-        if name not in ELSEWHERE and str(value) != str(defaults[name].default)
-    ]
+    if isinstance(model, TaskParameterizedGMM):
+        rows.append(("iterations of EM", model.n_iter_))
+        rows.append(("converged", "yes" if model.converged_ else "no"))
+        if np.isfinite(model.lower_bound_):
+            rows.append(("mean log-likelihood per time step", f"{model.lower_bound_:.3f}"))
+        defaults = signature(type(model)).parameters
+        rows += [
+            (f"`{name}`", value)
+            for name, value in model.get_params(deep=False).items()
+            if name not in ELSEWHERE and str(value) != str(defaults[name].default)
+        ]
     return _table(("", ""), [*rows, ("tpgmm-torch", version("tpgmm-torch"))])
 
 

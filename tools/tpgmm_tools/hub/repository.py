@@ -7,16 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
-
-from sklearn.utils.validation import check_is_fitted
+from typing import Any
 
 from tpgmm_tools.hub.model_card import model_card
+from tpgmm_torch import persistence
 from tpgmm_torch.exceptions import DataError, DependencyError, ModelFileError
-from tpgmm_torch.persistence import FILES, load_model, save
-
-if TYPE_CHECKING:
-    from tpgmm_torch.estimator import TaskParameterizedGMM
+from tpgmm_torch.persistence import FILES, save
 
 __all__ = ["download", "load", "push", "upload"]
 
@@ -25,7 +21,7 @@ REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 
 
 def push(
-    model: TaskParameterizedGMM,
+    model: Any,
     repo_id: str,
     *,
     measured: Mapping[str, object] | None = None,
@@ -34,14 +30,14 @@ def push(
     private: bool | None = None,
     token: str | None = None,
 ) -> str:
-    """Upload a fitted model to the Hugging Face hub, with a card made from it.
+    """Upload a fitted model or a skill to the Hugging Face hub, with a card made from it.
 
     The ranges of postures and frames in the demonstrations and the robot's URDF go along, the
     demonstrations do not.
 
     Parameters
     ----------
-    model : TaskParameterizedGMM
+    model : TaskParameterizedGMM or Skill
         Fitted.
     repo_id : str
         ``"owner/name"``; made if it does not exist.
@@ -64,7 +60,6 @@ def push(
     DataError, DependencyError
         If that is no repository's id, or huggingface_hub is not installed.
     """
-    check_is_fitted(model)
     card = model_card(model, repo_id, measured=measured, notes=notes, license=license)
     return upload(repo_id, partial(save, model), card, private=private, token=token)
 
@@ -76,8 +71,8 @@ def load(
     token: str | None = None,
     custom: Sequence[type] = (),
     device: str | None = None,
-) -> TaskParameterizedGMM:
-    """Load a model from the Hugging Face hub, or from a folder; nothing in it is executed.
+) -> Any:
+    """Load a model or a skill from the Hugging Face hub, or a folder; nothing is executed.
 
     Parameters
     ----------
@@ -96,7 +91,7 @@ def load(
         If there is no such model, or huggingface_hub is not installed.
     """
     folder = download(repo_id_or_folder, FILES, revision=revision, token=token)
-    return load_model(folder, custom, device)
+    return persistence.load(folder, custom, device)
 
 
 def upload(

@@ -35,8 +35,6 @@ __all__ = ["LiveView", "write_motion"]
 
 #: How long the last picture stands before the motion starts again [s].
 PAUSE = 1.0
-#: Distance of situations that are shown side by side, in a scene of size 1.
-APART = 0.9
 #: The page is light in any browser. On a narrow one the curves go above the legend.
 STYLE = """
 #legend{position:fixed;left:1em;right:1em;bottom:4em;z-index:10;pointer-events:none;
@@ -60,7 +58,7 @@ Moved = Callable[[str, Frame], None]
 def write_motion(
     path: str | Path,
     model: TaskParameterizedGMM,
-    situation: Situation | Sequence[Situation],
+    situation: Situation,
     demonstrations: Sequence[Demonstration] = (),
     *,
     title: str = "tpgmm",
@@ -77,9 +75,8 @@ def write_motion(
         The file; replaced if it exists.
     model : TaskParameterizedGMM
         Fitted, with a robot or with tracked poses.
-    situation : Situation or sequence of Situation
-        Where the skill is reproduced; several are shown side by side, and the curves are of
-        the first.
+    situation : Situation
+        Where the skill is reproduced.
     demonstrations : sequence of Demonstration, default=()
         Whose paths and frames are drawn.
     title : str, default="tpgmm"
@@ -90,32 +87,21 @@ def write_motion(
     Returns
     -------
     Trajectory
-        The reproduction in the first situation.
+        The reproduction.
 
     Raises
     ------
     DependencyError, DataError
         If viser is not installed, or the model has no links that can be drawn.
     """
-    situations = [situation] if isinstance(situation, Situation) else list(situation)
-    scene = MotionScene(model, demonstrations, **how)
+    drawing = MotionScene(model, demonstrations, **how).draw(situation)
+    trajectory, clock = drawing.trajectory, drawing.time
     with viser_server("127.0.0.1", 0) as server:
-        drawings = [scene.draw(one) for one in situations]
-        first, trajectory = drawings[0], drawings[0].trajectory
-        several, drawn = len(drawings) - 1, []
-        for number, drawing in enumerate(drawings):
-            root, aside = (f"/{number}" if number else ""), number * APART * first.size
-            if number:
-                server.scene.add_frame(root, show_axes=False, position=(0.0, aside, 0.0))
-            if several:
-                server.scene.add_label(f"{root}/number", f"{number + 1} of {several + 1}")
-            drawn.append(draw(server.scene, drawing, root))
-        _set_view(server, first, several)
+        handles = draw(server.scene, drawing)
+        _set_view(server, drawing)
         recording = server.get_scene_serializer()
-        clock = max((drawing.time for drawing in drawings), key=lambda instants: instants[-1])
-        for now, pause in zip(clock, [*np.diff(clock), PAUSE], strict=True):
-            for drawing, handles in zip(drawings, drawn, strict=True):
-                move(handles, drawing.nodes, drawing.picture(now))
+        for picture, pause in enumerate([*np.diff(clock), PAUSE]):
+            move(handles, drawing.nodes, picture)
             recording.insert_sleep(float(pause))
         page = recording.as_html()
     curves = as_html(motion_panels(model, trajectory), motion_marks(model, trajectory))
@@ -172,7 +158,6 @@ def viser_server(host: str, port: int) -> Iterator[Any]:
 def draw(
     scene: Any,
     drawing: Drawing,
-    root: str = "",
     handles: Mapping[str, Any] | None = None,
     moved: Moved | None = None,
 ) -> dict[str, Any]:
@@ -184,8 +169,6 @@ def draw(
         Where it is drawn.
     drawing : Drawing
         The motion.
-    root : str
-        Begins all paths.
     handles : mapping of str to viser.SceneNodeHandle, optional
         Nodes that are there already, of another motion of the same model.
     moved : callable, optional
@@ -197,22 +180,22 @@ def draw(
         nodes.pop(gone).remove()
     for path, node in drawing.nodes.items():
         if path not in nodes:
-            nodes[path] = _add_node(scene, root + path, node, drawing.size, moved)
+            nodes[path] = _add_node(scene, path, node, drawing.size, moved)
     for path, lines in drawing.lines.items():
         scene.add_line_segments(
-            root + path, points=lines.points, colors=lines.color, thickness=lines.thickness,
+            path, points=lines.points, colors=lines.color, thickness=lines.thickness,
             thickness_units="screen",
         )  # fmt: skip
     for path, some in drawing.ellipsoids.items():
         scene.add_batched_meshes_simple(
-            root + path, *unit_ball(), batched_positions=some.centres,
+            path, *unit_ball(), batched_positions=some.centres,
             batched_wxyzs=some.orientations, batched_scales=some.half_axes,
             batched_colors=COLORS["covariance"], opacity=0.35, lod="off", cast_shadow=False,
             receive_shadow=False,
         )  # fmt: skip
     for path, poses in drawing.axes.items():
         scene.add_batched_axes(
-            root + path, batched_wxyzs=poses[:, 3:], batched_positions=poses[:, :3],
+            path, batched_wxyzs=poses[:, 3:], batched_positions=poses[:, :3],
             axes_length=0.025 * drawing.size, axes_radius=0.0012 * drawing.size,
         )  # fmt: skip
     for path, node in drawing.nodes.items():
@@ -277,12 +260,11 @@ def _add_solid(scene: Any, path: str, shape: Shape) -> None:
         add(path, *shape.size, **placed)
 
 
-def _set_view(server: Any, drawing: Drawing, others: int = 0) -> None:
-    """Camera, lights and floor, for a drawing and ``others`` beside it along y."""
+def _set_view(server: Any, drawing: Drawing) -> None:
+    """Camera, lights and floor."""
     size, camera = drawing.size, server.initial_camera
-    camera.look_at = drawing.middle + np.array([0.0, others * APART * size / 2, 0.0])
-    away = drawing.distance * np.array([0.8, 0.5, 0.35])
-    camera.position = camera.look_at + away * (1 + 0.5 * others)
+    camera.look_at = drawing.middle
+    camera.position = camera.look_at + drawing.distance * np.array([0.8, 0.5, 0.35])
     camera.fov = 0.75
     server.scene.configure_default_lights(cast_shadow=False)
     cell = 10.0 ** np.floor(np.log10(size / 2))
@@ -437,7 +419,7 @@ class LiveView:
         with self._lock:
             self.situation, self.drawing = situation, self._scene.draw(situation)
             self._handles = draw(
-                self.server.scene, self.drawing, "", self._handles, self.move_frame
+                self.server.scene, self.drawing, self._handles, self.move_frame
             )
             trajectory = self.drawing.trajectory
             marks = motion_marks(self._model, trajectory)
