@@ -14,18 +14,18 @@ a class              its instances
 ``"array-like"``     whatever has elements, a text excepted
 ``"boolean"``        ``True`` and ``False``, those of NumPy too
 ``"random_state"``   ``None``, a seed from 0 to 2**32 - 1, a ``numpy.random.RandomState``
-``"verbose"``        booleans, and integers from 0
 ==================== =======================================================================
 
 A parameter that a class checks by itself stands in the table as ``ANYTHING``.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any, Literal
 
 import numpy as np
+from numpy.random import RandomState
 
 from tpgmm_torch.exceptions import InvalidParameterError
 
@@ -130,31 +130,34 @@ def check_parameters(estimator: Any) -> None:
             )
 
 
+#: The kinds of values that have a name in the table, and what errors call them.
+SEED = Interval(Integral, 0, 2**32 - 1, closed="both")
+NAMED: Mapping[str | None, tuple[Callable[[Any], bool], str]] = {
+    None: (lambda value: value is None, "None"),
+    "array-like": (
+        lambda value: (
+            not isinstance(value, str | bytes | type)
+            and (hasattr(value, "__len__") or hasattr(value, "__array__"))
+        ),
+        "array-like",
+    ),
+    "boolean": (lambda value: isinstance(value, BOOLEANS), "True or False"),
+    "random_state": (
+        lambda value: value is None or isinstance(value, RandomState) or value in SEED,
+        "a seed, a RandomState",
+    ),
+}
+
+
 def _fits(value: Any, constraint: Any) -> bool:
-    if constraint is None:
-        return value is None
     if isinstance(constraint, Interval | Options):
         return value in constraint
     if isinstance(constraint, type):
         return isinstance(value, constraint)
-    if constraint == "array-like":
-        has_elements = hasattr(value, "__len__") or hasattr(value, "__array__")
-        return has_elements and not isinstance(value, str | bytes | type)
-    if constraint == "boolean":
-        return isinstance(value, BOOLEANS)
-    if constraint == "random_state":
-        seeds = Interval(Integral, 0, 2**32 - 1, closed="both")
-        return value is None or isinstance(value, np.random.RandomState) or value in seeds
-    assert constraint == "verbose", constraint
-    return isinstance(value, BOOLEANS) or value in Interval(Integral, 0, None, closed="left")
+    return NAMED[constraint][0](value)
 
 
 def _in_words(constraint: Any) -> str:
-    if isinstance(constraint, type):
-        return f"a {constraint.__name__}"
-    words = {
-        "boolean": "True or False",
-        "random_state": "a seed, a RandomState",
-        "verbose": "a boolean or an int in the range [0, inf)",
-    }
-    return words.get(constraint, str(constraint))
+    if isinstance(constraint, Interval | Options):
+        return str(constraint)
+    return f"a {constraint.__name__}" if isinstance(constraint, type) else NAMED[constraint][1]

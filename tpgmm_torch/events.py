@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -159,19 +158,14 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
     """
     begin, end = float(demonstration.time[0]), float(demonstration.time[-1])
     holds = () if robot is None else find_holds([demonstration], robot)
-    found = []
-    for hold in holds:
-        for time, does in ((hold.begin, "is taken"), (hold.end, "is let go")):
-            if isfinite(time) and begin < time < end:
-                found.append(Boundary(time, f"{hold.frame} {does}", time, time))
+    happen = [(hold.begin, f"{hold.frame} is taken") for hold in holds]
+    happen += [(hold.end, f"{hold.frame} is let go") for hold in holds]
     held = {hold.frame for hold in holds}
     for name, frame in demonstration.frames.items():
-        if name in held or not frame.batch_shape:
-            continue
-        at, confidence = move_start(as_array(frame.position), as_array(demonstration.time))
-        if confidence >= LEAST_CONFIDENCE and begin < at < end:
-            found.append(Boundary(at, f"{name} moves", at, at))
-    return found
+        if name not in held and frame.batch_shape:
+            at, sure = move_start(as_array(frame.position), as_array(demonstration.time))
+            happen += [(at, f"{name} moves")] if sure >= LEAST_CONFIDENCE else []
+    return [Boundary(at, reason, at, at) for at, reason in happen if begin < at < end]
 
 
 def find_stops(

@@ -25,7 +25,6 @@ CASES = [
     ("array-like", [[], (1,), np.ones(2), torch.ones(2), {}], ["ab", b"ab", 1, None, list]),
     ("boolean", [True, np.False_], [0, 1, "yes", None]),
     ("random_state", [None, 0, 2**32 - 1, np.random.RandomState(0)], [-1, 2**32, 1.0, "0"]),
-    ("verbose", [True, 0, 7], [-1, 1.5, "loud", None]),
     (None, [None], [0, False, ""]),
     (dict, [{}], [[], dict]),
 ]

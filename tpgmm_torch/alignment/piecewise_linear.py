@@ -187,19 +187,14 @@ class EventAlignment(LinearTimeNormalization):
 
     def _order(self, demonstrations: Sequence[Demonstration]) -> tuple[str, ...]:
         """Names of the anchors, each of which every demonstration has."""
-        known = list(dict.fromkeys(name for one in demonstrations for name in one.events))
-        wanted = known
-        if self.events is not None:
-            found = ([n for n in known if fnmatchcase(n, event)] for event in self.events)
-            pairs = zip(self.events, found, strict=True)
-            wanted = [name for event, names in pairs for name in names or [event]]
-        names = [name for name in dict.fromkeys(wanted) if name not in ("start", "end")]
-        if not names:
+        known = dict.fromkeys(name for one in demonstrations for name in one.events)
+        wanted = self._wanted([name for name in known if name not in ("start", "end")])
+        if not wanted:
             raise DataError(
                 "there are no events to align at: find them (find_events, events=... of "
                 "load_lerobot, --event), or use LinearTimeNormalization"
             )
-        for name in names:
+        for name in wanted:
             lost = [i for i, one in enumerate(demonstrations) if name not in one.events]
             if lost:
                 raise DataError(
@@ -207,13 +202,16 @@ class EventAlignment(LinearTimeNormalization):
                     f"{sorted(known)}. Leave them out, or align at others: events=[...]"
                 )
         if self.events is not None:
-            return tuple(names)
+            return tuple(wanted)
+        return tuple(sorted(wanted, key=lambda name: _median_phase(name, demonstrations)))
 
-        def phase(name: str) -> float:
-            phases = [(d.events[name] - d.event("start")) / d.duration for d in demonstrations]
-            return float(np.median(phases))
-
-        return tuple(sorted(names, key=phase))
+    def _wanted(self, known: list[str]) -> list[str]:
+        """The events to align at: all that are known, or those asked for by name or pattern."""
+        if self.events is None:
+            return known
+        found = {event: [n for n in known if fnmatchcase(n, event)] for event in self.events}
+        names = [name for event, own in found.items() for name in own or [event]]
+        return [name for name in dict.fromkeys(names) if name not in ("start", "end")]
 
     def _anchors(self, demonstration: Demonstration, which: str = "the demonstration") -> Array:
         """Beginning, events and end of a demonstration [s]."""
@@ -235,26 +233,35 @@ class EventAlignment(LinearTimeNormalization):
     def _fit_parts(self, demonstrations: Sequence[Demonstration]) -> None:
         """Learn how each part is warped in itself."""
         names = ("start", *self.events_, "end")
-        self.parts_: list[DynamicTimeWarping | None] = [None] * (len(names) - 1)
-        self.fallback_: dict[tuple[int, int], str] = {}
-        if self.within is None:
-            return
-        for number in range(len(self.parts_)):
-            parts = [self._part(one, number) for one in demonstrations]
-            moving = any(bool(one.joints.diff(dim=0).any()) for one in parts)
-            if len(parts[0]) < SHORTEST_PART or not moving:
-                continue
-            part = clone(self.within)
-            part.set_params(robot=self.robot if part.robot is None else part.robot)
-            with warnings.catch_warnings():  # one warning is of all parts
-                warnings.simplefilter("ignore", PlausibilityWarning)
-                self.parts_[number] = part.fit(parts)
-            self.fallback_ |= {(i, number): why for i, why in part.fallback_.items()}
+        self.parts_: list[DynamicTimeWarping | None] = [
+            None if self.within is None else self._warping(demonstrations, number)
+            for number in range(len(names) - 1)
+        ]
+        self.fallback_ = {
+            (i, number): why
+            for number, part in enumerate(self.parts_)
+            if part is not None
+            for i, why in part.fallback_.items()
+        }
         if self.fallback_:
             warn_of_linear_time(
                 f"demonstration {i} from {names[number]!r} to {names[number + 1]!r}: {why}"
                 for (i, number), why in self.fallback_.items()
             )
+
+    def _warping(
+        self, demonstrations: Sequence[Demonstration], number: int
+    ) -> DynamicTimeWarping | None:
+        """How one part is warped; None where nothing moves or there are few time steps."""
+        parts = [self._part(one, number) for one in demonstrations]
+        moving = any(bool(one.joints.diff(dim=0).any()) for one in parts)
+        if len(parts[0]) < SHORTEST_PART or not moving:
+            return None
+        part: DynamicTimeWarping = clone(self.within)
+        part.set_params(robot=self.robot if part.robot is None else part.robot)
+        with warnings.catch_warnings():  # one warning is of all parts
+            warnings.simplefilter("ignore", PlausibilityWarning)
+            return part.fit(parts)
 
     def _part(self, demonstration: Demonstration, number: int) -> Demonstration:
         """The part behind anchor ``number``, evenly stretched."""
@@ -287,3 +294,9 @@ class EventAlignment(LinearTimeNormalization):
                 evenly[inside] = np.interp(grid[inside], clock, path)
         instants: Array = np.interp(evenly, self._instants, self._anchors(demonstration))
         return instants
+
+
+def _median_phase(event: str, demonstrations: Sequence[Demonstration]) -> float:
+    """When an event happens, as a share of the duration."""
+    phases = [(d.events[event] - d.event("start")) / d.duration for d in demonstrations]
+    return float(np.median(phases))

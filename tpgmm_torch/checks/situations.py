@@ -49,35 +49,40 @@ def check_situations(
         Of the demonstrations; of several ways of a skill the nearest one counts.
     """
     findings = list(_time(times, learned))
-    batch = np.broadcast_shapes(
-        joints.shape[:-1], *(frame.batch_shape for frame in frames.values())
-    )
+    shapes = [frame.batch_shape for frame in frames.values()]
+    batch = np.broadcast_shapes(joints.shape[:-1], *shapes)
     rows = joints.expand(*batch, kinematics.n_joints)
     values, lower, upper = map(as_array, (rows, kinematics.lower, kinematics.upper))
     excess = np.maximum(lower - values, values - upper)
     begin, end = float(learned[0]), float(learned[-1])
     starts = rows if float(times.min()) <= begin + START * (end - begin) else None
-    novelties = np.zeros((1, *batch))
+    novelty = np.zeros(batch)
     if summaries:
-        each = [one.novelty(starts, frames) for one in summaries]
-        novelties = np.stack(np.broadcast_arrays(*each, novelties[0])[:-1])
-    unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelties.min(axis=0))
+        novelty = novelty + np.min([one.novelty(starts, frames) for one in summaries], axis=0)
+    unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelty)
     worst = np.unravel_index(int(unlike.argmax()), batch)
-    label = f"situation {worst[0]}, " if len(batch) == 1 and batch[0] > 1 else ""
+    subject, label = "the situation", ""
+    if len(batch) == 1 and batch[0] > 1:
+        subject, label = f"{batch[0]} situations", f"situation {worst[0]}, "
     joint = int(excess[worst].argmax())
-    name, value = kinematics.joint_names[joint], values[*worst, joint]
     if excess[*worst, joint] > IMPOSSIBLE:
-        message = (
-            f"{label}start posture: {name} = {value:.4g} cannot be in radians, its limits are "
-            f"{lower[joint]:.4g} to {upper[joint]:.4g}"
-        )
-        remedy = "Is the posture in degrees? Convert all of it (np.deg2rad)"
-        findings.append(Finding("units", message, remedy, (name,), impossible=True))
+        findings.append(_unit(kinematics, joint, values[*worst, joint], label))
     elif summaries:
         here = {name: frame.expand(batch)[worst] for name, frame in frames.items()}
-        nearest = summaries[int(np.argmin([one[worst] for one in novelties]))]
-        findings += nearest.findings(None if starts is None else starts[worst], here, label)
-    return Report.of(findings, f"{batch[0]} situations" if label else "the situation")
+        start = None if starts is None else starts[worst]
+        nearest = min(summaries, key=lambda one: float(one.novelty(start, here)))
+        findings += nearest.findings(start, here, label)
+    return Report.of(findings, subject)
+
+
+def _unit(kinematics: Kinematics, joint: int, value: float, label: str) -> Finding:
+    name, lower, upper = kinematics.joint_names[joint], kinematics.lower, kinematics.upper
+    message = (
+        f"{label}start posture: {name} = {value:.4g} cannot be in radians, its limits are "
+        f"{float(lower[joint]):.4g} to {float(upper[joint]):.4g}"
+    )
+    remedy = "Is the posture in degrees? Convert all of it (np.deg2rad)"
+    return Finding("units", message, remedy, (name,), impossible=True)
 
 
 def _time(times: Tensor, learned: Tensor) -> Iterator[Finding]:

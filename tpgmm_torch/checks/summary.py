@@ -230,9 +230,11 @@ class TrainingSummary:
         starts = np.stack([episode.start for episode in episodes])
         state = kinematics.state(starts)
         links = {link: state.pose(link) for link in kinematics.links}
-        angular = {i for s in kinematics.quaternion_starts for i in range(s, s + 4)}
-        angular |= {i for group in quaternion_groups(kinematics.joint_names) for i in group}
-        compared = [i for i in range(kinematics.n_joints) if i not in angular]
+        turns = [
+            *(range(first, first + 4) for first in kinematics.quaternion_starts),
+            *quaternion_groups(kinematics.joint_names),
+        ]
+        compared = np.setdiff1d(range(kinematics.n_joints), np.ravel(turns)).tolist()
         vectors, frames = [("start", starts[:, compared])], dict[str, FrameSummary]()
         for name in episodes[0].frames:
             paths = [episode.frames[name] for episode in episodes]
@@ -251,8 +253,7 @@ class TrainingSummary:
             frames,
             {
                 name: float(np.median([episode.events[name] for episode in episodes]))
-                for name in episodes[0].events
-                if name in common
+                for name in sorted(common, key=list(episodes[0].events).index)
             },
         )
 

@@ -267,8 +267,10 @@ def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Itera
         remedy = "Name the columns: Demonstration(..., joint_names=[...])"
     else:
         check, message = "limits", f"joints are beyond the robot's limits: {places}"
-        remedy = "Check their zeros, units and order, that it is this robot"
-        remedy += ", and name them (joint_names=[...])" if unnamed else ""
+        remedy = (
+            "Check their zeros, units and order, that it is this robot; name unnamed joints "
+            "(joint_names=[...])"
+        )
     yield Finding(check, message, remedy, about, value=value, impossible=bool(impossible))
 
 

@@ -24,7 +24,8 @@ from tpgmm_torch.mixture.points import Points
 
 __all__ = [
     "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
-    "e_step", "expectation_maximization", "log_joint", "m_step", "reseed", "whiten",
+    "e_step", "expectation_maximization", "labelled_step", "log_joint", "m_step", "reseed",
+    "whiten",
 ]  # fmt: skip
 
 #: A component is left out of a chunk where its responsibilities are below exp(-36) = 2e-16 ...
@@ -217,12 +218,7 @@ class Expectation:
     least: Tensor
 
 
-def e_step(
-    parameters: Parameters,
-    points: Points,
-    least: Tensor | None = None,
-    labeller: Labeller | None = None,
-) -> Expectation:
+def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) -> Expectation:
     """One pass over the points, in which each chunk meets only the components near it in time.
 
     Within a chunk no log-density of component k exceeds ``ub_k``, that at its mean less
@@ -240,52 +236,92 @@ def e_step(
     points : Points
     least : Tensor of shape (n_chunks,), optional
         That of the last pass; without it all components are evaluated at all points.
-    labeller : callable, optional
-        Gives each point to one component, in place of the responsibilities.
     """
-    group_size = points.group_size
-    exact, peaks = whiten(parameters)
-    maps, heights = [own.to(points.dtype) for own in exact], peaks.to(points.dtype)
+    maps, peaks = whiten(parameters)
     ceilings = _ceilings(parameters, peaks, points.spans)
     limits = torch.full_like(ceilings[:, 0], -math.inf) if least is None else least - GUESSED
     limits = torch.minimum(limits, ceilings.amax(1) - GUESSED)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
-    mass, total, lowest = torch.zeros_like(peaks), torch.zeros_like(peaks[0]), []
-    sums = [own.new_zeros(own.shape[2], *own.shape[:2]) for own in exact]
-    for (chunk, numbers), index, limit, ceiling in zip(
+    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    found, lowest = _Sums.zero(maps, peaks), []
+    for (chunk, _), index, limit, ceiling in zip(
         points, chosen, limits.tolist(), ceilings, strict=True
     ):
         blocks = points.blocks(chunk)
-        if labeller is not None:
-            index, labels = labeller(chunk[points.values].T, numbers).unique(
-                return_inverse=True
-            )
-        joint, whitened = log_joint(
-            blocks, [m[index] for m in maps], heights[index], group_size
-        )
-        density = joint.logsumexp(0)
-        lowest.append(float(density.min()))
-        if limit > lowest[-1] - NEGLIGIBLE:  # the guess was wrong
-            index = (ceiling > lowest[-1] - NEGLIGIBLE).nonzero()[:, 0]
-            joint, whitened = log_joint(
-                blocks, [m[index] for m in maps], heights[index], group_size
-            )
+        while True:
+            own = [m[index] for m in rounded], heights[index]
+            joint, whitened = log_joint(blocks, *own, points.group_size)
             density = joint.logsumexp(0)
-            lowest[-1] = float(density.min())
+            lowest.append(float(density.min()))
+            if not limit > lowest[-1] - NEGLIGIBLE:  # nor where it is NaN
+                break
+            limit = -math.inf  # the guess was wrong
+            index = (ceiling > lowest.pop() - NEGLIGIBLE).nonzero()[:, 0]
         gamma = joint.sub_(density).clamp_(min=LEAST).exp_()
-        if labeller is not None:
-            gamma = torch.nn.functional.one_hot(labels, len(index)).T.to(joint)
-        mass.index_add_(0, index, gamma.sum(1, dtype=mass.dtype))
-        for x, y, own in zip(blocks, whitened, sums, strict=True):
+        found.add(index, gamma, blocks, whitened)
+        found.total += density.sum(dtype=peaks.dtype)
+    return found.expectation(parameters, rounded, points, limits.new_tensor(lowest))
+
+
+def labelled_step(points: Points, labeller: Labeller, n_components: int) -> Expectation:
+    """The pass in which each point belongs to one component.
+
+    Parameters
+    ----------
+    points : Points
+    labeller : callable
+        Gives the components of points.
+    n_components : int
+    """
+    like = points.shift
+    zeros = [like.new_zeros(n_components, width) for width in points.widths]
+    ones = [torch.diag_embed(torch.ones_like(mean)) for mean in zeros]
+    shares = like.new_full((n_components,), 1 / n_components)
+    unit = Parameters(shares, tuple(zeros), tuple(ones))
+    maps, peaks = whiten(unit)
+    rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
+    found = _Sums.zero(maps, peaks)
+    for chunk, numbers in points:
+        labels = labeller(chunk[points.values].T, numbers)
+        index, places = labels.unique(return_inverse=True)
+        blocks = points.blocks(chunk)
+        joint, whitened = log_joint(blocks, [m[index] for m in rounded], heights[index])
+        gamma = torch.nn.functional.one_hot(places, len(index)).T.to(joint)
+        found.add(index, gamma, blocks, whitened)
+    return found.expectation(unit, rounded, points, points.spans.new_zeros(len(points.spans)))
+
+
+@dataclass
+class _Sums:
+    """Sums over points of one process."""
+
+    mass: Tensor
+    total: Tensor
+    moments: list[Tensor]
+
+    @classmethod
+    def zero(cls, maps: Sequence[Tensor], peaks: Tensor) -> _Sums:
+        moments = [own.new_zeros(own.shape[2], *own.shape[:2]) for own in maps]
+        return cls(torch.zeros_like(peaks), torch.zeros_like(peaks[0]), moments)
+
+    def add(
+        self, index: Tensor, gamma: Tensor, blocks: Sequence[Tensor], whitened: Sequence[Tensor]
+    ) -> None:
+        """Add a chunk, given the responsibilities (K', n) of some components."""
+        self.mass.index_add_(0, index, gamma.sum(1, dtype=self.mass.dtype))
+        for x, y, own in zip(blocks, whitened, self.moments, strict=True):
             y.mul_(gamma[:, None])
             part = (x @ y.flatten(0, 1).T).view(len(x), len(index), -1)
             own.index_add_(1, index, part.double())
-        total += density.sum(dtype=total.dtype)
-    mass, total, *sums = points.processes.sum(mass, total, *sums)
-    rounded = [own.double() for own in maps]
-    bound = float(total) / points.total
-    return Expectation(parameters, rounded, mass, sums, bound, limits.new_tensor(lowest))
+
+    def expectation(
+        self, parameters: Parameters, maps: Sequence[Tensor], points: Points, least: Tensor
+    ) -> Expectation:
+        """The sums of all processes."""
+        mass, total, *sums = points.processes.sum(self.mass, self.total, *self.moments)
+        rounded, bound = [own.double() for own in maps], float(total) / points.total
+        return Expectation(parameters, rounded, mass, sums, bound, least)
 
 
 def _ceilings(parameters: Parameters, peaks: Tensor, spans: Tensor) -> Tensor:
@@ -467,24 +503,22 @@ def expectation_maximization(
         proposal = m_step(current, family, floor=floor)
         dead = dead_components(current, family, points)
         n_dead = int(dead.sum())
-        reseeded = 0 < n_dead <= min(left, len(dead) - 1)
-        if reseeded:
-            proposal = reseed(proposal, dead, current.parameters, points, rng)
+        if 0 < n_dead <= min(left, len(dead) - 1):
             left -= n_dead
             components = dead.nonzero()[:, 0].tolist()
             fit.reseedings.append(f"component(s) {components} in iteration {fit.n_iter}")
-        following = e_step(proposal, points, current.least)
-        if following.bound < lowest and not floor and not reseeded:
-            floor = True
-            proposal = m_step(current, family, floor=True)
+            proposal = reseed(proposal, dead, current.parameters, points, rng)
             following = e_step(proposal, points, current.least)
-        change = current.bound - fit.bounds[-1] if fit.bounds else math.inf
-        fit.bounds.append(current.bound)
-        if not reseeded:
-            fit.converged = abs(change) < tol
+            fit.bounds = [] if following.bound < lowest else [*fit.bounds, current.bound]
+        else:
+            following = e_step(proposal, points, current.least)
+            if following.bound < lowest and not floor:
+                floor = True
+                proposal = m_step(current, family, floor=True)
+                following = e_step(proposal, points, current.least)
             following = current if following.bound < lowest else following
-        elif following.bound < lowest:
-            last = fit.n_iter == max_iter
-            fit.bounds = [following.bound] if last else []
+            fit.converged = bool(fit.bounds) and abs(current.bound - fit.bounds[-1]) < tol
+            fit.bounds.append(current.bound)
         current, fit.parameters = following, following.parameters
+    fit.bounds = fit.bounds or [current.bound]
     return fit

@@ -8,12 +8,13 @@ from numpy.random import RandomState
 from sklearn.cluster import KMeans
 from torch import Tensor
 
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.expectation_maximization import (
     CovarianceFamily,
     Labeller,
     Parameters,
-    e_step,
+    labelled_step,
     m_step,
 )
 from tpgmm_torch.mixture.points import Points
@@ -47,8 +48,7 @@ def draw_starts(
     DataError
         If there are fewer distinct points than components.
     """
-    sample, numbers = points.sample()
-    rows = sample.cpu().numpy()
+    rows = points.sample()[0].cpu().numpy()
     # points that differ on a random line are distinct; column by column, since a product of
     # matrices rounds equal rows differently
     line = RandomState(0).standard_normal(rows.shape[1])
@@ -60,32 +60,31 @@ def draw_starts(
             f"point(s) among n_samples = {points.total}; use at most that many components, or "
             "more data"
         )
-    # groups stay together, unless they are too few
-    group_size = points.group_size if points.total // points.group_size >= n_components else 1
-    if method == "time" and group_size > 1:
-        sample, numbers = points.sample(group_size)
 
-    def labeller(number: int) -> Labeller:
-        if method == "time":
-            sizes = bin_sizes(len(sample), n_components, rng if number else None)
-            times = sample[:, 0].to(points.dtype)
-            return time_bins(times, numbers, sizes, group_size)
+    def centers() -> Array:
         if method == "kmeans":
-            centers = (
-                KMeans(n_components, n_init=1, random_state=rng).fit(rows).cluster_centers_
-            )
-        else:
-            centers = rows[rng.choice(distinct, n_components, replace=False)]
-        return nearest(torch.from_numpy(centers).to(points.shift))
+            return KMeans(n_components, n_init=1, random_state=rng).fit(rows).cluster_centers_
+        return rows[rng.choice(distinct, n_components, replace=False)]
 
-    zeros = [points.shift.new_zeros(n_components, width) for width in points.widths]
-    ones = [torch.diag_embed(torch.ones_like(mean)) for mean in zeros]
-    weights = points.shift.new_full((n_components,), 1 / n_components)
-    unit = Parameters(weights, tuple(zeros), tuple(ones))
-    labellers = [labeller(number) for number in range(n_starts)]
-    return [
-        m_step(e_step(unit, points, labeller=own), family, floor=False) for own in labellers
-    ]
+    if method == "time":
+        labellers = _bins_along_time(n_starts, n_components, points, rng)
+    else:
+        found = [torch.from_numpy(centers()) for _ in range(n_starts)]
+        labellers = [nearest(own.to(points.shift)) for own in found]
+    steps = (labelled_step(points, labeller, n_components) for labeller in labellers)
+    return [m_step(step, family, floor=False) for step in steps]
+
+
+def _bins_along_time(
+    n_starts: int, n_bins: int, points: Points, rng: RandomState
+) -> list[Labeller]:
+    """Equal bins, and bins of random sizes from the second start on."""
+    # groups stay together, unless they are too few
+    group_size = points.group_size if points.total // points.group_size >= n_bins else 1
+    sample, numbers = points.sample(group_size)
+    times = sample[:, 0].to(points.dtype)
+    sizes = [bin_sizes(len(times), n_bins, rng if k else None) for k in range(n_starts)]
+    return [time_bins(times, numbers, own, group_size) for own in sizes]
 
 
 def bin_sizes(n_points: int, n_bins: int, rng: RandomState | None = None) -> list[int]:

@@ -7,7 +7,7 @@ import torch
 from tests.support.blocks import COVARIANCE_TYPES
 from tests.support.em_reference import columns, family, movements, points_of
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.mixture.expectation_maximization import e_step, m_step
+from tpgmm_torch.mixture.expectation_maximization import labelled_step, m_step
 from tpgmm_torch.mixture.initialization import bin_sizes, draw_starts, nearest, time_bins
 from tpgmm_torch.mixture.row_file import RowFile
 
@@ -119,9 +119,8 @@ def test_fewer_distinct_points_than_components_are_refused(method):
 def test_gaussians_are_those_of_the_labelled_points(covariance_type, monkeypatch):
     monkeypatch.setattr("tpgmm_torch.mixture.points.CHUNK_SIZE", {"cpu": 2**10})
     points, own = points_of(movements(600)), family(1e-2, covariance_type)
-    [start] = drawn(points, "time", n_starts=1, n_components=3)
     labels = torch.from_numpy(np.random.RandomState(0).randint(0, 3, 600))
-    found = m_step(e_step(start, points, labeller=lambda _, n: labels[n]), own, floor=False)
+    found = m_step(labelled_step(points, lambda _, n: labels[n], 3), own, floor=False)
     numbers = torch.cat([numbers for _, numbers in points])
     counts = torch.bincount(labels) / 600
     torch.testing.assert_close(found.weights, counts.double(), rtol=1e-6, atol=0)
