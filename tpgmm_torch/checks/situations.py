@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -56,14 +57,11 @@ def check_situations(
     excess = np.maximum(lower - values, values - upper)
     begin, end = float(learned[0]), float(learned[-1])
     starts = rows if float(times.min()) <= begin + START * (end - begin) else None
-    novelty = np.zeros(batch)
-    if summaries:
-        novelty = novelty + np.min([one.novelty(starts, frames) for one in summaries], axis=0)
+    novelties = [np.zeros(batch) + one.novelty(starts, frames) for one in summaries]
+    novelty = np.min(novelties or [np.zeros(batch)], axis=0)
     unlike = np.where(excess.max(axis=-1) > IMPOSSIBLE, np.inf, novelty)
     worst = np.unravel_index(int(unlike.argmax()), batch)
-    subject, label = "the situation", ""
-    if len(batch) == 1 and batch[0] > 1:
-        subject, label = f"{batch[0]} situations", f"situation {worst[0]}, "
+    subject, label = _named(worst, batch)
     joint = int(excess[worst].argmax())
     if excess[*worst, joint] > IMPOSSIBLE:
         findings.append(_unit(kinematics, joint, values[*worst, joint], label))
@@ -73,6 +71,13 @@ def check_situations(
         nearest = min(summaries, key=lambda one: float(one.novelty(start, here)))
         findings += nearest.findings(start, here, label)
     return Report.of(findings, subject)
+
+
+def _named(worst: tuple[Any, ...], batch: tuple[int, ...]) -> tuple[str, str]:
+    """Names of the batch, and of one of its situations."""
+    if len(batch) == 1 and batch[0] > 1:
+        return f"{batch[0]} situations", f"situation {worst[0]}, "
+    return "the situation", ""
 
 
 def _unit(kinematics: Kinematics, joint: int, value: float, label: str) -> Finding:
