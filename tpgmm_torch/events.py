@@ -43,18 +43,15 @@ LEAST_CONFIDENCE = 0.2
 #: A robot rests below this share of the smaller one of its peak speeds before and after, and
 #: moves above the second; slower than the third share of the peak speed is noise.
 REST, MOTION, NOISE = 0.15, 0.5, 0.005
-#: It rests for this share of the time in which it does not move: 0.47 where minimum-jerk
-#: motions meet, 0.29 where a sinusoid turns back.
-DWELL = 0.35
 #: Events so far from a stop, as a share of the duration, happen at the stop.
 NEAR = 0.05
 #: Speeds are means over so long [s], and over this share of the duration, at least.
 SMOOTHING, SHARE = 0.15, 0.015
 #: Turning a link by one radian counts as this distance [m].
 LEVER = 0.2
-#: A signal has come to its high level (1) above the first share of the way, and is back at its
-#: low one (0) below the second.
-ON, OFF = 0.65, 0.35
+#: A signal has come to its high level (1) above this share of the way, and is back at its low
+#: one (0) below the rest of it.
+ON = 0.65
 #: Spikes of half this length are no change of a signal [s].
 SPIKE = 0.1
 #: A swing counts fully from this share of the signal's magnitude on; less may be drift.
@@ -169,7 +166,7 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
 
 
 def find_stops(
-    demonstration: Demonstration, robot: Any = None, *, dwell: float = DWELL
+    demonstration: Demonstration, robot: Any = None, *, dwell: float = 0.35
 ) -> list[Boundary]:
     """When the whole robot comes to rest between two motions; rhythms go on.
 
@@ -182,10 +179,10 @@ def find_stops(
         Of at least five time steps.
     robot : Kinematics, optional
         Its links are what rests; without it, the joints but for grippers.
-
     dwell : float, default=0.35
         Where the robot rests for this share of the time in which it does not move, at least,
-        it stops; 0 also finds where rhythms turn back.
+        it stops; 0 also finds where rhythms turn back. The share is 0.47 where minimum-jerk
+        motions meet, and 0.29 where a sinusoid turns back.
 
     References
     ----------
@@ -321,7 +318,7 @@ def level_changes(time: Array, values: Array) -> list[tuple[float, float, bool]]
         return []
     share = 1 - share  # 1 where it is low
     found = []
-    for start, stop in high_stretches(share, ON, OFF):
+    for start, stop in high_stretches(share, ON, 1 - ON):
         if start > 0:
             at, change = crossing_time(time, share, start, stop, "begin")
             found.append((at - change, at, True))
@@ -377,7 +374,7 @@ def _levels(values: Array) -> tuple[float, float, float]:
 def crossing_time(
     time: Array, share: Array, start: int, stop: int, edge: str
 ) -> tuple[float, float]:
-    """When a signal passes ``ON`` at an edge [s], and how long that took from ``OFF``.
+    """When a signal passes ``ON`` at an edge [s], and how long that took from ``1 - ON``.
 
     Parameters
     ----------
@@ -390,7 +387,7 @@ def crossing_time(
     """
     if edge == "begin":
         at = float(np.interp(ON, share[start - 1 : start + 1], time[start - 1 : start + 1]))
-        away = np.flatnonzero(share[:start] <= OFF)
+        away = np.flatnonzero(share[:start] <= 1 - ON)
         return at, at - float(time[away[-1]] if len(away) else time[0])
     last = start + int(np.flatnonzero(share[start:stop] >= ON)[-1])
     at = float(np.interp(-ON, -share[last : last + 2], time[last : last + 2]))

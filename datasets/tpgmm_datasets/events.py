@@ -18,7 +18,6 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.pose_names import words
 from tpgmm_torch.events import (
     LEAST_CONFIDENCE,
-    OFF,
     ON,
     SMALL,
     between_levels,
@@ -164,7 +163,7 @@ class SignalEvent(Detector):
         values = as_array(demonstration.joints)[:, self._columns(demonstration)]
         share, contrast = between_levels(without_spikes(values, time))
         share = 1 - share if self.level == "low" else share
-        stretches = high_stretches(share, ON, OFF)
+        stretches = high_stretches(share, ON, 1 - ON)
         chosen = [(start, stop) for start, stop in stretches if start > 0]
         if self.edge == "end":
             ended = [(start, stop) for start, stop in stretches if stop < len(share)]

@@ -23,10 +23,6 @@ Floats = NDArray[np.floating[Any]]
 
 #: A warp never runs slower than this share of its mean: an event has one instant.
 SLOWEST = 1e-3
-#: Steps of the sequences of which the medoid is chosen; each pair costs their square.
-MEDOID_STEPS = 200
-#: Rounds of the barycentre at most, and the relative fall of its cost at which it stops.
-BARYCENTER_ROUNDS, BARYCENTER_TOLERANCE = 10, 1e-3
 
 
 def resample(values: Array, time: Floats, grid: Floats) -> Array:
@@ -133,7 +129,7 @@ def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
     return (1 - SLOWEST) * moving_average(means, width) + SLOWEST * line
 
 
-def medoid(sequences: Sequence[Array], max_slope: int = 2) -> int:
+def medoid(sequences: Sequence[Array], max_slope: int = 2, n_steps: int = 200) -> int:
     """Index of the sequence with the least summed warping distance to the others.
 
     Parameters
@@ -142,10 +138,12 @@ def medoid(sequences: Sequence[Array], max_slope: int = 2) -> int:
         At least one.
     max_slope : int, default=2
         As in :func:`warping_path`.
+    n_steps : int, default=200
+        To which longer sequences are shortened; each pair costs their square.
     """
     if len(sequences) < 3:
         return 0
-    phase = np.linspace(0, 1, min(MEDOID_STEPS, max(map(len, sequences))))
+    phase = np.linspace(0, 1, min(n_steps, max(map(len, sequences))))
     short = [resample(s, np.linspace(0, 1, len(s)), phase) for s in sequences]
     total = np.zeros(len(short))
     for i, j in itertools.combinations(range(len(short)), 2):
@@ -154,7 +152,13 @@ def medoid(sequences: Sequence[Array], max_slope: int = 2) -> int:
 
 
 def barycenter(
-    sequences: Sequence[Array], start: Array, penalty: float = 0.0, max_slope: int = 2
+    sequences: Sequence[Array],
+    start: Array,
+    penalty: float = 0.0,
+    max_slope: int = 2,
+    *,
+    tol: float = 1e-3,
+    max_iter: int = 10,
 ) -> Array:
     """Average sequences by dynamic time warping barycentre averaging (DBA).
 
@@ -169,6 +173,10 @@ def barycenter(
         First guess, usually the medoid.
     penalty, max_slope : float, int
         As in :func:`warping_path`.
+    tol : float, default=1e-3
+        It ends where the cost falls by less than this share.
+    max_iter : int, default=10
+        Rounds at most.
 
     References
     ----------
@@ -176,14 +184,14 @@ def barycenter(
     with applications to clustering, Pattern Recognition 44(3), 2011.
     """
     average, last = start, np.inf
-    for _ in range(BARYCENTER_ROUNDS):
+    for _ in range(max_iter):
         total, counts, cost = np.zeros_like(start), np.zeros(len(start)), 0.0
         for sequence in sequences:
             path, one = warping_path(average, sequence, penalty, max_slope)
             np.add.at(total, path[:, 0], sequence[path[:, 1]])
             counts += np.bincount(path[:, 0], minlength=len(start))
             cost += one
-        if cost >= last * (1 - BARYCENTER_TOLERANCE):
+        if cost >= last * (1 - tol):
             break
         average, last = total / counts[:, None], cost
     return average

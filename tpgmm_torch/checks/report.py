@@ -11,9 +11,8 @@ from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
 __all__ = ["Finding", "Report", "in_columns", "listed"]
 
-#: Largest numbers of examples of one finding, and of findings, in a message; a report has
-#: them all.
-MOST_EXAMPLES, MOST_FINDINGS = 3, 8
+#: Examples of one finding that a message names; how many more there are it counts.
+MOST_EXAMPLES = 3
 PACKAGE = str(Path(__file__).parents[1])
 
 
@@ -89,10 +88,7 @@ class Report:
     def __str__(self) -> str:
         if not self.findings:
             return f"{self.subject}: nothing implausible"
-        spelled = self.findings[:MOST_FINDINGS]
-        items = "; ".join(f"({n}) {finding}" for n, finding in enumerate(spelled, start=1))
-        if len(self) > len(spelled):
-            items += f"; and {len(self) - len(spelled)} more"
+        items = "; ".join(f"({n}) {finding}" for n, finding in enumerate(self, start=1))
         one = "one thing is" if len(self) == 1 else f"{len(self)} things are"
         worst = "impossible" if self.errors() else "implausible"
         return f"{self.subject}: {one} {worst}: {items}"

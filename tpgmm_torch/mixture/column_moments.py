@@ -10,14 +10,11 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.mixture.row_file import Rows
+from tpgmm_torch.mixture.row_file import FILE_ROWS, Rows
 
 __all__ = ["ColumnMoments"]
 
 Array = NDArray[np.float64]
-
-#: Numbers at a time when moments are summed: a processor's cache full.
-PART = 2**16
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,8 @@ class ColumnMoments:
             raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
         if len(set(widths)) > 1:
             raise DataError(f"the processes' rows have {widths} columns: all need the same")
-        step = -(-len(rows) // max(1, len(rows) * widths[0] // PART))
         with np.errstate(over="ignore", invalid="ignore"):
-            own = [_moments(rows[i : i + step]) for i in range(0, len(rows), step)]
+            own = [_moments(rows[i : i + FILE_ROWS]) for i in range(0, len(rows), FILE_ROWS)]
             parts = np.concatenate(processes.gather(np.stack(own)))
             number, means, scatters, low, high = parts.swapaxes(0, 1)
             count = number.sum(0)

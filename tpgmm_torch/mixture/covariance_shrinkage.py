@@ -24,8 +24,6 @@ from torch import Tensor
 
 __all__ = ["moderated_variances", "shrink", "shrinkage_intensity", "trigamma_inverse"]
 
-#: Newton's steps for the inverse of the trigamma function, which double their digits each.
-STEPS = 20
 #: Logarithms of variances that differ by no more than this beyond chance are alike.
 ALIKE = 1e-9
 
@@ -139,14 +137,14 @@ def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
     return torch.where(excess > ALIKE, posterior, mean.exp())
 
 
-def trigamma_inverse(value: Tensor) -> Tensor:
+def trigamma_inverse(value: Tensor, n_steps: int = 20) -> Tensor:
     """The x with ``trigamma(x) = value``, elementwise, of positive values.
 
     By Newton's method on ``1 / trigamma``, which is convex from the start on and converges from
-    there (Smyth, appendix).
+    there (Smyth, appendix); each of ``n_steps`` doubles the number of right digits.
     """
     x = 0.5 + 1 / value
-    for _ in range(STEPS):
+    for _ in range(n_steps):
         trigamma = torch.polygamma(1, x)
         x = x + trigamma * (1 - trigamma / value) / torch.polygamma(2, x)
     return x

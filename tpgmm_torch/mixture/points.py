@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.mixture.processes import Processes
-from tpgmm_torch.mixture.row_file import Rows
+from tpgmm_torch.mixture.row_file import FILE_ROWS, Rows
 
 __all__ = ["Chunk", "Points"]
 
@@ -21,8 +21,6 @@ Chunk = tuple[Tensor, Tensor]
 #: Whitened coordinates of a chunk in float64, in float32 twice as many: what a processor's
 #: cache holds, and what keeps a GPU busy.
 CHUNK_SIZE = {"cpu": 3 * 2**17, "gpu": 2**25}
-#: Rows of a file that are read, and put in order of time, at once.
-FILE_ROWS = 2**16
 #: Starts are found from so many rows at most; of more, from a sample.
 LARGEST_SAMPLE = 2**16
 

@@ -13,7 +13,10 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["RowFile", "Rows"]
+__all__ = ["FILE_ROWS", "RowFile", "Rows"]
+
+#: Rows that are read at once; memory holds no more of a file.
+FILE_ROWS = 2**16
 
 
 class RowFile:

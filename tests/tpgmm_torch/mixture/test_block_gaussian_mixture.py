@@ -190,16 +190,6 @@ def test_the_best_of_several_starts_wins(clusters, init_params):
     assert bounds[0] < bounds[2]
 
 
-def test_the_same_random_state_gives_the_same_mixture(clusters):
-    first, second = (
-        fitted(
-            BlockGaussianMixture(4, init_params="random", n_init=2, random_state=7), clusters
-        )
-        for _ in range(2)
-    )
-    torch.testing.assert_close(first.means_, second.means_, rtol=0, atol=0)
-
-
 def test_em_goes_on_from_a_mixture(clusters):
     settings = {"n_components": 3, "blocks": WIDTHS, "tol": 0.0}
     half = fitted(BlockGaussianMixture(**settings, max_iter=4), clusters)
@@ -616,13 +606,6 @@ def test_groups_equal_plain_em_with_shared_responsibilities(n_iter):
     np.testing.assert_allclose(model.lower_bounds_, bounds, rtol=1e-9)
 
 
-def test_groups_are_another_model_than_points():
-    X = grouped_data()
-    assert not torch.allclose(
-        fit_grouped(X, group_size=GROUP).means_[0], fit_grouped(X).means_[0], atol=1e-3
-    )
-
-
 def test_groups_of_equal_rows_are_their_rows():
     X = grouped_data(group=1)
     repeated = fit_grouped(X.repeat(GROUP, 0), group_size=GROUP)
@@ -643,36 +626,7 @@ def test_order_within_groups_and_of_groups_does_not_matter():
     torch.testing.assert_close(own.means_, other.means_)
 
 
-def test_prediction_is_of_single_rows():
-    X = grouped_data()
-    model = fit_grouped(X, group_size=GROUP)
-    parameters = [model.weights_.numpy()], model.means_, model.covariances_
-    log_joint = joint_density(X[:7], parameters[0][0], *parameters[1:])
-    np.testing.assert_allclose(model.score_samples(X[:7]), logsumexp(log_joint, axis=1))
-    np.testing.assert_allclose(model.predict_proba(X[:7]), softmax(log_joint, axis=1))
-
-
-@pytest.mark.parametrize("covariance_type", ["full", "tied", "diag", "spherical"])
-@pytest.mark.parametrize("size", [1, 20, 64 * 3 * 7])
-def test_chunks_are_cut_between_groups(covariance_type, size, monkeypatch):
-    X = grouped_data()
-    options = {"group_size": 9, "covariance_type": covariance_type}
-    whole = fit_grouped(X, **options)
-    monkeypatch.setattr("tpgmm_torch.mixture.points.CHUNK_SIZE", {"cpu": size})
-    chunked = fit_grouped(X, **options)
-    torch.testing.assert_close(chunked.weights_, whole.weights_)
-    torch.testing.assert_close(chunked.means_, whole.means_)
-    torch.testing.assert_close(chunked.covariances_, whole.covariances_)
-    np.testing.assert_allclose(chunked.score_samples(X), whole.score_samples(X), rtol=1e-9)
-
-
 @pytest.mark.parametrize("group_size", [7, 181])
 def test_incomplete_groups_are_refused(group_size):
     with pytest.raises(ShapeError, match=rf"180 rows are no multiple of .*{group_size}"):
-        fit_grouped(grouped_data(), group_size=group_size)
-
-
-@pytest.mark.parametrize("group_size", [0, -1, 2.5, "4"])
-def test_sizes_that_are_no_sizes_are_refused(group_size):
-    with pytest.raises(ValueError, match="'group_size' parameter"):
         fit_grouped(grouped_data(), group_size=group_size)
