@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from numbers import Integral, Real
@@ -17,10 +17,8 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.checks.report import Report
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.checks.training import EpisodeSummary, check, summarize
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import as_tensor
@@ -32,7 +30,6 @@ from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.conditionals import Conditionals
@@ -48,8 +45,8 @@ from tpgmm_torch.training.mixture_settings import (
     kinematics_for,
     regularization,
 )
-from tpgmm_torch.training.outlying_demonstrations import outliers_among
-from tpgmm_torch.training.training_rows import batches_of, read_rows
+from tpgmm_torch.training.training_data import read
+from tpgmm_torch.training.training_rows import batches_of
 
 __all__ = ["TaskParameterizedGMM"]
 
@@ -259,39 +256,25 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         head = next(batches)
         kinematics = kinematics_for(head, operators, self.robot, self.dtype, self.device)
         (self.fusion or InformationFusion()).check(operators, kinematics)
-        peaks, episodes = DemonstratedPeaks(kinematics.joint_names), list[EpisodeSummary]()
-
-        def remember() -> Iterator[Sequence[Demonstration]]:
-            for batch in peaks.watch(chain([head], batches)):
-                episodes.extend(summarize(batch, kinematics))
-                yield batch
-
-        data = read_rows(
-            remember(),
-            operators, kinematics, responsibilities=self.responsibilities, processes=processes,
-        )  # fmt: skip
-        data = data if interval is None else data.within(*interval)
-        episodes = list(chain.from_iterable(processes.gather(episodes)))
         correlated = self.covariance_type in ("full", "tied") and self.covariance_shrinkage == 0
-        known = episodes, kinematics, data.operators, data.holds
-        findings = *check(*known, correlated=correlated), *outliers_among(data, kinematics)
-        report = Report.of(findings, f"{len(episodes)} demonstrations")
-        if processes.rank == 0 or report.errors():
-            report.act()
-        moments = ColumnMoments.of(data.rows, processes)
+        data = read(
+            chain([head], batches), operators, kinematics,
+            responsibilities=self.responsibilities, correlated=correlated, interval=interval,
+            processes=processes,
+        )  # fmt: skip
+        rows = data.rows
         mixture = BlockGaussianMixture(
-            **self._mixture_settings(data.operators, kinematics),
-            group_size=data.group_size,
-            n_demonstrations=data.n_demonstrations,
+            **self._mixture_settings(rows.operators, kinematics),
+            group_size=rows.group_size,
+            n_demonstrations=rows.n_demonstrations,
             reg_covar=regularization(
-                moments, data.operators, kinematics,
+                ColumnMoments.of(rows.rows, processes), rows.operators, kinematics,
                 reg_covar=self.reg_covar, covariance_type=self.covariance_type,
             ),
-        ).fit(data.rows, processes=processes)  # fmt: skip
+        ).fit(rows.rows, processes=processes)  # fmt: skip
         return self._set(
-            mixture, data.operators, kinematics, data.time, data.holds,
-            data.n_demonstrations, peaks.result(processes),
-            TrainingSummary.of(episodes, kinematics),
+            mixture, rows.operators, kinematics, rows.time, rows.holds, rows.n_demonstrations,
+            data.peaks, data.summary,
         )  # fmt: skip
 
     def predict(

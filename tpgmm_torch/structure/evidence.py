@@ -24,7 +24,7 @@ from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 from tpgmm_torch.training.local_data import local_data
-from tpgmm_torch.training.training_rows import typical_time
+from tpgmm_torch.training.training_rows import typical
 
 __all__ = ["Evidence", "gather_evidence"]
 
@@ -129,7 +129,11 @@ def gather_evidence(
     holds : sequence of Hold, default=()
         Objects that the robot held.
     """
-    time = typical_time(demonstrations).to(kinematics.lower)
+    begins, durations = (
+        [float(d.time[0]) for d in demonstrations],
+        [d.duration for d in demonstrations],
+    )
+    time = demonstrations[typical(begins, durations)].time.to(kinematics.lower)
     phase = torch.linspace(0, 1, min(n_instants, *map(len, demonstrations)))
     seen = [one.at_steps(((len(one) - 1) * phase).round().long()) for one in demonstrations]
     # quaternions among the joints on one side, from here on

@@ -29,7 +29,7 @@ from tpgmm_torch.operators import (
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.evidence import Evidence, gather_evidence
-from tpgmm_torch.training.hold_detection import demonstrated_holds
+from tpgmm_torch.training.hold_detection import demonstrated_holds, with_holds
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
@@ -192,7 +192,8 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         kinematics = kinematics_for(demonstrations, operators, self.robot, "float64", "cpu")
         holds = demonstrated_holds(demonstrations, operators, kinematics)
         # one frame in a wrong place hides that it matters
-        outlying = outlying_demonstrations(demonstrations, operators, kinematics, holds)
+        demonstrations = with_holds(demonstrations, holds)
+        outlying = outlying_demonstrations(demonstrations, operators, kinematics)
         unlike = {one.episode for one in outlying}
         demonstrations = [d for i, d in enumerate(demonstrations) if i not in unlike]
         evidence = gather_evidence(

@@ -9,7 +9,6 @@ from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
 
@@ -22,12 +21,10 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.skills.ways import Ways
-from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import Motion, at_phases, local_data
-from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.local_data import Motion
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
 from tpgmm_torch.training.outlying_demonstrations import comparable_coordinates
-from tpgmm_torch.training.training_rows import typical_time
+from tpgmm_torch.training.training_rows import read_rows
 
 __all__ = ["SelectWays"]
 
@@ -179,7 +176,6 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
                 f"{wanted} modes of at least {FEWEST} demonstrations each need "
                 f"{FEWEST * wanted}, got {count}"
             )
-        self._time = as_array(typical_time(known))
         self.labels_: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
         self.bic_: Array = np.full(self.max_ways, np.inf)
         self._found: list[_Split] = []
@@ -230,15 +226,13 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
     def _views(self, known: Sequence[Demonstration]) -> list[_View]:
         operators, robot = check_operators(self.model.operators), self.model.robot
         kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
-        holds = demonstrated_holds(known, operators, kinematics)
-        motions = [Motion.of(one, kinematics, holds) for one in known]
-        operators = with_mean_orientations(operators, motions, kinematics)
-        rows = local_data(known, operators, kinematics, holds=holds)
-        data = torch.stack([at_phases(row, len(self._time)) for row in rows])
+        rows = read_rows([known], operators, kinematics)
+        self._time = as_array(rows.time)
+        data = rows.at_phases(len(rows.time))
         return [
             _View(leaf, as_array(values), near)
             for leaf, values, near in comparable_coordinates(
-                data, operators, kinematics, SMALLEST_RANGE
+                data, rows.operators, kinematics, SMALLEST_RANGE
             )
         ]
 

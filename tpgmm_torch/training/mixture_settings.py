@@ -23,7 +23,6 @@ __all__ = [
     "block_widths",
     "check_operators",
     "column_units",
-    "fused_samples",
     "kinematics_for",
     "regularization",
 ]
@@ -147,18 +146,3 @@ def regularization(
     paths = [(0.0, *operator.path_variances(kinematics)) for operator in operators]
     own = reg_covar * (1 + np.concatenate(paths) / scales**2)
     return own + (np.concatenate(tolerances) / scales) ** 2
-
-
-def fused_samples(
-    covariance_shrinkage: float | str, n_demonstrations: int | None
-) -> int | None:
-    """How few samples the fusion shall allow for; None where it takes covariances as they are.
-
-    Parameters
-    ----------
-    covariance_shrinkage : "auto" or float
-        A number is the user's own word on covariances.
-    n_demonstrations : int or None
-        None of models of which nobody knows what they were learned from.
-    """
-    return n_demonstrations if covariance_shrinkage == "auto" else None

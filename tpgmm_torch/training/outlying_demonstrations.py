@@ -10,28 +10,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.report import Finding, Report, listed
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.hold_detection import attach_holds, demonstrated_holds
-from tpgmm_torch.training.local_data import Motion, at_phases, local_data
-from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.hold_detection import attach_holds
+from tpgmm_torch.training.local_data import at_phases
 from tpgmm_torch.training.mixture_settings import check_operators, kinematics_for
-from tpgmm_torch.training.training_rows import TrainingRows, typical_time
+from tpgmm_torch.training.training_rows import TrainingRows, read_rows
 
 __all__ = [
     "Outlying",
     "comparable_coordinates",
     "drop_outliers",
-    "outliers_among",
     "outlying_demonstrations",
     "outlying_rows",
     "unlike_the_others",
@@ -43,8 +41,6 @@ FEWEST = 5
 NEAR = 0.005
 #: and an angle [rad].
 NEAR_ANGLE = 0.05
-#: Of a normal law, the standard deviation per median absolute deviation.
-CONSISTENT = 1.4826
 #: So many robust standard deviations from the median are unlike the others, where they last for
 #: so long [s]. On real recordings: at most 6.1 of those who are not, at least 11.6 of those
 #: whose frame was taken at a wrong instant, 5 to 15 cm beside the right one.
@@ -80,7 +76,6 @@ def outlying_demonstrations(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
-    holds: Sequence[Hold] = (),
 ) -> tuple[Outlying, ...]:
     """Demonstrations far from the median of all, at instants at which the others agree.
 
@@ -97,50 +92,45 @@ def outlying_demonstrations(
         show several ways rather than mistakes.
     operators : sequence of Operator
     kinematics : Kinematics
-    holds : sequence of Hold, default=()
-        Objects that the robot held.
 
     Returns
     -------
     tuple of Outlying
         In the order of the demonstrations.
     """
-    if len(demonstrations) < FEWEST:
+    if len(demonstrations) < FEWEST:  # nothing is read
         return ()
-    time = typical_time(demonstrations)
-    rows = local_data(demonstrations, operators, kinematics, holds=holds)
-    data = torch.stack([at_phases(row, len(time)) for row in rows])
-    return outlying_rows(data, time, operators, kinematics)
+    return outlying_rows(read_rows([demonstrations], operators, kinematics), kinematics)
 
 
-def outlying_rows(
-    data: Tensor, time: Tensor, operators: Sequence[Operator], kinematics: Kinematics
-) -> tuple[Outlying, ...]:
-    """The same of local data that are at hand.
+def outlying_rows(rows: TrainingRows, kinematics: Kinematics) -> tuple[Outlying, ...]:
+    """:func:`outlying_demonstrations` of rows that are read, of all batches and processes.
 
     Parameters
     ----------
-    data : Tensor of shape (M, T, sum_j (1 + D_j))
-        Of M demonstrations, at equal phase.
-    time : Tensor of shape (T,)
-        Of a typical one.
-    operators : sequence of Operator
+    rows : TrainingRows
     kinematics : Kinematics
     """
-    if len(data) < FEWEST:
+    number = rows.n_demonstrations
+    if number < FEWEST:
         return ()
-    step = float(time[-1] - time[0]) / max(len(time) - 1, 1)
+    duration = float(rows.time[-1] - rows.time[0])
+    most = LARGEST_TABLE // (number * rows.rows.shape[1])
+    most = max(most, math.ceil(2 * duration / LONG) + 1)
+    time = at_phases(rows.time, min(len(rows.time), most))
+    data = rows.at_phases(len(time))
+    step = duration / max(len(time) - 1, 1)
     count = min(max(round(LONG / step), 1), len(time)) if step > 0 else 1
     found: dict[int, Outlying] = {}
-    for operator, local, near in comparable_coordinates(data, operators, kinematics):
+    for operator, local, near in comparable_coordinates(data, rows.operators, kinematics):
         distance = torch.linalg.vector_norm(local - local.median(0).values, dim=-1)  # (M, T)
-        usual = distance.median(0).values.clamp(min=near)
-        ratios, instants = (distance / (CONSISTENT * usual)).topk(count, dim=1)
+        usual = distance.median(0).values.clamp(min=near) / NormalDist().inv_cdf(0.75)
+        ratios, instants = (distance / usual).topk(count, dim=1)
         for episode in (ratios[:, -1] > UNLIKE).nonzero()[:, 0].tolist():
             ratio, instant = float(ratios[episode, -1]), int(instants[episode, -1])
             if episode not in found or ratio > found[episode].ratio:
                 found[episode] = Outlying(episode, operator, float(time[instant]), ratio)
-    if len(found) > len(data) // 3:
+    if len(found) > number // 3:
         return ()
     return tuple(found[episode] for episode in sorted(found))
 
@@ -185,9 +175,8 @@ def comparable_coordinates(
             spread = local.flatten(0, 1).amax(0) - local.flatten(0, 1).amin(0)
             if not bool((spread > 0).any()):
                 continue
-            if leaf.determines_joints or isinstance(
-                leaf, Canonical
-            ):  # of which each has a unit of its own
+            # of joints, each has a unit of its own
+            if leaf.determines_joints or isinstance(leaf, Canonical):
                 local = local[..., spread > 0] / spread[spread > 0].clamp(min=least)
                 yield leaf, local, NEAR * local.shape[-1] ** 0.5
             else:
@@ -225,33 +214,12 @@ def drop_outliers(
     kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
     if known[0].holds is None:
         known = attach_holds(known, kinematics)
-    holds = demonstrated_holds(known, operators, kinematics)
-    motions = [Motion.of(one, kinematics, holds) for one in known]
-    completed = with_mean_orientations(operators, motions, kinematics)
-    outlying = outlying_demonstrations(known, completed, kinematics, holds)
+    outlying = outlying_demonstrations(known, operators, kinematics)
     if outlying:
         finding = replace(unlike_the_others(outlying, len(known)), remedy="They are left out")
         Report.of([finding], f"{len(known)} demonstrations").act()
     dropped = {one.episode for one in outlying}
     return [one for number, one in enumerate(demonstrations) if number not in dropped]
-
-
-def outliers_among(data: TrainingRows, kinematics: Kinematics) -> Iterator[Finding]:
-    """A finding, if there are demonstrations unlike the others, of all batches and processes.
-
-    Parameters
-    ----------
-    data : TrainingRows
-    kinematics : Kinematics
-    """
-    width = sum(1 + operator.dimension(kinematics) for operator in data.operators)
-    fewest = math.ceil(2 * float(data.time[-1] - data.time[0]) / LONG) + 1
-    most = LARGEST_TABLE // (data.n_demonstrations * width)
-    count = min(len(data.time), max(most, fewest))
-    time = at_phases(data.time, count)
-    outlying = outlying_rows(data.at_phases(count), time, data.operators, kinematics)
-    if outlying:
-        yield unlike_the_others(outlying, data.n_demonstrations)
 
 
 def unlike_the_others(outlying: Sequence[Outlying], count: int) -> Finding:

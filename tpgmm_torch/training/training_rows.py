@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
@@ -28,14 +29,20 @@ from tpgmm_torch.training.local_data import (
     constant_columns,
     like,
     local_rows,
-    one_constant,
 )
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
 
-__all__ = ["TrainingRows", "batches_of", "read_rows", "share_one_grid", "typical_time"]
+__all__ = ["TrainingRows", "batches_of", "read_rows", "typical"]
 
-#: Duration [s], first row and end of a demonstration in a file.
-Span = tuple[float, int, int]
+
+@dataclass(frozen=True)
+class Span:
+    """Begin and duration [s] of a demonstration, and its rows among all of its process."""
+
+    begin: float
+    duration: float
+    start: int
+    stop: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +52,7 @@ class TrainingRows:
     Parameters
     ----------
     rows : array of shape (n, sum_j (1 + D_j)), or RowFile
-        Of this process.
+        What this process learns from.
     group_size : int
         So many consecutive rows share one responsibility.
     time : Tensor of shape (T,)
@@ -58,12 +65,10 @@ class TrainingRows:
         From when to when the robot holds which object.
     processes : Processes
         Among which the rows are spread.
-    parts : tuple of Tensor of shape (T_m, sum_j (1 + D_j))
-        The rows of each demonstration, if all are in memory.
-    file : RowFile, optional
-        Where the rows are, or came from, of more than one batch.
+    stored : array of shape (sum_m T_m, sum_j (1 + D_j)), or RowFile
+        Rows of the demonstrations of this process, one after the other.
     spans : tuple of Span
-        Where the demonstrations of this process are in the file.
+        Where each demonstration is in them.
     """
 
     rows: Rows
@@ -73,9 +78,8 @@ class TrainingRows:
     operators: tuple[Operator, ...]
     holds: tuple[Hold, ...]
     processes: Processes
-    parts: tuple[Tensor, ...] = ()
-    file: RowFile | None = None
-    spans: tuple[Span, ...] = ()
+    stored: Rows
+    spans: tuple[Span, ...]
 
     def at_phases(self, count: int) -> Tensor:
         """Rows of all demonstrations of all processes at equal phase.
@@ -89,16 +93,9 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        thinned = [at_phases(rows, count) for rows in self._each()]
-        return torch.cat(self.processes.gather(torch.stack(thinned).double().cpu()))
-
-    def _each(self) -> Iterator[Tensor]:
-        """The rows of each demonstration of this process, (T_m, sum_j (1 + D_j))."""
-        if self.file is None:
-            yield from self.parts
-        else:
-            for _, *rows in self.spans:
-                yield torch.from_numpy(self.file[slice(*rows)])
+        each = (torch.from_numpy(self.stored[one.start : one.stop]) for one in self.spans)
+        thinned = torch.stack([at_phases(rows, count) for rows in each])
+        return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
         """Those rows, in memory, whose time is from ``begin`` to before ``end`` [s].
@@ -109,13 +106,18 @@ class TrainingRows:
             If there are less than two instants.
         """
         inside = (self.time >= begin) & (self.time < end)
-        rows = self.rows[:]
-        own = (rows[:, 0] >= begin) & (rows[:, 0] < end)
+        rows, stored = self.rows[:], self.stored[:]
+        own, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
         if int(inside.sum()) < 2 or not own.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
-        parts = tuple(x[(x[:, 0] >= begin) & (x[:, 0] < end)] for x in self._each())
-        time = self.time[inside]
-        return replace(self, rows=rows[own], time=time, parts=parts, file=None)
+        before = np.concatenate(([0], np.cumsum(kept)))
+        spans = tuple(
+            replace(one, start=int(before[one.start]), stop=int(before[one.stop]))
+            for one in self.spans
+        )
+        return replace(
+            self, rows=rows[own], time=self.time[inside], stored=stored[kept], spans=spans
+        )
 
 
 def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstration]]:
@@ -221,126 +223,113 @@ def read_rows(
     head = next(walk)
     holds = processes.gather(demonstrated_holds(head, operators, kinematics))[0]
     motions = [Motion.of(one, kinematics, holds) for one in head]
-    completed = with_mean_orientations(operators, motions, kinematics)
-    completed = processes.gather(completed)[0]
-    local = [[motion.coordinates(one, kinematics) for one in completed] for motion in motions]
-    grid, *templates = processes.gather([head[0].time.cpu(), *(x.cpu() for x in local[0])])[0]
+    operators = with_mean_orientations(operators, motions, kinematics)
+    operators = processes.gather(operators)[0]
+
+    def coordinates(motion: Motion) -> list[Tensor]:
+        return [motion.coordinates(one, kinematics) for one in operators]
+
+    local = list(map(coordinates, motions))
+    templates = processes.gather([x.cpu() for x in local[0]])[0]
     expected = like([template.to(kinematics.lower) for template in templates])
-    known = completed, kinematics, expected
-    rows = [
-        local_rows(motion.time, x, *known) for motion, x in zip(motions, local, strict=True)
-    ]
-    aligned = share_one_grid(head, grid)
-    following = next(walk, None)
-    if following is None and processes.count == 1:
-        rows, time = one_constant(rows, completed, kinematics), typical_time(head)
-        size = _group_size(aligned, responsibilities, len(rows))
-        together = torch.cat(rows) if size == 1 else torch.stack(rows, 1).flatten(0, 1)
-        stored = together.cpu().numpy()
-        time = time.to(kinematics.lower)
-        return TrainingRows(
-            stored, size, time, len(rows), completed, holds, processes, tuple(rows)
-        )
-    file = RowFile()
-    spans = _write(file, head, rows, [])
-    while following is not None:
-        aligned = aligned and share_one_grid(following, grid)
-        rows = []
-        for one in following:
+    known = operators, kinematics, expected
+    later = next(walk, None)
+    alone = later is None and processes.count == 1
+
+    def rows() -> Iterator[Tensor]:
+        for motion, x in zip(motions, local, strict=True):
+            yield local_rows(motion.time, x, *known)
+        for one in chain.from_iterable(chain([later or ()], walk)):
             motion = Motion.of(one, kinematics, holds)
-            x = [motion.coordinates(operator, kinematics) for operator in completed]
-            rows.append(local_rows(motion.time, x, *known))
-        _write(file, following, rows, spans)
-        following = next(walk, None)
-    return _gathered(
-        file, spans, all(processes.gather(aligned)), responsibilities, kinematics,
-        TrainingRows(file, 1, grid, 0, completed, holds, processes, file=file),
-    )  # fmt: skip
+            yield local_rows(motion.time, coordinates(motion), *known)
 
-
-def _write(
-    file: RowFile, batch: Sequence[Demonstration], rows: Sequence[Tensor], spans: list[Span]
-) -> list[Span]:
-    for one, own in zip(batch, rows, strict=True):
-        spans.append((one.duration, len(file), len(file) + len(own)))
-        file.append(own.cpu().numpy())
-    return spans
-
-
-def _gathered(
-    file: RowFile,
-    spans: Sequence[Span],
-    aligned: bool,
-    responsibilities: str,
-    kinematics: Kinematics,
-    data: TrainingRows,
-) -> TrainingRows:
-    """What the rows in the files of all processes are learned as."""
-    processes, operators = data.processes, data.operators
+    stored, spans, aligned = _stored(rows(), alone, processes)
+    first = _made_constant(stored, spans[0], operators, kinematics, processes)
     n_demonstrations = sum(processes.gather(len(spans)))
-    size = _group_size(aligned, responsibilities, n_demonstrations)
-    moments = ColumnMoments.of(file, processes)
-    first = processes.gather(file[slice(*spans[0][1:])])[0]
-    low, high = (
-        torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
-    )
-    widths, turns = columns_of(operators, kinematics)
-    constant = constant_columns(low, high, widths, turns).numpy()
-    file[:, constant] = first[0, constant]
-    everyone = [
-        (duration, rank, start, stop)
-        for rank, each in enumerate(processes.gather(spans))
-        for duration, start, stop in each
-    ]
-    everyone.sort(key=lambda span: span[0])
-    _, owner, start, stop = everyone[len(everyone) // 2]
-    typical = file[start:stop, 0] if processes.rank == owner else None
-    time = torch.from_numpy(processes.gather(typical)[owner]).to(kinematics.lower)
-    data = replace(data, time=time, n_demonstrations=n_demonstrations, spans=tuple(spans))
-    if size == 1:
-        return data
-    instants = Instants(np.where(constant, first[0], first), widths)
-    instants.add(file)
-    points, size = instants.points(processes)
-    own = processes.share(range(len(points) // size))
-    share = points[own[0] * size : (own[-1] + 1) * size]
-    return replace(data, rows=share, group_size=size)
-
-
-def _group_size(aligned: bool, responsibilities: str, n_demonstrations: int) -> int:
-    """How many rows share a responsibility: one, or all demonstrations at an instant."""
     if responsibilities == "instant" and not aligned:
         raise DataError(
             "responsibilities='instant' needs demonstrations of one common time grid: "
             "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
         )
-    return n_demonstrations if aligned and responsibilities != "point" else 1
+    learned, size = stored, 1
+    if aligned and responsibilities != "point" and n_demonstrations > 1:
+        if alone:
+            size, together = n_demonstrations, stored[:].reshape(n_demonstrations, *first.shape)
+            learned = together.swapaxes(0, 1).reshape(-1, first.shape[1])
+        else:
+            learned, size = _equivalent(stored, first, columns_of(*known[:2])[0], processes)
+    time = _typical_time(stored, spans, processes).to(kinematics.lower)
+    return TrainingRows(
+        learned, size, time, n_demonstrations, tuple(operators), holds, processes, stored,
+        tuple(spans),
+    )  # fmt: skip
 
 
-def share_one_grid(demonstrations: Sequence[Demonstration], grid: Tensor) -> bool:
-    """Whether the time of all demonstrations is one grid.
+def _stored(
+    each: Iterator[Tensor], alone: bool, processes: Processes
+) -> tuple[Rows, list[Span], bool]:
+    """All rows, where each demonstration is in them, and whether all have one time grid."""
+    kept: Any = [] if alone else RowFile()
+    spans, count, aligned, grid = list[Span](), 0, True, None
+    for rows in each:
+        values = rows.cpu().numpy()
+        time = values[:, 0]
+        grid = processes.gather(time)[0] if grid is None else grid
+        aligned = aligned and np.array_equal(time, grid)
+        begin, end = float(time[0]), float(time[-1])
+        spans.append(Span(begin, end - begin, count, count + len(values)))
+        count += len(values)
+        kept.append(values)
+    return np.concatenate(kept) if alone else kept, spans, all(processes.gather(aligned))
+
+
+def _made_constant(
+    stored: Rows,
+    span: Span,
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    processes: Processes,
+) -> NDArray[Any]:
+    """Rows of the first demonstration of all; what varies by rounding alone is as in it."""
+    moments = ColumnMoments.of(stored, processes)
+    first = processes.gather(stored[span.start : span.stop])[0]
+    low, high = (
+        torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
+    )
+    constant = constant_columns(low, high, *columns_of(operators, kinematics)).numpy()
+    stored[:, constant] = first[0, constant]
+    return np.where(constant, first[0], first)
+
+
+def _equivalent(
+    stored: Rows, reference: NDArray[Any], widths: Sequence[int], processes: Processes
+) -> tuple[Rows, int]:
+    """The share of a process of points that stand for all demonstrations at each instant."""
+    instants = Instants(reference, widths)
+    instants.add(stored)
+    points, size = instants.points(processes)
+    own = processes.share(range(len(points) // size))
+    return points[own[0] * size : (own[-1] + 1) * size], size
+
+
+def _typical_time(stored: Rows, spans: Sequence[Span], processes: Processes) -> Tensor:
+    everyone = [
+        (rank, one) for rank, each in enumerate(processes.gather(spans)) for one in each
+    ]
+    begins, durations = zip(*((one.begin, one.duration) for _, one in everyone), strict=True)
+    owner, one = everyone[typical(begins, durations)]
+    time = stored[one.start : one.stop, 0] if processes.rank == owner else None
+    return torch.from_numpy(processes.gather(time)[owner])
+
+
+def typical(begins: Sequence[float], durations: Sequence[float]) -> int:
+    """Which demonstration has the median duration.
 
     Parameters
     ----------
-    demonstrations : sequence of Demonstration
-    grid : Tensor of shape (T,)
+    begins, durations : sequence of float
+        Of each [s]; segments that begin later than the first by more than a tenth do not count.
     """
-    return all(torch.equal(one.time.cpu(), grid) for one in demonstrations)
-
-
-def typical_time(demonstrations: Sequence[Demonstration]) -> Tensor:
-    """The time grid of the demonstration of median duration.
-
-    Parameters
-    ----------
-    demonstrations : sequence of Demonstration
-        Segments that begin later than the first by more than a tenth do not count.
-
-    Returns
-    -------
-    Tensor of shape (T,)
-    """
-    begin = min(float(one.time[0]) for one in demonstrations)
-    late = begin + 0.1 * max(one.duration for one in demonstrations)
-    whole = [one for one in demonstrations if one.time[0] <= late]
-    return sorted(whole, key=lambda one: one.duration)[len(whole) // 2].time
+    late = min(begins) + 0.1 * max(durations)
+    whole = [number for number, begin in enumerate(begins) if begin <= late]
+    return sorted(whole, key=lambda number: durations[number])[len(whole) // 2]

@@ -55,6 +55,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.structure.segmentation import Segmentation
+from tpgmm_torch.training.hold_detection import with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
@@ -289,7 +290,8 @@ class Learner:
         holds = self._model.holds_ if given is None else given
         shown = list(aligned.values())
         if config.training.robust:  # as in fit, which says so
-            outlying = outlying_demonstrations(shown, operators, kinematics, holds)
+            held = with_holds(shown, holds)
+            outlying = outlying_demonstrations(held, operators, kinematics)
             self._left_out = {list(aligned)[one.episode] for one in outlying}
             if self._left_out:
                 log.info("unlike the others, not learned from: %s", sorted(self._left_out))
