@@ -318,7 +318,7 @@ def _typical_time(stored: Rows, spans: Sequence[Span], processes: Processes) -> 
     ]
     begins, durations = zip(*((one.begin, one.duration) for _, one in everyone), strict=True)
     owner, one = everyone[typical(begins, durations)]
-    time = stored[one.start : one.stop, 0] if processes.rank == owner else None
+    time = stored[one.start : one.stop, 0].copy() if processes.rank == owner else None
     return torch.from_numpy(processes.gather(time)[owner])
 
 
