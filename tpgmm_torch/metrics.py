@@ -6,7 +6,7 @@ radians. None depends on the signs of quaternions.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,8 +35,8 @@ __all__ = [
 ]
 
 
-#: An event's name, an instant or several [s], or a function of a demonstration to find them.
-Instants = str | float | Sequence[float] | Tensor | Callable[[Demonstration], Any]
+#: An event's name, or an instant or several [s].
+Instants = str | float | Sequence[float] | Tensor
 
 
 def joint_rmse(trajectory: Trajectory, demonstration: Demonstration) -> float:
@@ -107,9 +107,9 @@ def pose_errors(
         ``model.kinematics_``.
     link : str
         Of the robot.
-    at : str, float, array-like or callable, optional
-        When, on the demonstration's clock: an event's name, an instant or several [s], or a
-        function of the demonstration that returns them. By default each of its time steps.
+    at : str, float or array-like, optional
+        When, on the demonstration's clock: an event's name, or an instant or several [s]. By
+        default each of its time steps.
         Between time steps the joints are interpolated; before and after a motion they stand
         still.
 
@@ -154,8 +154,6 @@ def _instants(at: Instants | None, demonstration: Demonstration) -> Tensor:
         return time
     if isinstance(at, str):
         at = demonstration.event(at)
-    elif callable(at):
-        at = at(demonstration)
     instants = as_tensor(at, "an instant").to(time).reshape(-1)
     outside = (instants < time[0]) | (instants > time[-1])
     if bool(outside.any()) or not len(instants):
@@ -194,13 +192,11 @@ class PoseScorer:
     ----------
     link : str, optional
         Of the robot; the mean over all its links by default.
-    event : str, float or callable, optional
-        When: the name of an event of the demonstrations, an instant of all of them [s], or a
-        function of a demonstration that returns one. By default the whole path.
+    event : str or float, optional
+        When: the name of an event of the demonstrations, or an instant of all of them [s]. By
+        default the whole path.
     quantity : {"position", "angle"}, default="position"
         In millimetres, or in degrees.
-    robot : Kinematics, optional
-        By default the model's own.
 
     Raises
     ------
@@ -216,7 +212,6 @@ class PoseScorer:
     link: str | None = None
     event: Instants | None = None
     quantity: str = "position"
-    robot: Kinematics | None = None
 
     def __post_init__(self) -> None:
         if self.quantity not in ("position", "angle"):
@@ -237,7 +232,7 @@ class PoseScorer:
             Here for scikit-learn.
         """
         model, pairs = _reproductions(estimator, X)
-        robot = model.kinematics_ if self.robot is None else self.robot
+        robot = model.kinematics_
         links = robot.links if self.link is None else (self.link,)
         if not links:
             raise DataError(

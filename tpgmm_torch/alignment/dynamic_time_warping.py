@@ -161,15 +161,13 @@ class DynamicTimeWarping(Alignment):
         if self._held_out is not None:
             warp = warps[self.reference_index_]
             self._held_out_target = resample(self._held_out(chosen), time, warp)
-        reasons = map(self._reason_against, demonstrations, warps)
+        reasons = list(map(self._reason_against, demonstrations, warps))
         self.fallback_ = {i: reason for i, reason in enumerate(reasons) if reason}
-        for i in self.fallback_:
-            warps[i] = self._linear(demonstrations[i])
         if self.fallback_:
             warn_of_linear_time(
                 f"demonstration {i}: {why}" for i, why in self.fallback_.items()
             )
-        self.paths_ = list(map(self._on_grid, warps))
+        self.paths_ = list(map(self._on_grid, demonstrations, warps, reasons))
         return self
 
     def _index(self, sequences: Sequence[Array]) -> int:
@@ -237,16 +235,18 @@ class DynamicTimeWarping(Alignment):
             f"{after / before:.0%} of that on linear time"
         )
 
-    def _on_grid(self, warp: Array) -> Array:
-        instants: Array = np.interp(self.time_.numpy(), self._clock, warp)
+    def _on_grid(self, demonstration: Demonstration, warp: Array, reason: str) -> Array:
+        """Instants at the times of the grid, linear where there is a reason against warping."""
+        chosen = self._linear(demonstration) if reason else warp
+        instants: Array = np.interp(self.time_.numpy(), self._clock, chosen)
         return instants
 
     def _path(self, demonstration: Demonstration) -> Array:
         warp = self._warp(demonstration, self._features(demonstration))
-        if reason := self._reason_against(demonstration, warp):
-            warp = self._linear(demonstration)
+        reason = self._reason_against(demonstration, warp)
+        if reason:
             warn_of_linear_time([f"of transform: {reason}"])
-        return self._on_grid(warp)
+        return self._on_grid(demonstration, warp, reason)
 
 
 def warn_of_linear_time(found: Iterable[str]) -> None:

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from itertools import pairwise
-from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -16,7 +15,7 @@ from sklearn.base import clone
 from tpgmm_torch.alignment.base import Alignment, retime
 from tpgmm_torch.alignment.dynamic_time_warping import DynamicTimeWarping, warn_of_linear_time
 from tpgmm_torch.alignment.features import quaternion_columns
-from tpgmm_torch.constraints import ANYTHING, Interval, Options
+from tpgmm_torch.constraints import ANYTHING, Options
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
@@ -32,8 +31,8 @@ class LinearTimeNormalization(Alignment):
 
     Parameters
     ----------
-    duration : {"mean", "median"} or float, default="mean"
-        Duration of the result [s]; 1.0 makes time the phase.
+    duration : {"mean", "median"}, default="mean"
+        Which average of the durations.
     robot : Kinematics, optional
         Says where recorded poses hold quaternions.
 
@@ -55,11 +54,11 @@ class LinearTimeNormalization(Alignment):
     """
 
     _parameter_constraints: dict[str, Any] = {  # noqa: RUF012
-        "duration": [Options("mean", "median"), Interval(Real, 0, None, closed="neither")],
+        "duration": [Options("mean", "median")],
         "robot": ANYTHING,
     }
 
-    def __init__(self, duration: str | float = "mean", *, robot: Any = None) -> None:
+    def __init__(self, duration: str = "mean", *, robot: Any = None) -> None:
         self.duration = duration
         self.robot = robot
 
@@ -75,9 +74,6 @@ class LinearTimeNormalization(Alignment):
         lengths = np.diff([self._anchors(one) for one in demonstrations])
         average = np.median if self.duration == "median" else np.mean
         self._instants = np.concatenate(([0.0], average(lengths, axis=0).cumsum()))
-        if not isinstance(self.duration, str):
-            self._instants *= self.duration / self._instants[-1]
-            self._instants[-1] = self.duration
         n_steps = round(float(np.median([len(one) for one in demonstrations])))
         self.time_ = torch.linspace(0, float(self._instants[-1]), n_steps, dtype=torch.float64)
 
@@ -104,9 +100,8 @@ class EventAlignment(LinearTimeNormalization):
     events : sequence of str, optional
         The anchors in their order, by name or pattern (``"part *"``); by default all events of
         the demonstrations, in the order of their median phases.
-    duration : {"mean", "median"} or float, default="mean"
-        Which average of the lengths of each part; or the sum of their means is scaled to
-        this [s], and 1.0 makes time the phase.
+    duration : {"mean", "median"}, default="mean"
+        Which average of the lengths of each part.
     within : DynamicTimeWarping, optional
         How each part is warped in itself, with its own reference and features; anchors stay.
         Its slopes are relative to the evenly stretched part. Parts without motion, or of fewer
@@ -150,7 +145,7 @@ class EventAlignment(LinearTimeNormalization):
         self,
         events: Sequence[str] | None = None,
         *,
-        duration: str | float = "mean",
+        duration: str = "mean",
         within: DynamicTimeWarping | None = None,
         robot: Any = None,
     ) -> None:

@@ -443,10 +443,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         """Bayesian information criterion on X (n_samples, n_features); lower is better."""
         return -2 * len(X) * self.score(X) + self.n_parameters_ * math.log(len(X))
 
-    def aic(self, X: Any) -> float:
-        """Akaike information criterion on X (n_samples, n_features); lower is better."""
-        return -2 * len(X) * self.score(X) + 2 * self.n_parameters_
-
     def sample(self, n_samples: int = 1) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
         """Draw points from the mixture.
 
