@@ -10,6 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
+from tests.support.local_coordinates import local_coordinates
 from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
 from tests.support.worlds import OnPoses
 from tpgmm_tools.plotting import (
@@ -90,7 +91,7 @@ def test_local_coordinates_are_those_of_the_operator():
     assert len(axes.lines) == 3
     for line, source in zip(axes.lines, [*demonstrations, motion], strict=True):
         np.testing.assert_array_equal(line.get_xdata(), source.time)
-        wanted = HANDLING[0].local(source, HANDS)[:, 2]
+        wanted = local_coordinates(HANDLING[0], source, HANDS)[:, 2]
         np.testing.assert_array_equal(np.abs(line.get_ydata()), wanted.abs())
     assert axes.lines[2].get_linestyle() == "--"
     assert axes.lines[2].get_color() != axes.lines[0].get_color()

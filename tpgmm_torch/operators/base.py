@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
-from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError, UnknownNameError
-from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = [
@@ -163,29 +160,6 @@ class Operator(ABC):
         inverse = gaussians.pseudo_inverse(at.jacobian)
         return (inverse @ at.displacement[..., None])[..., 0] + state.joints
 
-    def local(
-        self,
-        demonstration: Demonstration,
-        kinematics: Kinematics,
-        holds: Sequence[Hold] = (),
-    ) -> Tensor:
-        """The local data set X^(j) of a demonstration, (T, D), its quaternions continuous.
-
-        Parameters
-        ----------
-        demonstration : Demonstration
-        kinematics : Kinematics
-        holds : sequence of Hold, default=()
-            Objects that were held: as places they are where they were last free.
-        """
-        demonstration = demonstration.reordered(kinematics.joint_names)
-        state = kinematics.state(demonstration.joints)
-        time = demonstration.time.to(state.joints)
-        frames = {name: f.to(state.joints) for name, f in demonstration.frames.items()}
-        if holds:
-            state, frames = held_objects(state, time, frames, holds)
-        return self.along(time, state, frames, kinematics)
-
     def along(
         self,
         time: Tensor,
@@ -208,11 +182,11 @@ class Operator(ABC):
         ShapeError
             If ``coordinates`` gave another shape.
         """
-        local = self.at(time).coordinates(state, frames)
-        if tuple(local.shape) != (len(time), self.dimension(kinematics)):
+        local, size = self.at(time).coordinates(state, frames), self.dimension(kinematics)
+        if local.shape != (len(time), size):
             raise ShapeError(
-                f"{self!r} has {self.dimension(kinematics)} coordinates, but its coordinates() "
-                f"gave shape {tuple(local.shape)} for {len(time)} time steps"
+                f"{self!r} has {size} coordinates, but its coordinates() gave shape "
+                f"{tuple(local.shape)} for {len(time)} time steps"
             )
         starts = self.quaternion_starts(kinematics)
         return quaternions.continuous(local, starts=starts) if starts else local
@@ -232,14 +206,9 @@ class Operator(ABC):
         for name in self.references():
             if name not in known:
                 raise UnknownNameError("frame", name, "the demonstration", frames)
-        for name in (*self.links(), *self.references()):
-            if name in frames and name in kinematics.links:
-                raise UnknownNameError(
-                    "frame",
-                    name,
-                    "the demonstration alone, it is a link of the robot too: rename the frame",
-                    frames,
-                )
+        for name in {*self.links(), *self.references()} & {*frames} & {*kinematics.links}:
+            where = "the demonstration alone, it is a link of the robot too: rename the frame"
+            raise UnknownNameError("frame", name, where, frames)
 
 
 def frame_names(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[str, ...]:

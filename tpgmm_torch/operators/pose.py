@@ -133,16 +133,7 @@ def linearize_poses(
     at = _constants(terms, state.links, len(state.carriers), like.dtype, like.device)
     places = [*(_place(name, state, frames) for name in at.places), at.base]
     batch = common_shape(state.positions.shape[:-2], *(place.batch_shape for place in places))
-    own, n = (state.positions, state.orientations), len(state.links)
-    links = [_expanded(part, (*batch, n, part.shape[-1])) for part in own]
-    others = [
-        (_expanded(place.position, (*batch, 3)), _expanded(place.orientation, (*batch, 4)))
-        for place in places
-    ]
-    positions, orientations = (
-        torch.cat((own, *(part.unsqueeze(-2) for part in parts)), -2)
-        for own, *parts in zip(links, *others, strict=True)
-    )
+    positions, orientations = _all_poses(state, places, batch)
     way = positions.index_select(-2, at.seen_from) - positions.index_select(-2, at.seen)
     way = way * at.is_position
     first = orientations.index_select(-2, at.first).unsqueeze(-1)
@@ -176,51 +167,56 @@ class _Constants:
     def __init__(
         self, terms: Sequence[_Term], links: tuple[str, ...], n_objects: int, **options: Any
     ) -> None:
-        known = [links if t.held else links[: len(links) - n_objects] for t in terms]
-        names = [t.link for t in terms if t.link not in links]
-        names += [
-            t.frame for t, k in zip(terms, known, strict=True) if t.frame and t.frame not in k
-        ]
-        self.places = tuple(dict.fromkeys(names))
+        robot_links = links[: len(links) - n_objects]
+        bodies = [(term.link, links) for term in terms]
+        references = [(term.frame, links if term.held else robot_links) for term in terms]
+        fixed = [n for n, moving in (*bodies, *references) if n and n not in moving]
+        self.places = tuple(dict.fromkeys(fixed))
 
         def pose(name: str | None, moving: tuple[str, ...]) -> int:
             if name in moving:
                 return moving.index(name)
-            return len(links) + (self.places.index(name) if name else len(self.places))
-
-        seen = [pose(term.link, links) for term in terms]
-        seen_from = [pose(t.frame, k) for t, k in zip(terms, known, strict=True)]
-        self.bodies = list(zip(seen, seen_from, strict=True))
-        self.is_moving = min(seen_from) < len(links)
-        # Hbar(conj a) H+(b) as coefficients (16, 4, 4) of a_i b_j; of a = b, R(a) below right
-        eye = torch.eye(4, dtype=torch.float64)
-        right = quaternions.right_matrix(quaternions.conjugate(eye))
-        bilinear = (right[:, None] @ quaternions.left_matrix(eye)).flatten(0, 1)
-        ends = [*accumulate(3 if term.gain is None else 4 for term in terms)]
-        self.shape = 3 * len(terms) + 1, ends[-1]  # the last row: present quaternions
-        matrix = torch.zeros(len(terms), 16, *self.shape, dtype=torch.float64)
-        for at, (term, end) in enumerate(zip(terms, ends, strict=True)):
-            rows = matrix[at, :, 3 * at : 3 * at + 3, :end]
-            if term.gain is None:
-                rows[..., -3:] = bilinear[:, 1:, 1:]
-            else:
-                rows[..., -4:] = term.gain * bilinear[:, 1:]
-                matrix[at, :, -1, end - 4 : end] = bilinear[:, 0]
-        self.matrix = matrix.flatten(2).flatten(0, 1).to(**options)
-        unit = quaternions.identity(**options)
-        self.base = Frame._from(torch.zeros_like(unit[:3]), unit)
+            return len(links) + [*self.places, None].index(name)
 
         def index(values: Iterable[int]) -> Tensor:
             return torch.tensor([*values], device=options["device"])
 
-        angular = [int(term.gain is not None) for term in terms]
-        first = [b if a else f for a, b, f in zip(angular, seen, seen_from, strict=True)]
-        self.first, self.seen, self.seen_from = map(index, (first, seen, seen_from))
-        self.is_position = (1 - index(angular)).to(unit)[:, None]
+        seen, seen_from = ([pose(*one) for one in group] for group in (bodies, references))
+        self.bodies = list(zip(seen, seen_from, strict=True))
+        self.is_moving = min(seen_from) < len(links)
+        self.matrix, self.shape = _bilinear(terms, **options)
+        unit = quaternions.identity(**options)
+        self.base = Frame._from(torch.zeros_like(unit[:3]), unit)
+        self.seen, self.seen_from = index(seen), index(seen_from)
+        angular = index(term.gain is not None for term in terms).long()
+        self.first = torch.where(angular > 0, self.seen, self.seen_from)
+        self.is_position = (1 - angular).to(unit)[:, None]
         still = index([2 * len(links)])  # of poses that no joint moves
-        self.rows = torch.minimum(2 * self.seen + index(angular), still)
-        self.reference_rows = torch.minimum(2 * self.seen_from + index(angular), still)
+        self.rows = torch.minimum(2 * self.seen + angular, still)
+        self.reference_rows = torch.minimum(2 * self.seen_from + angular, still)
         self.angular_rows = torch.minimum(2 * self.seen_from + 1, still)
+
+
+def _bilinear(terms: Sequence[_Term], **options: Any) -> tuple[Tensor, tuple[int, int]]:
+    """Coefficients of all operators' matrices in ``a_i b_j``, and the shape of the matrices.
+
+    ``Hbar(conj a) H+(b)`` has (16, 4, 4) of them; of a = b, ``R(a)`` is below right. The last
+    row is of the present quaternions.
+    """
+    eye = torch.eye(4, dtype=torch.float64)
+    right = quaternions.right_matrix(quaternions.conjugate(eye))
+    both = (right[:, None] @ quaternions.left_matrix(eye)).flatten(0, 1)
+    ends = [*accumulate(3 if term.gain is None else 4 for term in terms)]
+    shape = 3 * len(terms) + 1, ends[-1]
+    matrix = torch.zeros(len(terms), 16, *shape, dtype=torch.float64)
+    for at, (term, end) in enumerate(zip(terms, ends, strict=True)):
+        rows = matrix[at, :, 3 * at : 3 * at + 3, :end]
+        if term.gain is None:
+            rows[..., -3:] = both[:, 1:, 1:]
+        else:
+            rows[..., -4:] = term.gain * both[:, 1:]
+            matrix[at, :, -1, end - 4 : end] = both[:, 0]
+    return matrix.flatten(2).flatten(0, 1).to(**options), shape
 
 
 @lru_cache(maxsize=64)
@@ -236,8 +232,19 @@ def _constants(
         return _Constants(terms, links, n_objects, dtype=dtype, device=device)
 
 
-def _expanded(part: Tensor, shape: tuple[int, ...]) -> Tensor:
-    return part if part.shape == shape else part.expand(shape)
+def _all_poses(
+    state: RobotState, places: Sequence[Frame], batch: torch.Size
+) -> tuple[Tensor, Tensor]:
+    """Positions (..., L + F, 3) and orientations of the links, and behind them of places."""
+    positions = state.positions, *(place.position.unsqueeze(-2) for place in places)
+    orientations = state.orientations, *(place.orientation.unsqueeze(-2) for place in places)
+
+    def joined(parts: Sequence[Tensor]) -> Tensor:
+        shapes = [(*batch, *part.shape[-2:]) for part in parts]
+        both = zip(parts, shapes, strict=True)
+        return torch.cat([p if p.shape == shape else p.expand(shape) for p, shape in both], -2)
+
+    return joined(positions), joined(orientations)
 
 
 def _product(row: Tensor, matrix: Tensor) -> Tensor:

@@ -78,34 +78,7 @@ class Stack(Operator):
                 parts.append(linearize_poses(tuple(group), state, frames))  # type: ignore[arg-type]
             else:
                 parts += [operator.linearize(state, frames) for operator in group]
-        if len(parts) == 1:
-            return parts[0]
-        like, dense = state.joints, [part.dense() for part in parts]
-        batch = gaussians.common_shape(
-            like.shape[:-1],
-            *(matrix.shape[:-2] for pair in dense for matrix in pair),
-            *(part.displacement.shape[:-1] for part in parts),
-        )
-        shapes = [matrix.shape[-2:] for _, matrix in dense]
-        rows, columns = (sum(sizes) for sizes in zip(*shapes, strict=True))
-        # the last row has the present quaternions
-        whole, row, column = like.new_zeros(*batch, rows + 1, columns), 0, 0
-        for part, (_, matrix), (m, width) in zip(parts, dense, shapes, strict=True):
-            whole[..., row : row + m, column : column + width] = matrix
-            if part.present is not None:
-                whole[..., -1, column : column + width] = part.present
-            row, column = row + m, column + width
-        is_known = all(part.present is not None for part in parts)
-        noises = [
-            torch.zeros_like(p.displacement) if p.noise is None else p.noise for p in parts
-        ]
-        return Linearization(
-            _joined([jacobian for jacobian, _ in dense], batch, 2),
-            whole[..., :-1, :],
-            _joined([part.displacement for part in parts], batch, 1),
-            whole[..., -1, :] if is_known else None,
-            _joined(noises, batch, 1) if any(p.noise is not None for p in parts) else None,
-        )
+        return parts[0] if len(parts) == 1 else _stacked(parts, state.joints)
 
     def coordinates(self, state: RobotState, frames: Mapping[str, Frame]) -> Tensor:
         """The coordinates side by side."""
@@ -175,6 +148,40 @@ def leaves(operators: Sequence[Operator]) -> tuple[Operator, ...]:
 def _is_bilinear(operator: Operator, state: RobotState) -> bool:
     # a class that is derived from one of them may linearise in its own way
     return type(operator) in POSE_OPERATORS and operator.is_bilinear(state)  # type: ignore[attr-defined]
+
+
+def _stacked(parts: Sequence[Linearization], like: Tensor) -> Linearization:
+    """Parts below one another: matrices on the diagonal of one."""
+    jacobians, matrices = zip(*(part.dense() for part in parts), strict=True)
+    rows = [part.displacement for part in parts]
+    tails = [matrix.shape[:-2] for matrix in (*jacobians, *matrices)]
+    batch = gaussians.common_shape(like.shape[:-1], *tails, *(row.shape[:-1] for row in rows))
+    present = [part.present for part in parts if part.present is not None]
+    return Linearization(
+        _joined(jacobians, batch, 2),
+        _block_diagonal(matrices, batch),
+        _joined(rows, batch, 1),
+        _joined(present, batch, 1) if len(present) == len(parts) else None,
+        _noise(parts, batch),
+    )
+
+
+def _noise(parts: Sequence[Linearization], batch: torch.Size) -> Tensor | None:
+    if all(part.noise is None for part in parts):
+        return None
+    zeros = torch.zeros_like
+    noise = [zeros(p.displacement) if p.noise is None else p.noise for p in parts]
+    return _joined(noise, batch, 1)
+
+
+def _block_diagonal(matrices: Sequence[Tensor], batch: torch.Size) -> Tensor:
+    sizes = [matrix.shape[-2:] for matrix in matrices]
+    whole = matrices[0].new_zeros(*batch, *map(sum, zip(*sizes, strict=True)))
+    row = column = 0
+    for matrix, (rows, columns) in zip(matrices, sizes, strict=True):
+        whole[..., row : row + rows, column : column + columns] = matrix
+        row, column = row + rows, column + columns
+    return whole
 
 
 def _joined(parts: Sequence[Tensor], batch: torch.Size, rank: int) -> Tensor:

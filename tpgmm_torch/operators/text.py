@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from tpgmm_torch.exceptions import DataError
@@ -21,18 +20,13 @@ from tpgmm_torch.operators.base import Operator
 from tpgmm_torch.operators.canonical import Canonical
 from tpgmm_torch.operators.orientation import AbsoluteOrientation, RelativeOrientation
 from tpgmm_torch.operators.position import AbsolutePosition, RelativePosition
-from tpgmm_torch.operators.stack import Stack
+from tpgmm_torch.operators.stack import POSE_OPERATORS, Stack
 
 __all__ = ["default_operators", "format_operator", "parse_operator"]
 
-#: By kind, the operator in the base frame and the one seen from a frame.
-KINDS: dict[str, tuple[Any, Any]] = {
-    "position": (AbsolutePosition, RelativePosition),
-    "orientation": (AbsoluteOrientation, RelativeOrientation),
-}
 TERM = re.compile(
     r"(canonical(:(?P<joints>[^\s:@+~,]+(,[^\s:@+~,]+)*))?"
-    r"|(?P<kind>position|orientation|pose)(\[(?P<geometry>quaternion|tangent)\])?"
+    r"|(?P<kind>position|(orientation|pose)(\[(?P<geometry>quaternion|tangent)\])?)"
     r":(?P<link>[^\s:@+~]+)(@(?P<held>held:)?(?P<frame>[^\s:@+~]+))?)"
     r"(~(?P<tolerance>\d+\.?\d*(e-?\d+)?))?"
 )
@@ -74,27 +68,27 @@ def _term(term: str, text: str) -> list[Operator]:
     match = TERM.fullmatch(term)
     if match is None:
         raise DataError(f"operator {text!r}: {term!r} is not a term. A term is {GRAMMAR}")
-    kind, joints, link, frame = (match[name] for name in ("kind", "joints", "link", "frame"))
-    given = {} if match["tolerance"] is None else {"tolerance": float(match["tolerance"])}
+    kind, frame = match["kind"], match["frame"]
+    options: dict[str, Any] = {}
+    if match["tolerance"]:
+        options["tolerance"] = float(match["tolerance"])
     if kind is None:
-        some = None if joints is None else tuple(joints.split(","))
-        return [Canonical(**given, joints=some)]
-    if kind == "position" and match["geometry"]:
-        raise DataError(f"operator {text!r}: {term!r} is a position, which has no geometry")
-    if kind == "pose" and given:
+        joints = tuple(match["joints"].split(",")) if match["joints"] else None
+        return [Canonical(joints=joints, **options)]
+    if kind.startswith("pose") and options:
         raise DataError(
             f"operator {text!r}: {term!r} is a position [m] and an orientation [rad], of "
             "which each has a tolerance of its own: write both"
         )
-    operators: list[Any] = [
-        relative(link, frame, held=bool(match["held"]), **given)
-        if frame
-        else absolute(link, **given)
-        for absolute, relative in (KINDS.values() if kind == "pose" else [KINDS[kind]])
-    ]
-    if match["geometry"]:
-        operators[-1] = replace(operators[-1], geometry=match["geometry"])
-    return operators
+    place: list[str] = [match["link"]]
+    position: Any = AbsolutePosition
+    orientation: Any = AbsoluteOrientation
+    if frame:
+        position, orientation = RelativePosition, RelativeOrientation
+        place, options["held"] = [*place, frame], bool(match["held"])
+    geometry = match["geometry"] or "quaternion"
+    one, other = position(*place, **options), orientation(*place, **options, geometry=geometry)
+    return {"position": [one], "orientation": [other], "pose": [one, other]}[kind.split("[")[0]]
 
 
 def default_operators(links: Sequence[str], frames: Sequence[str]) -> list[Operator]:
@@ -124,12 +118,12 @@ def format_operator(operator: Operator) -> str:
     one: Any = operator
     if type(operator) is Canonical:
         text = "canonical" if one.joints is None else f"canonical:{','.join(one.joints)}"
-    else:
-        kinds = [kind for kind, classes in KINDS.items() if type(operator) in classes]
-        if not kinds:
-            return repr(operator)
+    elif type(operator) in POSE_OPERATORS:
+        kind = "position" if one.gain is None else "orientation"
         tangent = "[tangent]" if operator.rotation_vector_starts(None) else ""
-        text = f"{kinds[0]}{tangent}:{one.link}"
+        text = f"{kind}{tangent}:{one.link}"
         if hasattr(operator, "frame"):
             text += f"@{'held:' if one.held else ''}{one.frame}"
+    else:
+        return repr(operator)
     return text if one.tolerance == type(one).tolerance else f"{text}~{one.tolerance!r}"

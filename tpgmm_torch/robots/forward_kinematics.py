@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch import quaternions
@@ -68,36 +69,28 @@ class TreeKinematics:
         ]
         self._order = self._index(np.argsort(np.concatenate(levels)).tolist())
 
-        # a body moves each column of the Jacobians (the base: none); where joints mimic
-        # others, several bodies add up to one
-        movers = {body.joint: at for at, body in enumerate(bodies) if body.joint is not None}
-        columns = [movers.get(joint, 0) for joint in range(n_joints)]
-        self._mimic = None
-        moving = [at for at, body in enumerate(bodies) if body.joint is not None]
-        if len(movers) < len(moving) or any(bodies[at].multiplier != 1 for at in moving):
-            columns = moving
-            self._mimic = self._constant(follow[:, columns].T)  # (C, n)
-        self._select_entries(bodies, columns, len(bodies) - n_links)
+        columns, are_joints = _columns(bodies, n_joints)
+        self._mimic = None if are_joints else self._constant(follow[:, columns].T)  # (C, n)
+        self._select_entries(bodies, n_links, columns)
 
     def _select_entries(
-        self, bodies: Sequence[Body], columns: Sequence[int], first: int
+        self, bodies: Sequence[Body], n_links: int, columns: NDArray[np.int64]
     ) -> None:
         """Choose the numbers of the 2 N matrices that are wanted, as they stand in memory.
 
         Where links are, where what moves each column is, about which axis, line by line, and
         the rows that turn the links.
         """
-        links = range(first, len(bodies))
-        places = [16 * link + 4 * line + 3 for link in links for line in range(3)]
-        for entry in (3, 2):
-            places += [16 * at + 4 * line + entry for line in range(3) for at in columns]
-        places += [16 * (len(bodies) + link) + i for link in links for i in range(4)]
-        self._wanted = self._index(places)
-        self._sizes = [3 * len(links), 3 * len(columns), 3 * len(columns), 4 * len(links)]
-        mask = np.zeros((len(links), 1, len(columns)), bool)
-        for row, at in zip(mask, links, strict=True):
+        links = np.arange(len(bodies) - n_links, len(bodies))
+        entries = np.arange(2 * len(bodies) * 16).reshape(-1, 4, 4)
+        origins, axes = entries[columns][:, :3, 3].T, entries[columns][:, :3, 2].T
+        wanted = entries[links][:, :3, 3], origins, axes, entries[len(bodies) + links][:, 0]
+        self._wanted = self._index(np.concatenate([part.ravel() for part in wanted]).tolist())
+        self._sizes = [part.size for part in wanted]
+        mask = np.zeros((n_links, 1, len(columns)), bool)
+        for row, at in zip(mask, links.tolist(), strict=True):
             while at := bodies[at].parent:
-                row |= np.equal(columns, at)
+                row |= columns == at
         slide = np.array([bodies[at].slides for at in columns], bool)
         self._turns = self._constant(1.0 * (mask & ~slide))  # (L, 1, C)
         self._slides = self._constant(1.0 * (mask & slide)) if slide.any() else None
@@ -163,6 +156,18 @@ def _product(first: Tensor, second: Tensor) -> Tensor:
     if torch.compiler.is_compiling():
         return (first.unsqueeze(-1) * second.unsqueeze(-3)).sum(-2)
     return first @ second
+
+
+def _columns(bodies: Sequence[Body], n_joints: int) -> tuple[NDArray[np.int64], bool]:
+    """Which body moves each column of the Jacobians, and whether columns are joints.
+
+    The base moves none. Where joints mimic others, several bodies add up to one joint.
+    """
+    moving = [at for at, body in enumerate(bodies) if body.joint is not None]
+    movers = {bodies[at].joint: at for at in moving}
+    are_joints = len(movers) == len(moving) and all(bodies[at].multiplier == 1 for at in moving)
+    columns = [movers.get(joint, 0) for joint in range(n_joints)] if are_joints else moving
+    return np.array(columns, np.int64), are_joints
 
 
 def _motions(bodies: Sequence[Body], n_joints: int) -> tuple[Array, Array, Array]:

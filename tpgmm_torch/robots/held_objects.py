@@ -54,7 +54,8 @@ def held_objects(
         last_free, free, held = instants.clone(), -1, []
         for hold in holds:
             # the first instants that are not before
-            begin, end = (int((time < at).sum()) for at in (hold.begin, hold.end))
+            ends = time.new_tensor([hold.begin, hold.end])
+            begin, end = torch.searchsorted(time.contiguous(), ends).tolist()
             if hold.frame == name and begin < end:
                 # from hand to hand it is not free between
                 last_free[begin:end] = last_free[begin - 1] if begin == free else begin

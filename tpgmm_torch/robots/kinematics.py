@@ -179,16 +179,9 @@ class RobotState:
             jacobian = torch.where(where[..., None, None], jacobian, self.jacobian(name))
             carrier = torch.where(where, carrier, self.carrier(name))
         kept = [i for i, one in enumerate(self.links) if one != name]
-        carriers = (
-            *(
-                self.carriers[i - len(self.robot_links)]
-                for i in kept
-                if i >= len(self.robot_links)
-            ),
-            carrier,
-        )
-        shapes = [one.shape for one in carriers if isinstance(one, Tensor)]
-        batch = common_shape(self.joints.shape[:-1], position.shape[:-1], *shapes)
+        first = len(self.robot_links)
+        carriers = *(self.carriers[i - first] for i in kept[first:]), carrier
+        batch = common_shape(self.joints.shape[:-1], position.shape[:-1])
 
         def joined(links: Tensor, new: Tensor, rank: int) -> Tensor:
             shape = *batch, *new.shape[new.ndim - rank :]
@@ -202,9 +195,7 @@ class RobotState:
             positions=joined(self.positions, position, 1),
             orientations=joined(self.orientations, orientation, 1),
             jacobians=joined(self.jacobians, jacobian, 2),
-            carriers=tuple(
-                one.expand(batch) if isinstance(one, Tensor) else one for one in carriers
-            ),
+            carriers=tuple(_expanded(one, batch) for one in carriers),
         )
 
     def _map(self, change: Callable[[Tensor, int], Tensor]) -> Self:
@@ -237,6 +228,10 @@ class RobotState:
         if link not in self.links:
             raise UnknownNameError("link", link, "the state", self.links)
         return self.links.index(link)
+
+
+def _expanded(carrier: int | Tensor, batch: torch.Size) -> int | Tensor:
+    return carrier.expand(batch) if isinstance(carrier, Tensor) else carrier
 
 
 class Kinematics(abc.ABC):

@@ -107,7 +107,10 @@ class Robot(Described):
         """
         model = read_urdf(urdf)
         extra = _names("coordinates", coordinates)
-        columns, fixed = _joint_vector(model, joints, extra, locked or {})
+        for name in model.joint.keys() & extra:
+            raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
+        chosen = [joints] if isinstance(joints, str) else joints
+        columns, fixed = _joint_vector(model, chosen, extra, locked or {})
         config = {
             "urdf": model.text,
             "links": list(_names("links", links)),
@@ -227,35 +230,14 @@ class Robot(Described):
             raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
         for name in set(poses or ()) - set(robots):
             raise UnknownNameError("robot", name, "the robots to combine", robots)
-        still = Frame([0.0, 0.0, 0.0])
         roots = dict(fixed or {})
-        settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
-        settings |= {"locked": {}, "tools": {}}
-        parts = []
         for name, robot in robots.items():
-            config, place = robot._config, (poses or {}).get(name, still)
-            roots[f"{name}_{robot.model.root}"] = place.to(torch.float64).compose(robot._root())
-            parts += _prefixed(name, robot.model)
-            for key in ("links", "joints", "coordinates"):
-                settings[key] += [f"{name}_{one}" for one in config[key]]
-            settings["locked"] |= {
-                f"{name}_{joint}": at for joint, at in config["locked"].items()
-            }
-            for tool, (parent, *pose) in config["tools"].items():
-                settings["tools"][f"{name}_{tool}"] = f"{name}_{parent}", *pose
-        urdf = ElementTree.Element("robot", name=" and ".join(robots))
-        urdf.extend(
-            ElementTree.Element("link", name=link) for link in ("world", *(fixed or ()))
-        )
-        urdf.extend(parts)
-        taken = [part.get("name", "") for part in parts]
-        for link, frame in roots.items():
-            mount = free_name(f"{link}_mount", taken)
-            joint = UrdfJoint(mount, "fixed", "world", link, _matrix(frame), X_AXIS)
-            urdf.append(joint_element(joint))
+            place = (poses or {}).get(name, Frame([0.0, 0.0, 0.0])).to(torch.float64)
+            roots[f"{name}_{robot.model.root}"] = place.compose(robot._root())
+        options: dict[str, Any] = _side_by_side(robots)
         first = next(iter(robots.values())).lower
-        settings |= {"base": base, "dtype": first.dtype, "device": first.device}
-        return cls.from_urdf(ElementTree.tostring(urdf, encoding="unicode"), **settings)
+        options |= {"base": base, "dtype": first.dtype, "device": first.device}
+        return cls.from_urdf(_mounted(robots, roots, fixed or ()), **options)
 
     def __init__(
         self, model: UrdfModel, config: dict[str, Any], device: torch.device | str
@@ -374,40 +356,37 @@ def _names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
 
 def _joint_vector(
     model: UrdfModel,
-    joints: str | Sequence[str] | None,
+    joints: Sequence[str] | None,
     coordinates: tuple[str, ...],
     locked: Mapping[str, float],
 ) -> tuple[list[str], dict[str, float]]:
     """Names of the joint vector, and where all other actuated joints stand."""
-    chosen = _names("joints", [joints] if isinstance(joints, str) else joints or ())
-    columns, standing = _fitting(model, chosen, coordinates), _fitting(model, locked)
+    columns = _fitting(model, _names("joints", joints or ()), coordinates)
+    standing = _fitting(model, locked)
     fixed = {
-        name: float(locked[given])
+        name: float(locked[str(given)])
         for name, given in standing.items()
         if name == given or name not in columns
     }
+    if not all(map(math.isfinite, fixed.values())):
+        raise DataError(f"joints are locked at finite numbers, got {dict(locked)}")
     if joints is None:
-        columns = {name: name for name in model.actuated if name not in fixed}
-    columns |= {name: name for name in coordinates}
+        columns = dict.fromkeys(name for name in model.actuated if name not in fixed)
+    columns |= dict.fromkeys(coordinates)
     for name in columns.keys() & fixed.keys():
         raise DataError(f"joint {name!r} is both in the joint vector and locked")
-    for name, value in fixed.items():
-        if not math.isfinite(value):
-            raise DataError(f"joint {name!r} is locked at {value}: expected a finite number")
-    for name in model.joint.keys() & set(coordinates):
-        raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
     still = (name for name in model.actuated if name not in columns)
     return list(columns), {name: fixed.get(name, 0.0) for name in still}
 
 
 def _fitting(
     model: UrdfModel, names: Collection[str], coordinates: Sequence[str] = ()
-) -> dict[str, str]:
+) -> dict[str, str | None]:
     """The joints or coordinates of some names and patterns, each with what it is named by.
 
     A pattern stands for the actuated joints that fit it and are not named themselves.
     """
-    found: dict[str, str] = {}
+    found: dict[str, str | None] = {}
     for name in names:
         joint = model.movable.get(name)
         if joint is not None and joint.mimic is not None:
@@ -463,15 +442,45 @@ def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tupl
     return config["base"], [places[link] for link in config["links"]]
 
 
-def _prefixed(prefix: str, model: UrdfModel) -> list[ElementTree.Element]:
+def _mounted(
+    robots: Mapping[str, Robot], roots: Mapping[str, Frame], fixed: Iterable[str]
+) -> str:
+    """The URDF of robots and fixed links, whose roots are somewhere in a world."""
+    urdf = ElementTree.Element("robot", name=" and ".join(robots))
+    urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))
+    for name, robot in robots.items():
+        urdf.extend(_prefixed(name, robot))
+    taken = [part.get("name", "") for part in urdf]
+    for link, frame in roots.items():
+        mount = free_name(f"{link}_mount", taken)
+        joint = UrdfJoint(mount, "fixed", "world", link, _matrix(frame), X_AXIS)
+        urdf.append(joint_element(joint))
+    return ElementTree.tostring(urdf, encoding="unicode")
+
+
+def _prefixed(prefix: str, robot: Robot) -> list[ElementTree.Element]:
     """Links, joints and materials of a robot, with a prefix before all their names."""
-    robot = parse_xml(model.text)
-    parts = [part for part in robot if part.tag in ("link", "joint", "material")]
+    urdf = parse_xml(robot.model.text)
+    parts = [part for part in urdf if part.tag in ("link", "joint", "material")]
     for element in itertools.chain.from_iterable(part.iter() for part in parts):
         for key in ("name", "link", "joint"):
             if element.get(key):
                 element.set(key, f"{prefix}_{element.get(key)}")
     return parts
+
+
+def _side_by_side(robots: Mapping[str, Robot]) -> dict[str, Any]:
+    """Settings of robots by name, which stands before the names of what is theirs."""
+    settings: dict[str, Any] = {"links": [], "joints": [], "coordinates": []}
+    settings |= {"locked": {}, "tools": {}}
+    for prefix, robot in robots.items():
+        config = robot._config
+        for key in ("links", "joints", "coordinates"):
+            settings[key] += [f"{prefix}_{name}" for name in config[key]]
+        settings["locked"] |= {f"{prefix}_{name}": at for name, at in config["locked"].items()}
+        for tool, (parent, *pose) in config["tools"].items():
+            settings["tools"][f"{prefix}_{tool}"] = f"{prefix}_{parent}", *pose
+    return settings
 
 
 def _matrix(pose: Frame) -> Array:

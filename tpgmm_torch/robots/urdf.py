@@ -7,6 +7,7 @@ default there (axis ``1 0 0``, no offset). Numbers stay float64.
 
 import math
 import os
+import re
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -358,7 +359,7 @@ def _numbers(
         values = []
     largest = LARGEST if tag in ("origin", "mimic") else sys.float_info.max
     if len(values) != len(default) or not all(abs(value) <= largest for value in values):
-        hint = f". {XACRO}" if "${" in text or "$(" in text else ""
+        hint = f". {XACRO}" if re.search(r"\$[{(]", text) else ""
         raise DataError(
             f"joint {element.get('name')!r}: <{tag} {attribute}> needs {len(default)} finite "
             f"number(s) up to {largest:g}, got {text[:100]!r}{hint}"

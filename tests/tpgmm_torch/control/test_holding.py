@@ -16,6 +16,7 @@ from tests.support.carrying import (
     placed,
     scenes,
 )
+from tests.support.local_coordinates import local_coordinates
 from tests.support.worlds import LEFT, RIGHT, upper_body
 from tpgmm_torch import (
     Controller,
@@ -278,7 +279,7 @@ def test_from_hand_to_hand_what_is_learned_is_what_is_seen_in_control():
     passed = replace(shown, frames={**shown.frames, "bottle": bottle})
     first = {name: f[0] if f.batch_shape else f for name, f in passed.frames.items()}
     holding = Holding.start(robot, carried_objects(PASSING, robot), HANDS, first)
-    learned = [operator.local(passed, robot, HANDS) for operator in PASSING]
+    learned = [local_coordinates(operator, passed, robot, HANDS) for operator in PASSING]
     for i, now in enumerate(time.tolist()):
         joints = shown.joints[i]
         holding = holding.advance(now, joints, {"bottle": bottle[i]})

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.support import oracles
+from tests.support.local_coordinates import local_coordinates
 from tests.support.mixtures import (
     assert_close,
     assert_equal_estimates,
@@ -268,7 +269,9 @@ def test_coordinates_of_another_size_than_announced_are_refused():
     poses = OnPoses()
     joints = poses.joints(np.random.default_rng(0), 5)
     with pytest.raises(ShapeError, match=r"has 2 coordinates.*\(5, 3\) for 5 time steps"):
-        Liar(LEFT).local(Demonstration(torch.arange(5.0), joints), poses.kinematics)
+        local_coordinates(
+            Liar(LEFT), Demonstration(torch.arange(5.0), joints), poses.kinematics
+        )
 
 
 NOW = torch.tensor(0.9, dtype=torch.float64)

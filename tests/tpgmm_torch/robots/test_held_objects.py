@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.support.carrying import HAND, HELD, at_first, carries, operators
+from tests.support.local_coordinates import local_coordinates
 from tests.support.worlds import RIGHT, upper_body
 from tpgmm_torch import Hold, RelativePosition
 from tpgmm_torch.robots.held_objects import held_objects
@@ -99,14 +100,17 @@ def test_the_joints_move_what_is_attached():
 def test_local_data_follow_the_same_rule():
     place, thing = RelativePosition(HAND, "bottle"), RelativePosition(HAND, "bottle", held=True)
     robot = upper_body()
-    held = thing.local(SHOWN, robot, [HELD])
-    assert torch.equal(held, place.local(SHOWN, robot))  # as recorded
+    held = local_coordinates(thing, SHOWN, robot, [HELD])
+    assert torch.equal(held, local_coordinates(place, SHOWN, robot))  # as recorded
     still = held[BEGIN:END] - held[BEGIN]
     assert float(still.abs().max()) < 1e-3
-    nominal = place.local(at_first(SHOWN), robot)
-    assert torch.equal(place.local(SHOWN, robot, [HELD])[:END], nominal[:END])
-    put = operators()[1].local(SHOWN, robot, [HELD])
+    nominal = local_coordinates(place, at_first(SHOWN), robot)
+    assert torch.equal(local_coordinates(place, SHOWN, robot, [HELD])[:END], nominal[:END])
+    put = local_coordinates(operators()[1], SHOWN, robot, [HELD])
     assert float(put[END:, :3].abs().max()) < 1e-3
     unaware = replace(SHOWN, frames={**SHOWN.frames, "tray": SHOWN.frames["bottle"]})
     other = RelativePosition(HAND, "tray")
-    assert torch.equal(other.local(unaware, robot, [HELD]), other.local(unaware, robot))
+    assert torch.equal(
+        local_coordinates(other, unaware, robot, [HELD]),
+        local_coordinates(other, unaware, robot),
+    )

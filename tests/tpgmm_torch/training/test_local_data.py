@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.local_coordinates import local_coordinates
 from tests.support.motions import turning
 from tpgmm_torch import AbsoluteOrientation, AbsolutePosition, Canonical, Demonstration, Stack
 from tpgmm_torch.exceptions import ShapeError
@@ -21,7 +22,7 @@ QUATERNIONS = [slice(1, 5), slice(9, 13)]
 
 
 def expected_of(motion):
-    return like([operator.local(motion, HAND) for operator in OPERATORS])
+    return like([local_coordinates(operator, motion, HAND) for operator in OPERATORS])
 
 
 def flipped(demonstration):
@@ -79,7 +80,7 @@ def test_quaternions_lie_on_the_side_that_a_model_expects(sign):
 def test_at_equal_phase_the_ends_belong_together():
     motion = turning(TIME, TIME / 2)
     expected = expected_of(motion)
-    local = OPERATORS[0].local(motion, HAND)
+    local = local_coordinates(OPERATORS[0], motion, HAND)
     torch.testing.assert_close(expected(0, TIME[:14]), local[::3], rtol=0, atol=0)
     assert torch.equal(expected(1, TIME[:1])[0, :3], motion.joints[0, :3])
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.support.local_coordinates import local_coordinates
 from tests.support.skills import few_bottles
 from tests.support.worlds import LEFT, OBJECT, moved, upper_body
 from tpgmm_torch import (
@@ -97,7 +98,7 @@ def mean_of(demonstrations):
 def test_the_path_is_the_karcher_mean_at_each_instant():
     shown = recordings()
     [found] = completed([ABSOLUTE], shown)
-    local = torch.stack([found.local(one, HAND) for one in shown])
+    local = torch.stack([local_coordinates(found, one, HAND) for one in shown])
     assert float(local.mean(0).abs().max()) < 1e-12
     together = completed(
         [Stack(RelativePosition("hand", OBJECT), RELATIVE), Canonical()], shown
