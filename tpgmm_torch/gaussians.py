@@ -1,4 +1,4 @@
-"""Gaussians in batches: affine maps, products, conditioning, mixing (paper, section II-C).
+"""Gaussians in batches: products, conditioning, mixing (paper, section II-C).
 
 Means have shape (..., D) and covariances (..., D, D); leading dimensions broadcast, and
 every function is differentiable. A product of Gaussians is available in covariance form,
@@ -15,7 +15,6 @@ from torch import Tensor
 from tpgmm_torch.exceptions import DataError
 
 __all__ = [
-    "affine",
     "cholesky",
     "common_shape",
     "condition",
@@ -99,21 +98,6 @@ def _eliminate(covariance: Tensor, right: Tensor) -> Tensor:
         below = row[..., 1:left].unsqueeze(-1)
         matrix = matrix[..., 1:, 1:] - below * row[..., 1:].unsqueeze(-2)
     return torch.stack(rows, -2)
-
-
-def affine(
-    mean: Tensor, covariance: Tensor, linear: Tensor, offset: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Image of a Gaussian under ``x -> A x + b``, eq. (1).
-
-    Parameters
-    ----------
-    mean, covariance : Tensor of shape (..., D) and (..., D, D)
-        Of x.
-    linear, offset : Tensor of shape (..., n, D) and (..., n)
-        ``A``, of any rank, and ``b``.
-    """
-    return (linear @ mean[..., None])[..., 0] + offset, linear @ covariance @ linear.mT
 
 
 def product(means: Tensor, covariances: Tensor) -> tuple[Tensor, Tensor]:

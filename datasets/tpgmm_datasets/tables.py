@@ -8,6 +8,7 @@ and, of trajectories, the upper triangle of the joints' covariance (``covariance
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.pose_names import POSE_PARTS, incomplete_poses, pose_groups
+from tpgmm_torch.data.pose_names import POSE_PARTS, pose_groups
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, DependencyError, UnknownNameError
 
@@ -334,7 +335,7 @@ def _joints(table: pd.DataFrame, time: str, episode: str) -> list[str]:
             "some are joints, say so: joints=[...]"
         )
     taken = [name for name in names if name not in known]
-    for frame, missing in incomplete_poses(taken).items():
+    for frame, missing in _incomplete_poses(taken).items():
         raise DataError(
             f"the table has a part of the pose of {frame!r}, and no columns {list(missing)}: "
             "add them (1, 0, 0, 0 where no orientation was recorded), or say which columns are "
@@ -403,3 +404,20 @@ def _numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
             raise DataError(f"column {name!r} lacks a value in row {row}")
         columns.append(values.to_numpy(dtype=np.float64))
     return np.stack(columns, axis=1)
+
+
+def _incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """By pose of which the names have a part, the columns that complete it.
+
+    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, count as a pose.
+    """
+    parts: dict[str, set[str]] = {}
+    for name in names:
+        if match := re.fullmatch(r"(.+[._])(x|y|z|qw|qx|qy|qz)", name, re.DOTALL):
+            parts.setdefault(match[1], set()).add(match[2])
+    return {
+        stem[:-1]: tuple(stem + part for part in POSE_PARTS if part not in there)
+        for stem, there in parts.items()
+        if there != set(POSE_PARTS)
+        and (there >= {"x", "y", "z"} or len(there & set(POSE_PARTS[3:])) > 1)
+    }

@@ -53,28 +53,9 @@ def dense_product(means: Tensor, covariances: Tensor) -> tuple[object, object]:
     return covariance @ weighted, covariance
 
 
-# Eq. (1)
-
-
-@given(seeds, sizes, sizes)
-def test_affine_is_the_image_under_any_linear_map(seed, size, rows):
-    rng = np.random.default_rng(seed)
-    mean, covariance = normal(rng, size), spd(rng, size)
-    linear, offset = normal(rng, rows, size), normal(rng, rows)
-    image, spread = gaussians.affine(mean, covariance, linear, offset)
-    a = linear.numpy()
-    assert_close(image, a @ mean.numpy() + offset.numpy())
-    assert_close(spread, a @ covariance.numpy() @ a.T)
-
-
-def test_affine_maps_compose():
-    rng = np.random.default_rng(0)
-    mean, covariance = normal(rng, 4), spd(rng, 4)
-    a, b, c, d = normal(rng, 3, 4), normal(rng, 3), normal(rng, 5, 3), normal(rng, 5)
-    twice = gaussians.affine(*gaussians.affine(mean, covariance, a, b), c, d)
-    once = gaussians.affine(mean, covariance, c @ a, c @ b + d)
-    for left, right in zip(twice, once, strict=True):
-        assert_close(left, right)
+def affine(mean: Tensor, covariance: Tensor, linear: Tensor, offset: Tensor) -> list[Tensor]:
+    """Eq. (1)."""
+    return [(linear @ mean[..., None])[..., 0] + offset, linear @ covariance @ linear.mT]
 
 
 # Eq. (2)
@@ -129,7 +110,7 @@ def test_both_forms_agree_where_every_jacobian_is_invertible(seed, size, n_facto
     covariances = spd(rng, n_factors, size)
     inverses = torch.linalg.inv(jacobians)
     projected = [
-        gaussians.affine(y, s, a, torch.zeros_like(y))
+        affine(y, s, a, torch.zeros_like(y))
         for y, s, a in zip(targets, covariances, inverses, strict=True)
     ]
     product = gaussians.product(*(torch.stack(parts) for parts in zip(*projected, strict=True)))
@@ -248,7 +229,6 @@ BATCHES = [(), (3,), (2, 3)]
 def everything(mean: Tensor, linear: Tensor, covariance: Tensor, noise: Tensor) -> list[Tensor]:
     """Every function of one Gaussian; ``linear`` has two rows."""
     return [
-        *gaussians.affine(mean, covariance, linear, linear[..., 0]),
         *gaussians.information(linear, mean[..., :2, None], noise),
         *gaussians.from_information(covariance, mean),
     ]
@@ -289,7 +269,7 @@ def test_gradients_are_those_of_finite_differences():
 
     def mixture(weights: Tensor, means: Tensor, factors: Tensor, jacobian: Tensor):
         covariances = factors @ factors.mT + torch.eye(3, dtype=torch.float64)
-        image = gaussians.affine(means, covariances, jacobian, means[..., :2])
+        image = affine(means, covariances, jacobian, means[..., :2])
         precision, vector, size = gaussians.information(jacobian, image[0][..., None], image[1])
         closed = precision + torch.eye(3, dtype=torch.float64)
         return (

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -61,24 +60,8 @@ def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] |
     return names
 
 
-class _Frozen:
-    """A frozen dataclass whose mappings are read-only, and pickled as plain dicts."""
-
-    def _set(self, **attributes: Any) -> None:
-        for name, value in attributes.items():
-            value = MappingProxyType(value) if isinstance(value, dict) else value
-            object.__setattr__(self, name, value)
-
-    def __getstate__(self) -> dict[str, Any]:
-        state = vars(self).items()
-        return {k: dict(v) if isinstance(v, MappingProxyType) else v for k, v in state}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._set(**state)
-
-
 @dataclass(frozen=True, eq=False)
-class Demonstration(_Frozen):
+class Demonstration:
     """One demonstration of a skill: T_m datapoints and the frames they were made in.
 
     Parameters
@@ -143,8 +126,8 @@ class Demonstration(_Frozen):
                 )
         frames = _checked_frames(self.frames, len(time))
         holds = None if self.holds is None else check_holds(self.holds, frames)
-        self._set(time=time, joints=joints, frames=frames, joint_names=names)
-        self._set(events=events, holds=holds)
+        vars(self).update(time=time, joints=joints, frames=frames, joint_names=names)
+        vars(self).update(events=events, holds=holds)
 
     def __len__(self) -> int:
         """Number of time steps T."""
@@ -227,7 +210,7 @@ class Demonstration(_Frozen):
 
 
 @dataclass(frozen=True, eq=False)
-class Situation(_Frozen):
+class Situation:
     """A new situation: where the robot starts and where the objects are.
 
     Parameters
@@ -265,14 +248,25 @@ class Situation(_Frozen):
     frames_time: Tensor | None = None
 
     def __post_init__(self) -> None:
-        joints, names = _start_posture(self.joints, self.joint_names)
+        joints, names = self.joints, self.joint_names
+        if isinstance(joints, Mapping):
+            if names is not None:
+                raise DataError("joints are given by name: leave out joint_names")
+            names, values = tuple(joints), joints.items()
+            parts = [as_tensor(value, f"joint {name!r}").reshape(-1) for name, value in values]
+            joints = torch.cat(parts or [torch.empty(0)])
+        joints = as_tensor(joints, "the start posture")
+        if joints.ndim != 1 or not len(joints):
+            shape = tuple(joints.shape)
+            raise ShapeError(f"the start posture is a number for each joint, got shape {shape}")
+        names = _checked_names(names, len(joints))
         times = {
             name: None if value is None else _checked_time(value)
             for name, value in (("time", self.time), ("frames_time", self.frames_time))
         }
         recorded = times["time"] if self.frames_time is None else times["frames_time"]
         frames = _checked_frames(self.frames, None if recorded is None else len(recorded))
-        self._set(joints=joints, frames=frames, joint_names=names, **times)
+        vars(self).update(joints=joints, frames=frames, joint_names=names, **times)
 
     @classmethod
     def of(cls, demonstration: Demonstration, time: Any = None) -> Situation:
@@ -335,29 +329,6 @@ class Situation(_Frozen):
         return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
 
 
-def _start_posture(
-    joints: Any, names: Sequence[str] | None
-) -> tuple[Tensor, tuple[str, ...] | None]:
-    """The start posture (n_joints,), given in order or by name, and the joints' names."""
-    if isinstance(joints, Mapping):
-        if names is not None:
-            raise DataError("joints are given by name: leave out joint_names")
-        values = [as_tensor(value, f"joint {name!r}") for name, value in joints.items()]
-        for name, value in zip(joints, values, strict=True):
-            if not isinstance(name, str) or value.ndim:
-                raise ShapeError(
-                    f"the start posture maps names to numbers, got {name!r}: shape "
-                    f"{tuple(value.shape)}"
-                )
-        if not values:
-            raise ShapeError("the start posture has no joints")
-        return torch.stack([value.to(values[0]) for value in values]), tuple(joints)
-    joints = as_tensor(joints, "the start posture")
-    if joints.ndim != 1:
-        raise ShapeError(f"the start posture has shape (n_joints,), got {tuple(joints.shape)}")
-    return joints, _checked_names(names, len(joints))
-
-
 def _columns(
     wanted: Sequence[str], present: tuple[str, ...] | None, where: str
 ) -> list[int] | None:
@@ -408,14 +379,15 @@ def check_demonstrations(demonstrations: Any) -> list[Demonstration]:
     checked = list(demonstrations)
     if not checked:
         raise DataError("expected at least one demonstration, got an empty list")
+    names: tuple[str, ...] = ()
     for index, item in enumerate(checked):
         if not isinstance(item, Demonstration):
             raise DataError(
                 f"expected a list of Demonstration, item {index} is {type(item).__name__}"
             )
-    first, names = checked[0], next((d.joint_names for d in checked if d.joint_names), ())
+        names = names or item.joint_names or ()
     for index, item in enumerate(checked):
-        _check_alike(index, item, first, names)
+        _check_alike(index, item, checked[0], names)
     return [item.reordered(names) for item in checked]
 
 

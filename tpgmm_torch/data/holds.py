@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Self
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -33,8 +33,6 @@ class Hold:
     begin, end : float
         From when to when [s], in the time of the skill; by default from its beginning to its
         end, and beyond.
-    share : float, default=1.0
-        The share of the demonstrations in which it was found; no part of what it is.
 
     Raises
     ------
@@ -44,7 +42,7 @@ class Hold:
     Examples
     --------
     >>> Hold.parse("bottle@l_hand:4.3-")
-    Hold(frame='bottle', link='l_hand', begin=4.3, end=inf, share=1.0)
+    Hold(frame='bottle', link='l_hand', begin=4.3, end=inf)
     >>> str(Hold("cup", "r_hand", 1.5, 6.0))
     'cup@r_hand:1.5-6.0'
     """
@@ -53,7 +51,6 @@ class Hold:
     link: str
     begin: float = -math.inf
     end: float = math.inf
-    share: float = field(default=1.0, compare=False)
 
     def __post_init__(self) -> None:
         for name, value in (("frame", self.frame), ("link", self.link)):
@@ -63,14 +60,13 @@ class Hold:
             raise DataError(
                 f"{self.frame!r} cannot hold itself: a hold is of a frame by a link"
             )
-        for name in ("begin", "end", "share"):
+        for name in ("begin", "end"):
             try:
-                number = float(getattr(self, name))
+                object.__setattr__(self, name, float(getattr(self, name)))
             except (TypeError, ValueError):
-                number = math.nan
-            if math.isnan(number):
-                raise DataError(f"the {name} of {self._names} is a number, got {self!r}")
-            object.__setattr__(self, name, number)
+                object.__setattr__(self, name, math.nan)
+            if math.isnan(getattr(self, name)):
+                raise DataError(f"the {name} of {self._names} is a number of seconds")
         if not self.begin < self.end:
             raise DataError(
                 f"{self._names} is held from {self.begin:g} to {self.end:g} s: the end must be "

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 __all__ = [
     "POSE_PARTS",
-    "incomplete_poses",
     "is_gripper",
     "pose_groups",
     "quaternion_groups",
@@ -79,29 +78,3 @@ def quaternion_groups(names: Sequence[str] | None) -> list[tuple[int, ...]]:
         Of columns; None has no quaternions.
     """
     return list(pose_groups(names, POSE_PARTS[3:]).values())
-
-
-def incomplete_poses(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Missing columns of poses of which the names have a part.
-
-    All of ``x``, ``y``, ``z``, or two of a quaternion's parts, count as a pose.
-
-    Parameters
-    ----------
-    names : sequence of str
-
-    Returns
-    -------
-    dict of str to tuple of str
-        By name of the pose, the columns that complete it.
-    """
-    parts: dict[str, set[str]] = {}
-    for name in names:
-        if match := re.fullmatch(r"(.+[._])(x|y|z|qw|qx|qy|qz)", name, re.DOTALL):
-            parts.setdefault(match[1], set()).add(match[2])
-    return {
-        stem[:-1]: tuple(stem + part for part in POSE_PARTS if part not in there)
-        for stem, there in parts.items()
-        if there != set(POSE_PARTS)
-        and (there >= {"x", "y", "z"} or len(there & set(POSE_PARTS[3:])) > 1)
-    }

@@ -85,7 +85,7 @@ def find_holds(
     Returns
     -------
     tuple of Hold
-        In the order of time; ``share`` says how many of the demonstrations show it.
+        In the order of time.
 
     Raises
     ------
@@ -362,4 +362,4 @@ def _agreed(shown: Sequence[list[Hold]], agreement: float) -> Iterator[Hold]:
             end = median(hold.end for hold in holds)
             if following - end < WINDOW:  # as in one demonstration: from hand to hand
                 end = following
-            yield Hold(holds[0].frame, holds[0].link, begin, end, count / len(shown))
+            yield Hold(holds[0].frame, holds[0].link, begin, end)

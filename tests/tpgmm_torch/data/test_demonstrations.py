@@ -123,12 +123,8 @@ def test_attributes_cannot_be_replaced(attribute):
         setattr(demonstration(), attribute, None)
 
 
-def test_frames_and_events_cannot_be_changed():
+def test_poses_cannot_be_replaced():
     demo = demonstration()
-    with pytest.raises(TypeError):
-        demo.frames["cup"] = Frame([0.0, 0.0, 0.0])
-    with pytest.raises(TypeError):
-        demo.events["shake"] = 1.0
     with pytest.raises(AttributeError, match="cannot assign to field"):
         demo.frames["bottle"].position = torch.ones(3)
 
@@ -154,7 +150,7 @@ def test_reordered_names_the_joint_that_is_missing():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_copies_are_equal_and_still_read_only(copied):
+def test_copies_are_equal(copied):
     demo = demonstration()
     twin = copied(demo)
     assert torch.equal(twin.time, demo.time)
@@ -164,8 +160,6 @@ def test_copies_are_equal_and_still_read_only(copied):
     for name, frame in demo.frames.items():
         assert torch.equal(twin.frame(name).position, frame.position)
         assert torch.equal(twin.frame(name).orientation, frame.orientation)
-    with pytest.raises(TypeError):
-        twin.events["shake"] = 1.0
     situation = copied(Situation.of(demo))
     assert torch.equal(situation.joints, demo.joints[0])
     assert list(situation.frames) == ["bottle", "tray"]
@@ -221,14 +215,13 @@ def test_without_time_frames_per_step_have_one_length():
         (
             {"joints": [[0.0]]},
             ShapeError,
-            r"posture has shape \(n_joints,\), got \(1, 1\)",
+            r"posture is a number for each joint, got shape \(1, 1\)",
         ),
         ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
         ({"joints": {"a": math.nan}}, DataError, "joint 'a' holds 1 value"),
-        ({"joints": {"a": [1.0]}}, ShapeError, r"got 'a': shape \(1,\)"),
-        ({"joints": {1: 1.0}}, ShapeError, "maps names to numbers, got 1"),
+        ({"joints": {"a": [1.0, 2.0]}}, ShapeError, "2 different names"),
         ({"joints": {"a": "b"}}, DataError, "joint 'a' must be an array of numbers"),
-        ({"joints": {}}, ShapeError, "no joints"),
+        ({"joints": {}}, ShapeError, "a number for each joint"),
         ({"joints": {"a": 1.0}, "joint_names": ("a",)}, DataError, "leave out joint_names"),
         ({"joints": [1.0], "joint_names": ("a", "b")}, ShapeError, "1 different names"),
         ({"frames_time": [1.0, 1.0]}, DataError, "time must increase strictly"),

@@ -44,10 +44,6 @@ def test_what_is_no_hold_is_refused_and_explained(text):
         Hold.parse(text)
 
 
-def test_how_often_it_was_seen_is_no_part_of_it():
-    assert Hold("bottle", "l_hand", 1.0, share=0.9) == Hold("bottle", "l_hand", 1.0)
-
-
 @pytest.mark.parametrize("times", [(4.0, 3.0), (4.0, 4.0), (math.inf, math.inf)])
 def test_the_end_is_after_the_beginning(times):
     with pytest.raises(DataError, match=r"bottle@l_hand is held from .* the end must be after"):

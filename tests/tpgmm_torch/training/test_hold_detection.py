@@ -62,7 +62,7 @@ class Gripping(Kinematics):
 
 def test_the_bottle_is_held_from_the_grasp_until_it_is_let_go():
     [hold] = find_holds(carries(), upper_body())
-    assert (hold.frame, hold.link, hold.share) == ("bottle", HAND, 1.0)
+    assert (hold.frame, hold.link) == ("bottle", HAND)
     # from the grasp, to about a tick, until between the last motion and the release
     assert abs(hold.begin - ARRIVES) < 0.1 and abs(hold.end - HELD.end) < 0.1
 
@@ -164,7 +164,7 @@ def test_of_two_hands_one_is_the_holder_in_all_demonstrations():
         for _ in range(count)
     ]
     [hold] = find_holds([one for one, _ in noisy], noisy[0][1])
-    assert hold.link == "left" and hold.share == 1.0
+    assert hold.link == "left"
     # the right one slips
     slipping = {"left": along(x, 0.2), "right": along(x, -0.2 - 0.008 * ramp(1, 3))}
     demonstration, poses = shown(dict(reversed(slipping.items())), cup=along(x))
@@ -192,7 +192,6 @@ def test_the_median_demonstration_counts_and_most_must_agree():
     [before] = find_holds(usual, upper_body())
     assert abs(hold.begin - before.begin) < 0.05
     [hold] = find_holds(odd, upper_body())
-    assert hold.share == 0.5
     assert find_holds(odd, upper_body(), agreement=0.6) == ()
 
 
