@@ -4,6 +4,7 @@ LeRobot's commands import this module by themselves. The environments load late:
 package needs neither MuJoCo nor gym-aloha.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
 
@@ -109,6 +110,13 @@ class _TaskEnvConfig(_StateEnvConfig):
         """The environment's options, without those that are left to it."""
         return {"task": self.task, **super().gym_kwargs}
 
+    def _observe(self, objects: Mapping[str, Sequence[str]], n_joints: int) -> None:
+        """Check the task, and make the features those of its objects."""
+        if self.task not in objects:
+            raise UnknownNameError("task", str(self.task), self.type, objects)
+        if not self.features:
+            self.features = _features(n_joints, len(objects[self.task]))
+
 
 @EnvConfig.register_subclass("bottle_shaking")
 @dataclass
@@ -209,12 +217,9 @@ class BimanualConfig(_ControlledEnvConfig, _TaskEnvConfig):
     robot: str = UPPER_BODY
 
     def __post_init__(self) -> None:
-        if self.task is None or self.task not in SUITE:
-            raise UnknownNameError("task", str(self.task), "bimanual", SUITE)
         if self.robot not in ROBOTS:
             raise UnknownNameError("robot", self.robot, "bimanual", ROBOTS)
-        if not self.features:
-            self.features = _features(ROBOTS[self.robot], len(SUITE[self.task]))
+        self._observe(SUITE, ROBOTS[self.robot])
 
 
 @EnvConfig.register_subclass("aloha_state")
@@ -245,10 +250,7 @@ class AlohaStateConfig(_TaskEnvConfig):
     stop_at_success: bool = True
 
     def __post_init__(self) -> None:
-        if self.task not in OBJECTS:
-            raise UnknownNameError("task", str(self.task), "aloha_state", OBJECTS)
-        if not self.features:
-            self.features = _features(len(JOINTS), len(OBJECTS[self.task]))
+        self._observe(OBJECTS, len(JOINTS))
 
 
 @EnvConfig.register_subclass("metaworld_state")

@@ -57,7 +57,7 @@ def compare(
 
     The folder gets report.md, which begins with where TP-GMM loses, figures, results.parquet
     with a row for each episode, and for each environment a folder with its episodes (LeRobot
-    data sets), trained policies (for lerobot-eval --policy.path), and a page of its own. What
+    data sets), its cells and trained policies (for lerobot-eval --policy.path). What
     is finished there is not run again, so a run that was stopped goes on, and a grid can grow.
 
     Parameters

@@ -24,8 +24,6 @@ __all__ = ["ALL_CONDITIONS", "Comparison", "compare", "rewrite_report"]
 
 #: Stands for every condition that an environment has.
 ALL_CONDITIONS = "all"
-#: Minutes that the training of a policy takes that is no network, to judge what remains.
-EXPECTED = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def compare(
     out : Path
         The folder: ``report.md`` with tables and figures, and for each environment a folder of
         its name with ``episodes/`` (two LeRobot data sets for each seed), ``policies/``
-        (pretrained directories), ``cells/`` (one JSON file each), and a report of its own.
+        (pretrained directories) and ``cells/`` (one JSON file each).
     policies : sequence of str
         Names, or ``"tpgmm --policy.FIELD=VALUE ..."``: trained as ``"tpgmm"`` and used with
         other settings.
@@ -234,18 +232,15 @@ def _run(
     say: Callable[[str], None],
 ) -> dict[Cell, str]:
     """Run the cells, those of one training one after the other; return what failed."""
-    # the long ones first, so that no worker is idle at the end
-    groups = sorted(groups, key=lambda group: -_expected(*group))
+    # networks first, which take long, so that no worker is idle at the end
+    groups = sorted(groups, key=lambda group: group[2][0].variant.base not in RECIPES)
     logs = [folder / "failures" / f"{cells[0].training}.txt" for folder, _, cells in groups]
-    began, done, total = time.monotonic(), 0.0, sum(_expected(*group) for group in groups)
-    finished, failures = 0, {}
+    pending = sum(len(cells) for *_, cells in groups)
+    began, finished, failures = time.monotonic(), 0, {}
     for number, problem in run_jobs(run, groups, workers, logs):
         folder, _, cells = groups[number]
         results = Results(folder / "cells")
-        done += _expected(*groups[number])
         finished += len(cells)
-        elapsed = (time.monotonic() - began) / 60
-        left = (total - done) * elapsed / done
         for cell in cells:
             result = results.read(cell)
             if result is None:
@@ -255,13 +250,5 @@ def _run(
                 successes = sum(row["success"] for row in result["episodes"])
                 text = f"{successes} of {len(result['episodes'])} succeed"
             say(f"{cell.key}: {text}")
-        pending = sum(len(cells) for *_, cells in groups)
-        say(f"[{finished}/{pending}] {elapsed:.1f} min gone, about {left:.0f} min to go")
+        say(f"[{finished}/{pending}] after {(time.monotonic() - began) / 60:.1f} min")
     return failures
-
-
-def _expected(_: Path, settings: Settings, cells: Sequence[Cell]) -> float:
-    """Minutes, roughly, in proportion to one another."""
-    learned = cells[0].variant.base in RECIPES
-    training = settings.budget / 60 if learned else EXPECTED
-    return training + len(cells) * settings.episodes / 50

@@ -21,12 +21,12 @@ from lerobot_policy_tpgmm.configuration_tpgmm import (
     TPGMMConfig,
     state_features,
 )
-from lerobot_policy_tpgmm.control_rate import check_rate
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import (
     FrameFeatures,
     JointFeatures,
+    check_rate,
     observed_frames,
     poses_named,
 )
@@ -456,7 +456,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             ahead = self._begin(batch)
         else:
             passed = last.passed(self._observed(batch), timestamp, prev_chunk_left_over)
-            measured, poses = self._told(batch, last.first)
+            measured, poses = self._measurements(batch, last.first)
             ahead = last.first.resumed(
                 last.moments[passed], passed / self.config.rate, measured, poses
             )
@@ -483,10 +483,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return Controller(self.skill, joints, frames, **self.config.control.options())
 
-    def _told(
+    def _measurements(
         self, batch: Mapping[str, Tensor], controller: Controller
     ) -> tuple[Tensor | None, dict[str, Any] | None]:
-        """Joints and poses that a controller is told."""
+        """Joints and poses for a controller, as they were measured."""
         shape, config, measured = controller.reference.shape, self.config, self._observed(batch)
         begun = shape[0] if len(shape) == 2 else 1
         if len(measured) != begun:
@@ -506,7 +506,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     ) -> Tensor:
         """The references (B, n_joints) of the next action."""
         start, first = controller.reference, controller.command is None
-        told = self._told(batch, controller)
+        told = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
         command = controller.step(float(passed) if start.ndim == 1 else passed, *told)
         if first:

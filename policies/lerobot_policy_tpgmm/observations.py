@@ -21,7 +21,10 @@ from tpgmm_torch import Frame
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
-__all__ = ["FrameFeatures", "JointFeatures", "observed_frames", "poses_named"]
+__all__ = [
+    "CONTROL_RATE", "FrameFeatures", "JointFeatures", "check_rate", "observed_frames",
+    "poses_named",
+]  # fmt: skip
 
 REMEDY = (
     "Does the robot have joints that the data have not? --policy.joints='left_*,right_*' names "
@@ -30,6 +33,8 @@ REMEDY = (
     "--policy.state_names='[...]' --policy.action_names='[...]'"
 )
 POSE = 7
+#: Key of the rate in an observation [1/s].
+CONTROL_RATE = "observation.control_fps"
 
 
 class JointFeatures(nn.Module):
@@ -293,3 +298,27 @@ def _placed(
         f"frame {name!r} is at {list(place)}, which are not all entries of {OBS_ENV_STATE}, "
         f"{list(environment_names or ())}, nor of {OBS_STATE}, {list(state_names)}"
     )
+
+
+def check_rate(batch: Mapping[str, Any], rate: float) -> None:
+    """Whether observations come at the rate of the policy, if they tell.
+
+    LeRobot itself does not compare: a policy made for 100 Hz would run at half its speed in an
+    environment of 50 Hz. Those of ``lerobot_env_bimanual`` add their rate to each observation.
+
+    Parameters
+    ----------
+    batch : mapping of str to Tensor
+        Observations.
+    rate : float
+        Of the policy [1/s].
+    """
+    if CONTROL_RATE not in batch:
+        return
+    told = float(batch[CONTROL_RATE].flatten()[0])
+    if abs(told - rate) > 1e-3 * rate:
+        raise DataError(
+            f"the environment takes {told:g} actions per second, the policy gives {rate:g}: "
+            f"--policy.control_fps={told:g} makes its time pass accordingly, "
+            f"--env.fps={rate:g} changes the environment"
+        )

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lerobot_env_bimanual.control_rate import rate_processors
-from lerobot_policy_tpgmm.control_rate import CONTROL_RATE, check_rate
+from lerobot_policy_tpgmm.observations import CONTROL_RATE, check_rate
 from tests.support.policies import act, batch, changed, fitted
 from tpgmm_torch.exceptions import DataError
 

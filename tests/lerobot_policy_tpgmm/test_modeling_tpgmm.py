@@ -28,7 +28,6 @@ from tests.support.skills import (
     HANDS,
     bottle_model,
     canonical,
-    cups,
     hands,
     new_handling,
     small_bottle,
@@ -54,9 +53,6 @@ RATE = 20.0
 STEPS = len(small_bottle().time_)
 
 
-FAR = "ignore:.*one thing is implausible"  # too far away to reach one of the handles
-
-
 def predicted(model: TaskParameterizedGMM, given: list[Situation]) -> torch.Tensor:
     found = rollout(model.skill, given, bounds="robot", blend=1.0)
     return torch.stack([trajectory.joints for trajectory in found])
@@ -80,12 +76,6 @@ def test_a_start_off_the_skill_is_blended_in_as_predict_does():
     actions = act(played(), observed, STEPS)
     assert_close(actions[:, 0], observed[STATE].double())
     assert_close(actions, predicted(small_bottle(), situations(observed)))
-
-
-def test_references_keep_the_speed_limit():
-    joints = act(policy(blend=0.0, **OPEN), batch(), STEPS).double()
-    speed = joints.diff(dim=1) / small_bottle().time_.diff()[:, None]
-    assert bool((speed.abs() <= fitted().kinematics.velocity * (1 + 1e-5)).all())
 
 
 def test_after_the_end_it_holds():
@@ -218,16 +208,6 @@ def test_tracked_bodies_are_moved_on_their_manifold():
     for start in HANDS.quaternion_starts:
         norms = actions[:, start : start + 4].norm(dim=-1)
         torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
-
-
-def test_several_frames_follow_one_another_in_the_environments_state():
-    one, other = cups(2)
-    frames = TPGMMPolicy.from_estimator(hands()).frames
-    assert frames.in_environment == {"cup": list(range(7))}
-    values = torch.cat([one.position, one.orientation])[None]
-    found = frames.frames({STATE: torch.zeros(1, 14), ENVIRONMENT: values})
-    torch.testing.assert_close(found["cup"].position, one.position[None])
-    assert float((found["cup"].position - other.position).abs().max()) > 0
 
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")

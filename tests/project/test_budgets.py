@@ -50,9 +50,9 @@ BUDGETS = {
 #: when its budget is reached.
 CEILINGS = {
     "lines of tpgmm_torch": 15300,
-    "lines of lerobot_policy_tpgmm": 1950,
-    "lines of tpgmm_tools": 2840,
-    "lines of environments and evaluation": 8520,
+    "lines of lerobot_policy_tpgmm": 1900,
+    "lines of tpgmm_tools": 2755,
+    "lines of environments and evaluation": 8285,
     "lines of tests of core, data sets, policy and tools": 22800,
     "functions of the core above complexity 10": 62,
     "longest function of the core": 110,

@@ -52,7 +52,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("app",),
     ),
     "lerobot_policy_tpgmm": (
-        ("settings", "control_rate", "tick_durations"),
+        ("settings", "tick_durations"),
         ("configuration_tpgmm",),
         ("processor_tpgmm", "observations", "mixture_parameters", "dataset_contract"),
         ("policy_files", "training"),

@@ -85,11 +85,9 @@ def test_tables_and_report_say_what_the_cells_hold(whole):
     report = (whole / "report.md").read_text()
     assert "tpgmm compare ..." in report
     assert "| bottle_shaking | 0 | 3/3 = 100 % (44 to 100 %) | yes |" in report
-    page = (whole / SETTINGS.env / "report.md").read_text()
-    for text, place in ((report, whole), (page, whole / SETTINGS.env)):
-        for line in text.splitlines():
-            if line.startswith("!["):
-                assert (place / line.partition("(")[2].rstrip(")")).is_file()
+    for line in report.splitlines():
+        if line.startswith("!["):
+            assert (whole / line.partition("(")[2].rstrip(")")).is_file()
 
 
 def test_the_report_can_be_written_again(whole, tmp_path):
@@ -132,8 +130,7 @@ def test_a_folder_grows_by_an_environment(whole, tmp_path):
     episodes = pd.read_parquet(out / "results.parquet")
     assert dict(episodes.groupby("env").size()) == {"bottle_shaking": 6, "carry_and_put": 1 + 1}
     report = (out / "report.md").read_text()
-    assert "[carry_and_put](carry_and_put/report.md)" in report
-    assert (out / "carry_and_put" / "report.md").is_file()
+    assert "carry_and_put" in report
 
 
 def test_conditions_are_tried_where_they_are_known():
@@ -199,11 +196,10 @@ def test_conditions_are_tried_with_the_policy_that_is_there(whole, tmp_path):
     cells = pd.read_csv(out / "cells.csv")
     assert {"success_low", "success_high", "peak_speed_median", "grasp_mm_p95"} <= set(cells)
     assert len(cells) == 8
-    page = (place / "report.md").read_text()
-    for condition in conditions:
-        for policy in policies:
-            assert f"| {condition} | {policy} | " in page
-    assert "figures/conditions.webp" in (out / "report.md").read_text()
+    report = (out / "report.md").read_text()
+    assert "figures/conditions.webp" in report
+    for policy in policies:
+        assert f"\n{policy}:\n" in report
 
 
 @pytest.mark.parametrize("policy", ["act", "diffusion-phase", "mlp-phase"])

@@ -1,20 +1,15 @@
 """Pictures: what their artists hold, not only that they are drawn."""
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 import torch
-from matplotlib import rc_context, rcParams
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgb
 from matplotlib.patches import Ellipse
 
 from tests.support.local_coordinates import local_coordinates
 from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands, waves
 from tests.support.worlds import OnPoses
 from tpgmm_tools.plotting import (
-    STYLE,
     figure,
     legend,
     plot_candidates,
@@ -175,38 +170,3 @@ def test_candidates_that_matter_stand_above_the_others():
         image.get_array()[0], selection.relevance_[:, column].clip(min=0)
     )
     assert [line.get_ydata()[0] for line in axes.lines] == [len(kept) - 0.5]
-
-
-#: What is left of linear RGB to eyes with all cones, without long and without medium ones
-#: (Vienot, Brettel, Mollon, 1999).
-EYES = {
-    "all cones": np.eye(3),
-    "no long ones": [[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]],
-    "no medium ones": [[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]],
-}
-XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-
-
-def lab(color, eyes) -> np.ndarray:
-    """A colour as eyes see it, in CIE L*a*b*."""
-    srgb = np.array(to_rgb(color))
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    seen = XYZ @ np.clip(eyes @ linear, 0, 1) / XYZ.sum(axis=1)
-    x, y, z = np.where(seen > 216 / 24389, np.cbrt(seen), (24389 / 27 * seen + 16) / 116)
-    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-def least_difference(colors, eyes) -> float:
-    """Of any two colours: 2.3 is what can just be noticed."""
-    seen = [lab(color, eyes) for color in colors]
-    return min(np.linalg.norm(one - other) for one, other in combinations(seen, 2))
-
-
-@pytest.mark.parametrize("eyes", EYES.values(), ids=EYES)
-def test_colours_in_turn_are_told_apart_by_all_eyes(eyes):
-    with rc_context(STYLE):
-        colors = rcParams["axes.prop_cycle"].by_key()["color"]
-    assert len(colors) == 7
-    assert least_difference(colors, np.array(eyes)) > 15
-    if eyes is not EYES["all cones"]:  # matplotlib's own are not
-        assert least_difference(("tab:blue", "tab:purple"), np.array(eyes)) < 10

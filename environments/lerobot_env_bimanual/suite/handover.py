@@ -24,12 +24,10 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    moved,
     raised,
     seen,
     vector,
 )
-from tpgmm_datasets.bottle.skill import attached
 from tpgmm_torch import Canonical, Frame
 from tpgmm_torch.operators import Operator
 
@@ -63,7 +61,7 @@ class Handover(SuiteTask):
         "pass": 0.8, "leave": 1.0, "carry": 2.0, "lower": 1.2, "open": 0.8, "away": 1.0,
         "rest": 0.4,
     }  # fmt: skip
-    grasp, box = "close", BOX
+    grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
     figures: ClassVar = {
         "place_mm": Figure("on the stand [mm]", 1, high=8.0),
@@ -90,30 +88,23 @@ class Handover(SuiteTask):
     ) -> Mapping[str, Sequence[Leg]]:
         """Left to the baton, to the meeting, and back; right to the meeting and the stand."""
         baton, stand = poses["baton"], poses["stand"]
-        aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
         meeting = Frame(vector(MEETING) + style.free * vector(MEETING_SPREAD))
         place = Frame(stand.transform(vector((0.0, 0.0, FOOT))), stand.orientation)
 
-        def grip(pose: Frame, hand: str) -> Frame:
-            return attached(pose, GRIP[hand])
-
-        def near(pose: Frame, hand: str) -> Frame:
-            return moved(attached(pose, WAIT[hand]), aside[hand])
-
         left = [
-            Leg("reach", near(baton, "l_hand"), free=True),
-            Leg("close", grip(baton, "l_hand")),
-            Leg("raise", grip(raised(baton, LIFT), "l_hand")),
-            Leg("bring", grip(meeting, "l_hand"), free=True),
-            Leg("leave", near(meeting, "l_hand")),
+            Leg("reach", self.near(baton, "l_hand", style), free=True),
+            Leg("close", self.at_grip(baton, "l_hand")),
+            Leg("raise", self.at_grip(raised(baton, LIFT), "l_hand")),
+            Leg("bring", self.at_grip(meeting, "l_hand"), free=True),
+            Leg("leave", self.near(meeting, "l_hand", style)),
             Leg("carry", starts["l_hand"], free=True),
         ]
         right = [
-            Leg("bring", near(meeting, "r_hand"), free=True),
-            Leg("meet", grip(meeting, "r_hand")),
-            Leg("carry", grip(raised(place, LIFT), "r_hand"), free=True),
-            Leg("lower", grip(place, "r_hand")),
-            Leg("away", near(place, "r_hand")),
+            Leg("bring", self.near(meeting, "r_hand", style), free=True),
+            Leg("meet", self.at_grip(meeting, "r_hand")),
+            Leg("carry", self.at_grip(raised(place, LIFT), "r_hand"), free=True),
+            Leg("lower", self.at_grip(place, "r_hand")),
+            Leg("away", self.near(place, "r_hand", style)),
         ]
         return {"l_hand": left, "r_hand": right}
 

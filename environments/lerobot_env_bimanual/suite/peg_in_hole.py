@@ -34,7 +34,6 @@ from lerobot_env_bimanual.suite.task import (
     seen,
     vector,
 )
-from tpgmm_datasets.bottle.skill import attached
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.operators import Operator
 
@@ -80,7 +79,7 @@ class PegInHole(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 0.8, "bring": 2.0, "align": 1.2,
         "insert": 2.0, "keep": 1.2,
     }  # fmt: skip
-    grasp, box = "close", AREA
+    grasp, box, grip, wait = "close", AREA, GRIP, WAIT
     holds = (PEG, BLOCK)
     figures: ClassVar = {
         "depth_mm": Figure("depth [mm]", 1, low=1e3 * DEEP),
@@ -116,7 +115,6 @@ class PegInHole(SuiteTask):
     ) -> Mapping[str, Sequence[Leg]]:
         """Left to the block and the meeting; right to the peg, beside, above, and in."""
         peg, block = poses["peg"], poses["block"]
-        aside = {"l_hand": style.aim[:, 0], "r_hand": style.aim[:, 1]}
         # nobody turns them on the way
         place = vector(MEETING) + style.free * vector(MEETING_SPREAD)
         meeting = Frame(place, block.orientation)
@@ -126,24 +124,21 @@ class PegInHole(SuiteTask):
             up = vector((0.0, 0.0, HEIGHT + LENGTH + height))
             return Frame(meeting.position + up, _straighter(peg))
 
-        def waiting(pose: Frame, hand: str) -> Frame:
-            return moved(attached(pose, WAIT[hand]), aside[hand])
-
         begun = over(ABOVE)
-        beside = moved(begun, vector(BESIDE) + aside["r_hand"] * torch.tensor((1, 1, 0)))
+        beside = moved(begun, vector(BESIDE) + style.aim[:, 1] * torch.tensor((1, 1, 0)))
         left = [
-            Leg("reach", waiting(block, "l_hand"), free=True),
-            Leg("close", attached(block, GRIP["l_hand"])),
-            Leg("lift", attached(raised(block, LIFT), GRIP["l_hand"])),
-            Leg("bring", attached(meeting, GRIP["l_hand"]), free=True),
+            Leg("reach", self.near(block, "l_hand", style), free=True),
+            Leg("close", self.at_grip(block, "l_hand")),
+            Leg("lift", self.at_grip(raised(block, LIFT), "l_hand")),
+            Leg("bring", self.at_grip(meeting, "l_hand"), free=True),
         ]
         right = [
-            Leg("reach", waiting(peg, "r_hand"), free=True),
-            Leg("close", attached(peg, GRIP["r_hand"])),
-            Leg("lift", attached(raised(peg, LIFT), GRIP["r_hand"])),
-            Leg("bring", attached(beside, GRIP["r_hand"]), free=True),
-            Leg("align", attached(begun, GRIP["r_hand"])),
-            Leg("insert", attached(over(-IN), GRIP["r_hand"])),
+            Leg("reach", self.near(peg, "r_hand", style), free=True),
+            Leg("close", self.at_grip(peg, "r_hand")),
+            Leg("lift", self.at_grip(raised(peg, LIFT), "r_hand")),
+            Leg("bring", self.at_grip(beside, "r_hand"), free=True),
+            Leg("align", self.at_grip(begun, "r_hand")),
+            Leg("insert", self.at_grip(over(-IN), "r_hand")),
         ]
         return {"l_hand": left, "r_hand": right}
 

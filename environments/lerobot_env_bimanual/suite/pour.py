@@ -30,12 +30,11 @@ from lerobot_env_bimanual.suite.task import (
     Pose,
     Style,
     SuiteTask,
-    moved,
     raised,
     seen,
     vector,
 )
-from tpgmm_datasets.bottle.skill import attached, between
+from tpgmm_datasets.bottle.skill import between
 from tpgmm_torch import Canonical, Frame, quaternions
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.operators import Operator
@@ -83,7 +82,7 @@ class Pour(SuiteTask):
         "reach": 2.0, "close": 1.0, "hold": 0.6, "lift": 1.6, "grip": 0.6, "raise": 0.8,
         "bring": 2.0, "tilt": 1.6, "pour": 1.6, "back": 1.6, "leave": 1.6, "rest": 0.4,
     }  # fmt: skip
-    grasp, box = "close", BOX
+    grasp, box, grip, wait = "close", BOX, GRIP, WAIT
     holds = (LEFT, RIGHT)
     figures: ClassVar = {
         "poured": Figure("poured", 2, low=0.9),
@@ -113,40 +112,37 @@ class Pour(SuiteTask):
     ) -> Mapping[str, Sequence[Leg]]:
         """Right to the cup, and lifts it; left to the jug, over the cup, and back."""
         cup, jug = poses["cup"], poses["jug"]
-        aside = {hand: style.aim[:, i] for i, hand in enumerate(GRIP)}
+        aside = dict(zip(GRIP, style.aim.unbind(1), strict=True))
         sway, meeting = style.free * vector(SWAY), vector(MEETING) + aside["r_hand"]
         # where the cup is at the ends of the phases in which it is poured into
         turns = [Frame(meeting + share * sway) for share in (0.0, 1.0, -1.0, 0.0)]
         cups = dict(zip(("tilt", "pour", "back"), pairwise(turns), strict=True))
         side = _turn(SIDE + SIDE_SPREAD * style.free[:, 2], (0.0, 0.0, 1.0))
 
-        def near(pose: Frame, hand: str) -> Frame:
-            return moved(attached(pose, WAIT[hand]), aside[hand])
-
         def pouring(phase: str, tilted: Callable[[Tensor], Tensor]) -> Leg:
             def way(done: Tensor) -> Frame:
                 below = between(*cups[phase], done)
-                return attached(_over(below, side, TILT * tilted(done)), GRIP["l_hand"])
+                return self.at_grip(_over(below, side, TILT * tilted(done)), "l_hand")
 
             return Leg(phase, way)
 
         ready = _over(turns[0], side, torch.zeros_like(side[:, 0]))
         away = Frame(vector(ASIDE) + aside["l_hand"])
         left = [
-            Leg("reach", near(jug, "l_hand"), free=True),
-            Leg("lift", attached(jug, GRIP["l_hand"])),
-            Leg("raise", attached(raised(jug, LIFT), GRIP["l_hand"])),
-            Leg("bring", attached(ready, GRIP["l_hand"]), free=True),
+            Leg("reach", self.near(jug, "l_hand", style), free=True),
+            Leg("lift", self.at_grip(jug, "l_hand")),
+            Leg("raise", self.at_grip(raised(jug, LIFT), "l_hand")),
+            Leg("bring", self.at_grip(ready, "l_hand"), free=True),
             pouring("tilt", minimum_jerk),
             pouring("pour", torch.ones_like),
             pouring("back", lambda done: 1 - minimum_jerk(done)),
-            Leg("leave", attached(away, GRIP["l_hand"]), free=True),
+            Leg("leave", self.at_grip(away, "l_hand"), free=True),
         ]
         right = [
-            Leg("reach", near(cup, "r_hand"), free=True),
-            Leg("close", attached(cup, GRIP["r_hand"])),
-            Leg("lift", attached(turns[0], GRIP["r_hand"]), free=True),
-            *(Leg(phase, attached(end, GRIP["r_hand"])) for phase, (_, end) in cups.items()),
+            Leg("reach", self.near(cup, "r_hand", style), free=True),
+            Leg("close", self.at_grip(cup, "r_hand")),
+            Leg("lift", self.at_grip(turns[0], "r_hand"), free=True),
+            *(Leg(phase, self.at_grip(end, "r_hand")) for phase, (_, end) in cups.items()),
         ]
         return {"l_hand": left, "r_hand": right}
 

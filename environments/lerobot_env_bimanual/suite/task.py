@@ -24,7 +24,7 @@ from lerobot_env_bimanual.bottle.measures import Figure
 from lerobot_env_bimanual.suite.robots.embodiments import Embodiment
 from lerobot_env_bimanual.suite.scene import Hold, SuiteScene
 from tpgmm_datasets.bottle.phases import Phases
-from tpgmm_datasets.bottle.skill import HANDS, between, follow_hands
+from tpgmm_datasets.bottle.skill import HANDS, attached, between, follow_hands
 from tpgmm_torch import (
     Demonstration,
     Frame,
@@ -168,6 +168,9 @@ class SuiteTask(ABC):
     figures: ClassVar[Mapping[str, Figure]]
     #: Where the first object may be.
     box: ClassVar[Box]
+    #: Where palms touch what they take, and where they wait, in its frame [m].
+    grip: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    wait: ClassVar[Mapping[str, tuple[float, ...]]] = {}
 
     def __init__(self, embodiment: Embodiment) -> None:
         self.embodiment = embodiment
@@ -229,6 +232,14 @@ class SuiteTask(ABC):
         """When each phase ends nominally [s]."""
         done = np.cumsum(list(self.phases.values()))
         return dict(zip(self.phases, done.tolist(), strict=True))
+
+    def at_grip(self, pose: Frame, hand: str) -> Frame:
+        """Where a hand is that touches a thing with a pose."""
+        return attached(pose, self.grip[hand])
+
+    def near(self, pose: Frame, hand: str, style: Style) -> Frame:
+        """Where a hand waits beside a thing with a pose."""
+        return moved(attached(pose, self.wait[hand]), style.aim[:, HANDS.index(hand)])
 
     def start_posture(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Around the neutral one, shape (n_joints,) [rad]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from lerobot_env_bimanual.disturbances import NOMINAL
+from lerobot_env_bimanual.disturbances import NOMINAL, parse_condition
 from tpgmm_evaluation.cells import Cell
 from tpgmm_evaluation.report import pages
 from tpgmm_evaluation.report.failures import (
@@ -20,7 +21,6 @@ from tpgmm_evaluation.report.failures import (
     missed,
 )
 from tpgmm_evaluation.report.figures import draw_conditions, draw_success
-from tpgmm_evaluation.report.report import write_report
 from tpgmm_evaluation.report.significance import LEVEL, PAIR, PLACE, REFERENCE, paired
 from tpgmm_evaluation.report.tables import (
     cell_table,
@@ -65,7 +65,7 @@ class Task:
 def write_summary(
     out: Path, tasks: Sequence[Task], failures: Mapping[Cell, str], command: str
 ) -> Path:
-    """Write the report of a folder, the tables it is made from, and each environment's page.
+    """Write the report of a folder, and the tables it is made from.
 
     Parameters
     ----------
@@ -85,9 +85,6 @@ def write_summary(
         The report.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for task in tasks:
-        here = {cell: text for cell, text in failures.items() if cell.env == task.settings.env}
-        write_report(task.folder, task.settings, task.results, here)
     paragraphs = ["# What demonstrations buy"]
     if any(task.results for task in tasks):
         paragraphs += _Summary(out, [task for task in tasks if task.results])
@@ -173,6 +170,7 @@ class _Summary:
 
     def __iter__(self) -> Iterator[str]:
         yield self._introduction()
+        yield pages.bullets(f"**{name}**: {pages.described(name)}" for name in self.policies)
         yield from self._losses()
         yield from self._failed()
         yield from self._statements()
@@ -186,14 +184,12 @@ class _Summary:
         yield self._files()
 
     def _introduction(self) -> str:
-        names = ", ".join(f"[{env}]({env}/report.md)" for env in self.tasks)
         seeds = self.cells.seed.nunique()
         return (
-            f"Tasks: {names}. Policies: {', '.join(self.policies)}. Every policy learned from "
-            f"the same {pages.listed(self.counts)} demonstrations, in {seeds} training "
+            f"Tasks: {', '.join(self.tasks)}. Every policy learned from the same "
+            f"{pages.listed(self.counts)} demonstrations, in {seeds} training "
             f"seed{'s' * (seeds > 1)}, and was rolled out in the same situations, which no "
-            "demonstration shows. Each task's page says what the policies are, and what they "
-            "missed."
+            "demonstration shows."
         )
 
     def _losses(self) -> Iterator[str]:
@@ -363,10 +359,12 @@ class _Summary:
         conditions += sorted(found - set(conditions))
         yield "## Conditions"
         yield (
-            f"Successful episodes of each task in each condition, {most} demonstrations; what "
-            "goes wrong in which is said on the tasks' pages. The last column: all disturbed "
-            "episodes together, with the 95 % interval of the share (Wilson)."
+            f"Successful episodes of each task in each condition, {most} demonstrations. The "
+            "last column: all disturbed episodes together, with the 95 % interval of the share "
+            "(Wilson)."
         )
+        others = [name for name in conditions if name != NOMINAL]
+        yield pages.bullets(f"`{name}`: {self._described(name)}" for name in others)
         maps = {}
         for policy in policies:
             chosen = part[part.policy == policy]
@@ -384,27 +382,31 @@ class _Summary:
         draw_conditions(dict(list(maps.items())[:MAPS]), pages.picture(self.out, "conditions"))
         yield "![Success in percent, by task and condition](figures/conditions.webp)"
 
+    def _described(self, condition: str) -> str:
+        """What goes wrong, in the words of those who make it go wrong."""
+        options = {k: v for b in self.benchmarks.values() for k, v in b.disturbances.items()}
+        told = [
+            f"`{json.dumps(options[name])}`." if name in options
+            else str(type(parse_condition(name)[0]).__doc__).partition("\n")[0]
+            for name in condition.split("+")
+        ]  # fmt: skip
+        return " ".join(told)
+
     def _errors(self) -> Iterator[str]:
-        """The reference and the best of the others; each task's page has all."""
+        """Figures of all policies, task by task."""
         if self.nominal.empty:
             return
         yield "## Errors"
-        yield (
-            f"Median / 95th percentile over the episodes without disturbances, {REFERENCE} and "
-            "the best of the others; the tasks' pages have all policies."
-        )
-        best = best_others(self.comparisons)
+        yield "Median / 95th percentile over the episodes without disturbances."
         for env, benchmark in self.benchmarks.items():
             # figures that only other tasks have are all NaN here
             part = self.nominal[self.nominal.env == env].dropna(axis=1, how="all")
-            rivals = best[(best.env == env) & (best.condition == NOMINAL)]
-            groups = [
-                ((count, policy), chosen[chosen.policy == policy])
+            groups = (
+                ((count, policy), rows)
                 for count, chosen in part.groupby("demonstrations")
-                for policy in (REFERENCE, *rivals.policy[rivals.demonstrations == count])
-                if policy in set(chosen.policy)
-            ]
-            if groups:
+                for policy, rows in pages.by_policy(chosen)
+            )
+            if len(part):
                 yield f"{env}:"
                 figures = pages.known(benchmark.figures, part)
                 yield pages.figure_table(["demonstrations", "policy"], groups, figures)

@@ -9,7 +9,6 @@ all parameters of the mixture.
 from __future__ import annotations
 
 import logging
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from sklearn.pipeline import Pipeline
 from torch import Tensor, distributed
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
@@ -44,17 +44,13 @@ from tpgmm_datasets.conversion.assembly import event_sources
 from tpgmm_datasets.events import Detector, find_events
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import stored_events
-from tpgmm_tools.cli.learning import Choices, learn, prepared
+from tpgmm_tools.cli.learning import Choices, aligner, learn, prepared
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
-from tpgmm_torch.alignment.base import Alignment
-from tpgmm_torch.alignment.piecewise_linear import EventAlignment
-from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
 from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
-from tpgmm_torch.structure.segmentation import Segmentation
 from tpgmm_torch.training.hold_detection import with_holds
 from tpgmm_torch.training.local_data import local_data
 from tpgmm_torch.training.mixture_settings import regularization
@@ -64,8 +60,6 @@ __all__ = ["Learner"]
 
 log = logging.getLogger(__name__)
 
-#: Of the loss: if it falls by less in an epoch, the log says that it is enough.
-LITTLE = 0.01
 #: Covariances of these types are shrunk after EM.
 SHRUNK = ("full", "tied")
 
@@ -130,10 +124,8 @@ class Learner:
         self.clock: Clock | None = None
         self.prior: CovariancePrior | None = None
         self._left_out: set[int] = set()
-        self._steps = 0
-        self._told = False
-        self._losses: list[float] = []  # of the present epoch, while it is of interest
-        self._before: float | None = None  # their mean in the one before
+        self._begun = False
+        self._warned = False
 
     def loss(self, batch: Mapping[str, Any], training: bool) -> Tensor:
         """The loss of a batch.
@@ -160,12 +152,12 @@ class Learner:
         recorder = self._recorder
         if training:
             check_one_process()
-            self._steps += 1
         if training and recorder is not None:
             repeated = recorder.record(batch)
-            if self._steps == 1:
+            if not self._begun:
                 present = str(recorder)
                 log.info("collecting: the loss is 0 until every frame has come; %s", present)
+            self._begun = True
             if not (repeated and recorder.complete):
                 # no gradient, not a zero one: an optimizer's momentum must not move anything
                 return torch.zeros((), requires_grad=True)
@@ -176,17 +168,14 @@ class Learner:
                 "Evaluate less often (--eval_steps, --env_eval_freq)"
             )
         if unlearnable := self._unlearnable():
-            if not self._told:
+            if not self._warned:
                 log.warning(
                     "%s: the mixture stays as EM fitted it, and more steps change nothing",
                     unlearnable,
                 )
-            self._told = True
+            self._warned = True
             return torch.zeros((), requires_grad=True)
-        loss = self._gradient_loss(batch, training)
-        if training:
-            self._watch(loss.item(), len(batch["index"]))
-        return loss
+        return self._gradient_loss(batch, training)
 
     def end_epoch(self) -> None:
         """Fit, if all frames are there; a loop that evaluates or saves may stop right then."""
@@ -242,22 +231,17 @@ class Learner:
             {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
         )
         check(demonstrations, kinematics).act()
-        aligner: Alignment | None
-        if config.training.alignment == "parts":
-            demonstrations = Segmentation(kinematics).fit_transform(demonstrations)
-            aligner = EventAlignment(["part *"], robot=kinematics)
-        else:
-            aligner = parse_alignment(
-                config.training.alignment, kinematics, config.training.alignment_features
-            )
+        training = config.training
+        chosen = aligner(training.alignment, kinematics, training.alignment_features)
         steps = sum(map(len, demonstrations))
         log.info("%d frames of %d episodes collected", steps, len(numbers))
-        if aligner is not None:
-            log.info("aligning them: --policy.training.alignment=%s", config.training.alignment)
-        aligned = demonstrations if aligner is None else aligner.fit_transform(demonstrations)
+        aligned = demonstrations
+        if chosen is not None:
+            log.info("aligning them: --policy.training.alignment=%s", training.alignment)
+            aligned = chosen.fit_transform(demonstrations)
         if not mixture.fitted:
             self._fit(config.estimator(kinematics, list(self._operators)), aligned)
-        self.clock = self._aligned_clock(aligner, numbers)
+        self.clock = self._aligned_clock(chosen, numbers)
         for number in numbers:
             self._first[number] = {key: c[0].clone() for key, c in episodes[number].items()}
         self._learned, self._recorder = set(numbers), None
@@ -355,27 +339,6 @@ class Learner:
             for one in found
         ]
 
-    def _watch(self, loss: float, count: int) -> None:
-        """Say once that the loss of an epoch is hardly lower than that of the one before."""
-        learned = sum(len(self._ranges[number]) for number in self._learned)
-        if not self._learned or (self._before is not None and math.isinf(self._before)):
-            return
-        self._losses.append(loss)
-        if len(self._losses) * count < learned:
-            return
-        mean, before = sum(self._losses) / len(self._losses), self._before
-        self._before, self._losses = mean, []
-        if before is not None and before - mean < LITTLE * abs(before):
-            self._before = -math.inf
-            log.warning(
-                "the loss went from %.3f to %.3f in the last epoch of %d steps: more steps are "
-                "of little use, --steps=%d is enough",
-                before,
-                mean,
-                math.ceil(learned / count),
-                self._steps,
-            )
-
     def _regularization(self, rows: Tensor, kinematics: Kinematics) -> list[Tensor]:
         """What EM adds to the diagonals of the covariances of these local data."""
         config = self._config
@@ -411,18 +374,19 @@ class Learner:
             return self._joints.commanded(rows[ACTION])
         return self._joints.joints(rows[OBS_STATE])
 
-    def _aligned_clock(self, aligner: Alignment | None, numbers: Sequence[int]) -> Clock:
+    def _aligned_clock(self, chosen: Any, numbers: Sequence[int]) -> Clock:
         """Paths of the learned episodes, on the time grid of the mixture."""
         lengths = {number: len(frames) for number, frames in self._ranges.items()}
         if self._config.training.alignment == "none":
             return Clock(lengths, None, {}, self._fps)
         grid = self._mixture.time.detach().cpu().double().numpy()
         paths = {}
-        if aligner is not None:
+        if chosen is not None:
+            warping = chosen[-1] if isinstance(chosen, Pipeline) else chosen
             # a policy that was fitted before has its own grid
-            time = aligner.time_.numpy()
+            time = warping.time_.numpy()
             instants = np.interp(grid, grid[[0, -1]], time[[0, -1]])
-            for number, path in zip(numbers, aligner.paths_, strict=True):
+            for number, path in zip(numbers, warping.paths_, strict=True):
                 paths[number] = self._fps * np.interp(instants, time, path - path[0])
         return Clock(lengths, grid, paths, self._fps)
 

@@ -120,6 +120,8 @@ def test_operators_and_components_are_found(errand_set, tmp_path):
         fresh(errand_set, parts="auto", modes=2, **options)
 
 
+# one object is out of reach of one of the ways
+@pytest.mark.filterwarnings("ignore:.*one thing is implausible")
 def test_several_ways_are_found_and_each_robot_goes_the_one_that_suits(tmp_path):
     data = dataset(two_ways_set(tmp_path) / "set")
     policy = trained(
@@ -185,13 +187,6 @@ def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplo
     )
     # the same figure as the loss of all frames
     assert frames % 41 == 0 and np.mean(losses[3:]) == pytest.approx(float(printed), abs=2e-3)
-
-
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_the_log_says_once_when_more_steps_are_of_little_use(caplog, waves):
-    _, lines = said(caplog, waves, 5)
-    [line] = [line for line in lines if "of little use" in line]
-    assert re.search(r"last epoch of 3 steps: .* --steps=9 is enough", line)
 
 
 def test_a_policy_can_be_of_float32(waves):

@@ -132,6 +132,9 @@ def test_alone_it_has_nothing_to_lose_to(tmp_path):
             "| bottle_shaking | 20/20 | 20/20 | 17/20 | 37/40 = 92 % (80 to 97 %) |",
         ),
         ("Conditions", "| bottle_shaking | - | 2/20 | - | 2/20 = 10 % (3 to 30 %) |"),
+        ("Conditions", '- `pushes+noise`: `{"pushes": true}`. `{"noise": 1.0}`.'),
+        ("Conditions", "- `stopped-3`: The drives stop, and hold the joints where they are: a"),
+        ("# What", "- **nearest**: replays the demonstration whose objects stood nearest"),
         ("Errors", "| 10 | nearest | 1.00 / 1.00 | 1.00 / 1.00 | 1 / 1 |"),
         (
             "What it costs",

@@ -13,7 +13,7 @@ from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.reader import load_lerobot
 from tpgmm_datasets.signals import Signals
 from tpgmm_tools.cli import options
-from tpgmm_tools.cli.learning import Choices, learn, parse_parts, prepared
+from tpgmm_tools.cli.learning import Choices, aligner, learn, parse_parts, prepared
 from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
@@ -141,7 +141,7 @@ def fit(
             first, fitted = options.align(read, alignment, robot), None
         else:
             read, first = [], next(iter(EpisodeBatches(dataset, batch_episodes, **about)))
-            fitted = options.aligner(alignment, robot)
+            fitted = aligner(alignment, robot)
             fitted = fitted and fitted.fit(first)
             first = fitted.transform(first) if fitted else first
         if not operators:

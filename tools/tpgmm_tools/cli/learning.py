@@ -6,6 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sklearn.pipeline import Pipeline, make_pipeline
+
+from tpgmm_torch.alignment.base import Alignment
+from tpgmm_torch.alignment.piecewise_linear import EventAlignment
+from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
@@ -21,7 +26,7 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "learn", "parse_parts", "prepared"]
+__all__ = ["Choices", "aligner", "learn", "parse_parts", "prepared"]
 
 
 @dataclass(frozen=True)
@@ -51,17 +56,30 @@ class Choices:
         DataError
             If there are choices and batches, or more than one of modes, parts and components.
         """
-        chosen = [self.components, self.parts is not None, self.modes != 1]
-        if sum(chosen) > 1:
+        chosen = sum([self.components, self.parts is not None, self.modes != 1])
+        batched = batch_episodes is not None
+        if chosen > 1 or (batched and (chosen or self.operators)):
             raise DataError(
-                "--modes, --parts and --n-components auto go one at a time: give a number of "
-                "components with parts or modes, and one of these two"
+                "--modes, --parts and --n-components auto go one at a time, and they and "
+                "--operator auto without --batch-episodes: they compare all episodes"
             )
-        if batch_episodes is not None and (any(chosen) or self.operators):
-            raise DataError(
-                "--modes, --parts and 'auto' compare all episodes with each other: they go "
-                "without --batch-episodes"
-            )
+
+
+def aligner(
+    method: str, robot: Kinematics | None, features: Sequence[str] | None = None
+) -> Alignment | Pipeline | None:
+    """The transformer of a name: :func:`parse_alignment`, or "parts", which finds them first.
+
+    Parameters
+    ----------
+    method : str
+    robot : Kinematics, optional
+    features : sequence of str, optional
+        Compared by time warping.
+    """
+    if method != "parts":
+        return parse_alignment(method, robot, features)
+    return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
 
 
 def prepared(

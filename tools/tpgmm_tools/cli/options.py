@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 if TYPE_CHECKING:
-    from sklearn.pipeline import Pipeline
-
-    from tpgmm_torch.alignment.base import Alignment
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "Alignments", "DataOptions", "RobotOptions", "align", "aligner", "command", "load",
+    "Alignments", "DataOptions", "RobotOptions", "align", "command",
     "options_of", "wanted",
 ]  # fmt: skip
 
@@ -283,13 +280,6 @@ def value(text: Any) -> Any:
         return text
 
 
-def load(model: Path) -> Any:
-    """The skill of the model in a folder ``model``."""
-    from tpgmm_torch.persistence import load_skill
-
-    return load_skill(model, device="cpu")
-
-
 def wanted(
     situations: Path | None, dataset: str | None, data: DataOptions, robot: Kinematics
 ) -> tuple[list[Situation], list[Demonstration]]:
@@ -311,24 +301,12 @@ def wanted(
     return [Situation.of(one) for one in shown], shown
 
 
-def aligner(method: str, robot: Kinematics | None) -> Alignment | Pipeline | None:
-    """The transformer that ``--alignment method`` names, given a ``robot``; None for none."""
-    from tpgmm_torch.alignment.piecewise_linear import EventAlignment
-    from tpgmm_torch.alignment.text import parse_alignment
-
-    if method != "parts":
-        return parse_alignment(method, robot)
-    from sklearn.pipeline import make_pipeline
-
-    from tpgmm_torch.structure.segmentation import Segmentation
-
-    return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
-
-
 def align(
     demonstrations: list[Demonstration], method: str, robot: Kinematics | None
 ) -> list[Demonstration]:
-    """Bring ``demonstrations`` onto one clock, as :func:`aligner` does by ``method, robot``."""
+    """Bring ``demonstrations`` onto one clock, by the ``method`` for a ``robot``."""
+    from tpgmm_tools.cli.learning import aligner
+
     chosen = aligner(method, robot)
     if chosen is None:
         return demonstrations

@@ -68,6 +68,7 @@ def reproduce(
     from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.control.situations import at_first
     from tpgmm_torch.exceptions import DataError, UnknownNameError
+    from tpgmm_torch.persistence import load_skill
     from tpgmm_torch.skills.via_points import ViaPoints
     from tpgmm_torch.skills.ways import Ways
 
@@ -75,7 +76,7 @@ def reproduce(
         raise DataError(f"--out ends in one of {list(FORMATS)}, got {str(out)!r}")
     if (situations is None) == (dataset is None):
         raise DataError("give either --situations FILE.json or --dataset DATASET")
-    skill = options.load(model)
+    skill = load_skill(model, device="cpu")
     kinematics = skill.kinematics
     wanted, _ = options.wanted(situations, dataset, data, kinematics)
     if via:
