@@ -16,7 +16,7 @@ from sklearn.pipeline import Pipeline
 from torch import Tensor
 
 from tpgmm_torch import quaternions
-from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.arrays import as_array, as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.data.trajectories import Trajectory
@@ -166,18 +166,14 @@ def _instants(at: Instants | None, demonstration: Demonstration) -> Tensor:
 
 def _state_at(time: Tensor, joints: Tensor, instants: Tensor, robot: Kinematics) -> RobotState:
     """The robot between time steps."""
-    like = robot.lower
-    time, joints, instants = time.to(like), joints.to(like), instants.to(like)
-    last = len(time) - 1
-    right = torch.searchsorted(time, instants).clamp(min(1, last), last)
-    left = (right - 1).clamp(min=0)
-    width = (time[right] - time[left]).clamp(min=torch.finfo(time.dtype).tiny)
-    fraction = ((instants - time[left]) / width).clamp(0, 1).unsqueeze(-1)
-    start, end = joints[left], joints[right].clone()
+    joints = joints.to(robot.lower, copy=True)
     for place in robot.quaternion_starts:
         block = slice(place, place + 4)
-        end[:, block] = quaternions.match_hemisphere(end[:, block], start[:, block])
-    return robot.state(robot.retract(torch.lerp(start, end, fraction)))
+        joints[:, block] = quaternions.continuous(joints[:, block])
+    columns = [
+        np.interp(as_array(instants), as_array(time), column) for column in as_array(joints).T
+    ]
+    return robot.state(robot.retract(torch.from_numpy(np.stack(columns, 1)).to(joints)))
 
 
 @dataclass(frozen=True)

@@ -297,14 +297,11 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             method, k = self.init_params, self.n_components
             starts = draw_starts(method, self.n_init, k, points, family, rng)
         else:
-            if [len(start.weights_), *map(_width, start.means_)] != [
-                self.n_components,
-                *widths,
-            ]:
+            given = len(start.weights_), [*map(_width, start.means_)]
+            if given != (self.n_components, widths):
                 raise ShapeError(
-                    f"the start has {len(start.weights_)} components in blocks of "
-                    f"{[*map(_width, start.means_)]} columns, asked for are "
-                    f"{self.n_components} in blocks of {widths}"
+                    f"the start has {given[0]} components in blocks of {given[1]} columns, "
+                    f"asked for are {self.n_components} in blocks of {widths}"
                 )
             starts = [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
         fits = [

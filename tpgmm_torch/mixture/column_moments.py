@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,18 +52,24 @@ class ColumnMoments:
             raise DataError(f"there are no rows{where if processes.count > 1 else ''}")
         if len(set(widths)) > 1:
             raise DataError(f"the processes' rows have {widths} columns: all need the same")
+
+        def parts() -> Iterator[Array]:
+            for start in range(0, len(rows), FILE_ROWS):
+                yield np.asarray(rows[start : start + FILE_ROWS], dtype=np.float64)
+
+        def everywhere(own: list[Array], joined: np.ufunc = np.add) -> Array:
+            return np.asarray(joined.reduce(processes.gather(joined.reduce(own))))
+
+        count, first = sum(counts), processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
         with np.errstate(over="ignore", invalid="ignore"):
-            own = [_moments(rows[i : i + FILE_ROWS]) for i in range(0, len(rows), FILE_ROWS)]
-            parts = np.concatenate(processes.gather(np.stack(own)))
-            number, means, scatters, low, high = parts.swapaxes(0, 1)
-            count = number.sum(0)
-            # of all rows, from those of parts (Chan, Golub, LeVeque 1983); from the first part
-            # on, so that a constant column varies by nothing at all
-            mean = means[0] + (number * (means - means[0])).sum(0) / count
-            scatter = scatters.sum(0) + (number * (means - mean) ** 2).sum(0)
+            # seen from the first row, so that a constant column varies by nothing at all
+            mean = first + everywhere([(part - first).sum(0) for part in parts()]) / count
+            scatter = everywhere([np.square(part - mean).sum(0) for part in parts()])
         if not np.isfinite(scatter).all():
             raise DataError("the variance of the data overflows; divide the data by a constant")
-        return cls(int(count[0]), mean, scatter, low.min(0), high.max(0))
+        low = everywhere([part.min(0) for part in parts()], np.minimum)
+        high = everywhere([part.max(0) for part in parts()], np.maximum)
+        return cls(count, mean, scatter, low, high)
 
     def scales(self, widths: Sequence[int], *, isotropic: bool) -> Array:
         """The units (n_features,) in which each column, or block, has standard deviation 1.
@@ -84,13 +90,3 @@ class ColumnMoments:
         blocks = np.split(variance, np.cumsum(widths)[:-1])
         common = np.repeat([block.mean() or 1.0 for block in blocks], list(widths))
         return np.sqrt(common if isotropic else np.where(variance == 0, common, variance))
-
-
-def _moments(rows: NDArray[np.floating]) -> Array:
-    """Count, mean, scatter, least and largest value of each column, (5, n_features)."""
-    rows = np.asarray(rows, dtype=np.float64)
-    deviation = rows - rows[0]
-    shift = deviation.mean(0)
-    scatter = np.square(deviation - shift).sum(0)
-    count = np.full_like(shift, len(rows))
-    return np.stack([count, rows[0] + shift, scatter, rows.min(0), rows.max(0)])
