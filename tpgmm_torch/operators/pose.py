@@ -39,37 +39,34 @@ class PoseOperator(Operator):
     tolerance: float
     #: The factor g of an orientation; None of a position.
     gain: Any = None
+    held: bool = False
 
     def __post_init__(self) -> None:
         if self.link == self._frame:
             raise DataError(f"{self.link!r} seen from itself never changes: name another frame")
-        if not isinstance(self._held, bool):
-            raise DataError(f"held is True or False, got {self._held!r}")
+        if not isinstance(self.held, bool):
+            raise DataError(f"held is True or False, got {self.held!r}")
 
     @property
     def _frame(self) -> str | None:
         return getattr(self, "frame", None)
 
-    @property
-    def _held(self) -> bool:
-        return getattr(self, "held", False)
-
     def links(self) -> tuple[str, ...]:
         """The link; the frame too, if it is the held object that is meant."""
-        return (self.link, self._frame) if self._frame and self._held else (self.link,)
+        return (self.link, self._frame) if self._frame and self.held else (self.link,)
 
     def references(self) -> tuple[str, ...]:
         """The frame, if it is a place."""
-        return (self._frame,) if self._frame and not self._held else ()
+        return (self._frame,) if self._frame and not self.held else ()
 
     @cached_property
     def term(self) -> _Term:
         """Arguments of its linearisation, for :func:`linearize_poses`."""
-        return _Term(self.link, self._frame, self._held, self.gain)
+        return _Term(self.link, self._frame, self.held, self.gain)
 
     def moving_reference(self, state: RobotState) -> str | None:
         """The link or carried object that coordinates are seen from; None if it is a place."""
-        moving = state.links if self._held else state.robot_links
+        moving = state.links if self.held else state.robot_links
         return self._frame if self._frame in moving else None
 
     def is_bilinear(self, state: RobotState) -> bool:

@@ -385,6 +385,14 @@ class Described(Kinematics):
         """Arguments of ``from_config``, ready for JSON."""
         return copy.deepcopy(self._config)
 
+    @classmethod
+    def _check_keys(cls, config: Mapping[str, Any], *keys: str) -> None:
+        if set(config) != set(keys):
+            name = cls.__name__
+            raise DataError(
+                f"a {name}'s configuration has {sorted(keys)}, got {sorted(config)}"
+            )
+
     def __eq__(self, other: object) -> bool:
         return type(other) is type(self) and other._config == self._config
 

@@ -307,20 +307,8 @@ class Robot(Described):
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """The robot that gave this :meth:`config`."""
-        expected = {
-            "urdf",
-            "links",
-            "joints",
-            "locked",
-            "coordinates",
-            "base",
-            "tools",
-            "dtype",
-        }
-        if set(config) != expected:
-            raise DataError(
-                f"a robot's configuration has the keys {sorted(expected)}, got {sorted(config)}"
-            )
+        places = "urdf", "links", "base", "tools"
+        cls._check_keys(config, *places, "joints", "locked", "coordinates", "dtype")
         if not isinstance(config["urdf"], str) or not config["urdf"].startswith("<"):
             raise DataError("a robot's configuration holds the text of its URDF, not a path")
         dtype = checked_dtype(config["dtype"])

@@ -161,12 +161,7 @@ class Poses(Described):
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
         """The poses that gave this :meth:`config`."""
-        expected = {"links", "orientation", "dtype"}
-        if set(config) != expected:
-            raise DataError(
-                f"the configuration of poses has the keys {sorted(expected)}, got "
-                f"{sorted(config)}"
-            )
+        cls._check_keys(config, "links", "orientation", "dtype")
         dtype = checked_dtype(config["dtype"])
         return cls(config["links"], config["orientation"], dtype, device)
 

@@ -7,7 +7,6 @@ import torch
 
 from tests.support.robot_zoo import (
     HANDS,
-    assert_differences_agree,
     g1,
     random_joints,
     upper_body,
@@ -16,7 +15,6 @@ from tests.support.robot_zoo import (
 )
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
-from tpgmm_torch.robots.robot import Robot
 
 ROBOTS = {
     "upper body": upper_body,
@@ -48,18 +46,6 @@ def test_every_robot_of_a_batch_is_the_products_along_its_tree(make, count):
         np.testing.assert_allclose(positions[index], poses[:, :3, 3], rtol=0, atol=1e-13)
         np.testing.assert_allclose(rotations[index], poses[:, :3, :3], rtol=0, atol=1e-13)
         np.testing.assert_allclose(jacobians[index], expected, rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("make", ROBOTS.values(), ids=list(ROBOTS))
-@pytest.mark.parametrize("count", COUNTS[1:])
-def test_many_robots_are_each_what_one_is(make, count):
-    robot = make()
-    joints = random_joints(robot, count)
-    many = robot.forward_kinematics(joints)
-    for index in range(0, count, 1 + count // 20):
-        one = robot.forward_kinematics(joints[index : index + 1])
-        for some, single in zip(many, one, strict=True):
-            torch.testing.assert_close(some[index], single[0], rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -101,12 +87,6 @@ def test_no_robot_at_all_is_a_batch_too():
     assert state.jacobians.shape == (0, 2, 6, 17)
 
 
-def test_a_link_that_nothing_moves_has_a_jacobian_of_zeros():
-    state = Robot.from_urdf(upper_body_urdf(), ["base"]).state(torch.zeros(17))
-    assert torch.equal(state.positions, torch.zeros(1, 3, dtype=torch.float64))
-    assert not state.jacobians.any()
-
-
 @pytest.mark.parametrize("repeats", [1, 10])
 def test_upper_body_agrees_with_pytorch_kinematics(repeats):
     robot = upper_body()
@@ -121,12 +101,6 @@ def test_upper_body_agrees_with_pytorch_kinematics(repeats):
         torch.testing.assert_close(state.position(hand), matrix[:, :3, 3], rtol=0, atol=1e-6)
         rotation = quaternions.to_matrix(state.orientation(hand))
         torch.testing.assert_close(rotation, matrix[:, :3, :3], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("make", [upper_body, zoo, lambda: zoo(base="tip"), g1])
-def test_the_jacobian_is_the_derivative_of_the_poses(make):
-    robot = make()
-    assert_differences_agree(robot, random_joints(robot, seed=1))
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -3,18 +3,11 @@
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from tests.support.robot_zoo import (
     ZOO,
-    ZOO_FOLLOWERS,
     ZOO_JOINTS,
-    ZOO_LINKS,
-    Pinocchio,
-    random_joints,
-    written_out,
-    zoo,
 )
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematic_tree import Body, reduce
@@ -29,22 +22,6 @@ def tree(
     others = dict.fromkeys(set(ZOO_JOINTS) - set(joints), 0.0)
     wanted = [(link, np.eye(4)) for link in links]
     return reduce(read_urdf(ZOO), base, wanted, joints, others | locked)
-
-
-@pytest.mark.parametrize("base", ["ground", "column", "turret", "flange", "tip", "r_finger"])
-@pytest.mark.parametrize("locked", [{}, {"elbow": 0.7, "lift": 0.3}, {"grip": 0.05}])
-def test_poses_and_jacobians_are_those_of_pinocchio_from_any_base(base, locked):
-    names = [name for name in ZOO_JOINTS if name not in locked]
-    reduced = tree(ZOO_LINKS, base, {n: i for i, n in enumerate(names)}, **locked)
-    oracle = Pinocchio(pin.buildModelFromXML(ZOO), ZOO_FOLLOWERS)
-    for joints in random_joints(zoo(joints=names), 5).numpy():
-        oracle.run(locked | dict(zip(names, joints.tolist(), strict=True)))
-        ends = (part[-len(ZOO_LINKS) :] for part in written_out(reduced, joints))
-        for link, pose, jacobian in zip(ZOO_LINKS, *ends, strict=True):
-            position, rotation, expected = oracle.link(link, base, tuple(names))
-            np.testing.assert_allclose(pose[:3, 3], position, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(pose[:3, :3], rotation, rtol=0, atol=1e-12)
-            np.testing.assert_allclose(jacobian, expected, rtol=0, atol=1e-12)
 
 
 def test_only_joints_on_the_way_are_kept_and_parents_come_first():
