@@ -182,7 +182,7 @@ class RobotScene(ABC):
     def _controls(
         self, references: NDArray[np.float64], speeds: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """What the actuators are told at each time step."""
+        """Controls of the actuators at each time step."""
         # a joint of stiffness k follows a moving reference at a distance of d v / k, where d
         # is its damping, the joint's own and the control's: so much it has to be led
         model = self.model

@@ -1,4 +1,4 @@
-"""The environments of the comparison: where demonstrations come from, what TP-GMM is told."""
+"""The environments of the comparison: where demonstrations come from, and operators."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ class Settings:
         if changes:
             raise DataError(
                 f"{path.parent} holds results with other settings: {'; '.join(changes)}. Take "
-                "another folder, or the settings of before"
+                "another folder, or the earlier settings"
             )
 
     @classmethod

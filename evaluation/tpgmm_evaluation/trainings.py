@@ -89,7 +89,7 @@ def _tpgmm(episodes: Path, settings: Settings, cell: Cell) -> Training:
 
 
 def operators_of(base: str, benchmark: Benchmark) -> list[Operator]:
-    """What TP-GMM is told to learn in, when one of its parts is removed.
+    """Operators of TP-GMM when one of its parts is removed.
 
     Parameters
     ----------
@@ -144,14 +144,14 @@ def _nearest(episodes: Path, settings: Settings, cell: Cell) -> Training:
 def _neighbours(episodes: Path, settings: Settings, cell: Cell, timed: bool) -> Training:
     """Keep all states; with the time, of episodes on a common clock."""
     kept = Episodes.read(episodes / "training").first(cell.demonstrations)
-    options, told = dict(NEIGHBOURS), 0
+    options, n_timed = dict(NEIGHBOURS), 0
     if timed:
         if not settings.benchmark().synchronous:
             [kept] = kept.on_common_clock()
         before, kept = kept, kept.with_time()
-        told = kept.columns[OBS_ENV_STATE].shape[1] - before.columns[OBS_ENV_STATE].shape[1]
+        n_timed = kept.columns[OBS_ENV_STATE].shape[1] - before.columns[OBS_ENV_STATE].shape[1]
         options["time_weight"] = TIME_WEIGHT
-    policy = NeighboursPolicy.fit(kept, NEIGHBOURS_RATE, told, **options)
+    policy = NeighboursPolicy.fit(kept, NEIGHBOURS_RATE, n_timed, **options)
     processors = make_default_pre_post_processors(policy.config)
     if timed:
         tell_time(processors[0], NEIGHBOURS_RATE)

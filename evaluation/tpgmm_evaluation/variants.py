@@ -49,7 +49,7 @@ class Variant:
         Raises
         ------
         DataError, UnknownNameError
-            If a setting is none, or belongs to no field of a policy that has settings here.
+            If a setting cannot be read, or is no field of a policy that has settings.
         """
         base, *options = NAMED.get(text, text).split()
         known = {field.name for field in fields(TPGMMConfig)}

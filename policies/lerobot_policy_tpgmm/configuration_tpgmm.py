@@ -150,7 +150,7 @@ class TPGMMConfig(StatePolicyConfig):
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
         are found among them by name. Override them for a robot that has another order than
-        the data set: LeRobot tells a policy neither.
+        the data set: LeRobot gives a policy neither.
     units : str or dict, optional
         Unit of the joints in states and actions: ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, or
         ``[factor, offset]`` that bring a value to radians; for all, or by name; to begin with,
@@ -177,7 +177,7 @@ class TPGMMConfig(StatePolicyConfig):
     Raises
     ------
     DataError, InvalidParameterError
-        If a value is none that exists.
+        If a value does not exist.
     """
 
     n_steps: Earlier | None = None

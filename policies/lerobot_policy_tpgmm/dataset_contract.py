@@ -1,4 +1,4 @@
-"""What a data set tells a policy about itself: names, units, rate."""
+"""Names, units and rate that a policy takes from its data set."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
         if OBS_ENV_STATE in dataset.features:
             logging.getLogger(__name__).warning(
                 "without a robot the policy learns the joints alone, wherever the objects of "
-                f"{OBS_ENV_STATE} are: --policy.robot=URDF --policy.links='[...]' tells of one"
+                f"{OBS_ENV_STATE} are: --policy.robot=URDF --policy.links='[...]' describes one"
             )
     _check_links(config, kinematics)
     operators = config.decoded_operators()
@@ -79,11 +79,11 @@ def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
             raise UnknownNameError(
                 "link", pose.link, f"the robot (frame {name!r})", kinematics.links
             )
-        told = pose.event == "start" or config.environment_names or not config.frames
-        if not told and name not in (config.frames or ()):
+        clear = pose.event == "start" or config.environment_names or not config.frames
+        if not clear and name not in (config.frames or ()):
             raise DataError(
                 f"frame {name!r} is at {config.training.link_frames[name]!r} in the episodes; "
-                "say where a running policy is told it, too: --policy.frames="
+                "say where a running policy observes it, too: --policy.frames="
                 f"""'{{"{name}": [0, 1, 2, 3, 4, 5, 6], ...}}'"""
             )
 

@@ -58,7 +58,7 @@ __all__ = ["TPGMMPolicy"]
 
 log = logging.getLogger(__name__)
 
-#: What :meth:`TPGMMPolicy.push_to_hub` is told for the card, and how that says to run it.
+#: Options of :meth:`TPGMMPolicy.push_to_hub` for the card, and how that says to run it.
 FOR_THE_CARD = ("measured", "notes", "license")
 USE = """```bash
 pip install lerobot_policy_tpgmm 'lerobot[evaluation]'
@@ -75,7 +75,7 @@ class Chunk:
     Parameters
     ----------
     first : Controller
-        After its first action: what it was told last.
+        After its first action, with its last measurements.
     moments : list of Controller
         After each of its actions.
     joints : Tensor of shape (B, chunk_size, n_joints)
@@ -177,9 +177,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names
         summary = None if model is None else skill.summary
-        told = observed_frames(config, tuple(dict.fromkeys(required)), summary)
+        seen = observed_frames(config, tuple(dict.fromkeys(required)), summary)
         default = config.default_environment_state
-        self.frames = FrameFeatures(told, config.frames, *named, default, width)
+        self.frames = FrameFeatures(seen, config.frames, *named, default, width)
         self._learner: Learner | None = None
         if dataset_meta is not None:
             recorded = [name for name in required if name not in config.training.link_frames]
@@ -211,7 +211,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "--policy.type=tpgmm --dataset.root=..., or TPGMMPolicy.from_estimator(model), "
                 "or tpgmm fit ... --format lerobot"
             )
-        # an object that only stands where links do is told from a misspelt link by its data
+        # an object that only stands where links do differs from a misspelt link by its data
         known = {name for operator in operators for name in operator.references()}
         known |= {*(config.frames or ()), *poses_named(config.environment_names)}
         known |= {*poses_named(config.state_names)}
@@ -336,8 +336,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.action_names = list(action_names or kinematics.joint_names)
         config.environment_names = list(environment_names) if environment_names else None
         config.frames = {k: list(v) for k, v in frames.items()} if frames else None
-        told = observed_frames(config, skill.frame_names, skill.summary)
-        poses = FrameFeatures(told, config.frames, environment_names, config.state_names, None)
+        seen = observed_frames(config, skill.frame_names, skill.summary)
+        poses = FrameFeatures(seen, config.frames, environment_names, config.state_names, None)
         given = frames or {}
         order = [name for name in poses.in_environment if name not in given]
         if len(order) > 1 and not environment_names:
@@ -434,7 +434,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """The next ``chunk_size`` references, of robots that follow.
 
         Called again in an episode, it goes on from the step of the last chunk at which the
-        robot is: before the first action that is left over, where LeRobot's ``rtc`` tells
+        robot is: before the first action that is left over, where LeRobot's ``rtc`` says
         that, else where the timestamp says, else where the posture is nearest.
 
         Parameters
@@ -479,7 +479,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _begin(self, batch: Mapping[str, Tensor]) -> Controller:
         check_rate(batch, self.config.rate)
         joints, frames = self._observed(batch), self.frames.frames(batch)
-        if len(joints) == 1:  # one robot is sooner computed without a batch
+        if len(joints) == 1:  # one robot is faster without a batch
             joints, frames = joints[0], {name: frame[0] for name, frame in frames.items()}
         return Controller(self.skill, joints, frames, **self.config.control.options())
 
@@ -506,9 +506,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     ) -> Tensor:
         """The references (B, n_joints) of the next action."""
         start, first = controller.reference, controller.command is None
-        told = self._measurements(batch, controller)
+        measured = self._measurements(batch, controller)
         passed = self._passed(batch) if passed is None else passed
-        command = controller.step(float(passed) if start.ndim == 1 else passed, *told)
+        command = controller.step(float(passed) if start.ndim == 1 else passed, *measured)
         if first:
             self._check_start(start, command.estimate.joints)
         return controller.reference.reshape(-1, start.shape[-1])
@@ -556,7 +556,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Raises
         ------
         DataError, NotFittedError
-            If the policy was not told of a data set, or the batch cannot be learned from.
+            If the policy knows no data set, or the batch cannot be learned from.
         """
         if self._learner is None:
             raise DataError(
@@ -604,9 +604,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         DataError
             If that is no repository's id, or the policy cannot be saved.
         """
-        told: dict[str, Any] = {"license": self.config.license}
-        told |= {name: options.pop(name) for name in FOR_THE_CARD if name in options}
-        card = model_card(self.to_estimator(), repo_id, use=USE, library="lerobot", **told)
+        about: dict[str, Any] = {"license": self.config.license}
+        about |= {name: options.pop(name) for name in FOR_THE_CARD if name in options}
+        card = model_card(self.to_estimator(), repo_id, use=USE, library="lerobot", **about)
         return upload(repo_id, self.save_pretrained, card, **options)
 
     def generate_model_card(self, *given: Any, **options: Any) -> Any:
@@ -659,7 +659,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         except (DecodingError, ParsingError, FileNotFoundError) as error:
             raise ModelFileError(f"{folder / CONFIG_NAME} cannot be read: {error}") from error
         policy = cls(config, model=model, **options).eval().to(config.device)
-        # a robot of LeRobot tells none of this to a policy: who starts it must compare
+        # LeRobot passes none of this on to a policy: who starts it must compare
         log.info(
             "observation.state is taken as %s; actions are %s, %g per second (--fps)",
             list(policy.joints.state_names),

@@ -301,7 +301,7 @@ def _placed(
 
 
 def check_rate(batch: Mapping[str, Any], rate: float) -> None:
-    """Whether observations come at the rate of the policy, if they tell.
+    """Whether observations come at the rate of the policy, if they say.
 
     LeRobot itself does not compare: a policy made for 100 Hz would run at half its speed in an
     environment of 50 Hz. Those of ``lerobot_env_bimanual`` add their rate to each observation.
@@ -315,10 +315,10 @@ def check_rate(batch: Mapping[str, Any], rate: float) -> None:
     """
     if CONTROL_RATE not in batch:
         return
-    told = float(batch[CONTROL_RATE].flatten()[0])
-    if abs(told - rate) > 1e-3 * rate:
+    own = float(batch[CONTROL_RATE].flatten()[0])
+    if abs(own - rate) > 1e-3 * rate:
         raise DataError(
-            f"the environment takes {told:g} actions per second, the policy gives {rate:g}: "
-            f"--policy.control_fps={told:g} makes its time pass accordingly, "
+            f"the environment takes {own:g} actions per second, the policy gives {rate:g}: "
+            f"--policy.control_fps={own:g} makes its time pass accordingly, "
             f"--env.fps={rate:g} changes the environment"
         )

@@ -45,7 +45,7 @@ class TickDurations:
         Returns
         -------
         float or Tensor of shape (B,)
-            Of a robot whose time did not increase what it says itself, so that whoever is told
+            Of a robot whose time did not increase what it says itself, so that the controller
             can refuse it: not positive, or not finite.
         """
         now, last = timestamps.flatten().to("cpu", torch.float64), self._last

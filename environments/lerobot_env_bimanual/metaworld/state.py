@@ -62,7 +62,7 @@ class MetaworldStateEnv(StateEnv):
     Raises
     ------
     DataError, UnknownNameError
-        If an option is none that exists.
+        If an option does not exist.
     DependencyError
         Without Meta-World.
 

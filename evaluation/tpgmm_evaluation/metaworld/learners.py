@@ -58,7 +58,7 @@ class Actor(Protocol):
     outcome: str
 
     def begin(self, first: Rows) -> None:
-        """Hear the first observations (B, 25) of the episodes to come, in their order."""
+        """Take the first observations (B, 25) of the episodes to come, in their order."""
 
     def act(self, episode: int, step: int, observed: Rows) -> Rows:
         """The action (4,) after an observation (25,)."""
@@ -92,12 +92,12 @@ def direct(episodes: Sequence[Recorded], longest: float) -> list[Recorded]:
 def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     """Demonstrations at ``pace`` of their speed; the switches that all of them have are events.
 
-    Fingers do not slow down with the hand. They are told so much later that they have closed
-    where the experts' had. Switches count from the first: some experts take a second grip, and
-    others do not need it.
+    Fingers do not slow down with the hand. Their commands come so much later that they
+    have closed where the experts' had. Switches count from the first: some experts take a
+    second grip, and others do not need it.
     """
     later = round(CLOSING * (1 - pace) * FPS)
-    episodes = [_told_later(episode, later) for episode in episodes]
+    episodes = [_closing_later(episode, later) for episode in episodes]
     demonstrations = [episode.demonstration() for episode in episodes]
     found = [apart(one.references) for one in episodes]
     return [
@@ -113,7 +113,7 @@ def paced(episodes: Sequence[Recorded], pace: float) -> list[Demonstration]:
     ]
 
 
-def _told_later(episode: Recorded, later: int) -> Recorded:
+def _closing_later(episode: Recorded, later: int) -> Recorded:
     """The same, with the wanted opening so many steps later."""
     references = episode.references.copy()
     steps = np.arange(len(references))
@@ -229,7 +229,7 @@ class TaskParameterized:
 
 
 class TaskParameterizedActor:
-    """The policy of :class:`TaskParameterized`, and the observations that it is told.
+    """The policy of :class:`TaskParameterized`, and the observations that it gets.
 
     Parameters
     ----------
@@ -246,7 +246,7 @@ class TaskParameterizedActor:
         self._plan: Rows = np.empty((0, 0, len(JOINTS)))
 
     def begin(self, first: Rows) -> None:
-        """Hear the first observations."""
+        """Take the first observations."""
         self.policy.reset()
         if self.chunked:
             self._plan = self.policy.predict_action_chunk(_batch(first)).numpy()

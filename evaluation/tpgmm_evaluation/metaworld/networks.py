@@ -39,7 +39,7 @@ class Perceptron:
     updates : int
         Steps of gradient descent, whatever the number of demonstrations.
     relative : bool
-        Whether it is told, too, where the hand is as seen from each object.
+        Whether inputs also say where the hand is as seen from each object.
     """
 
     hidden: tuple[int, ...] = (256, 256)
@@ -86,7 +86,7 @@ class PerceptronActor:
 
 
 def features(observed: Rows, *, relative: bool) -> Rows:
-    """What a network is told (T, n) of observations (T, 25): the hand, and where objects are.
+    """Inputs of a network (T, n) from observations (T, 25): the hand, and where objects are.
 
     With ``relative``, also the places of the objects as seen from the hand.
     """

@@ -91,9 +91,9 @@ def cost_table(results: Iterable[Result]) -> str:
         training = np.median([result["training_seconds"] for result in here])
         action = np.median([_action_seconds(result) for result in here])
         ends = Counter(result["training_outcome"] for result in here)
-        told = "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common())
+        reasons = "; ".join(f"{outcome}: {count}" for outcome, count in ends.most_common())
         rows.append(
-            [f"{policy}, {n}", len(here), f"{training:.3g}", f"{1e3 * action:.3g}", told]
+            [f"{policy}, {n}", len(here), f"{training:.3g}", f"{1e3 * action:.3g}", reasons]
         )
     head = ["", "trainings", "training [s]", "action [ms]", "why trainings ended"]
     return table(head, rows)

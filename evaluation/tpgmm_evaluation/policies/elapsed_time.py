@@ -82,6 +82,6 @@ class ElapsedTimeStep(ObservationProcessorStep):  # type: ignore[misc]
 
 
 def tell_time(preprocessor: Any, fps: float) -> None:
-    """Insert the step into a pipeline of LeRobot's, where a policy wants the time told."""
+    """Insert the step into a pipeline of LeRobot's, where a policy wants the time."""
     # before device and normalisation, which know the time as a part of the environment
     preprocessor.steps.insert(-2, ElapsedTimeStep(fps))

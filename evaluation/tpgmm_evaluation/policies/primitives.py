@@ -192,7 +192,7 @@ class ProMPPolicy(_PrimitivePolicy):
         self.weight_cov[:] = torch.from_numpy(covariance)
 
     def _phase(self) -> Array:
-        """Of each time step, in [0, 1]; anew, because the library writes into it."""
+        """Of each time step, in [0, 1]; a new array, because the library writes into it."""
         phase: Array = np.linspace(0, 1, self.config.n_steps).astype(np.float64)
         return phase
 

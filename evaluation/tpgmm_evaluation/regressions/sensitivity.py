@@ -99,6 +99,6 @@ def _change(usual: Path, other: Path, sections: Sequence[str]) -> str:
                 moved[kind].append((two - one).mean())
     worse = sum(bool(row.worse) and row.now != row.before for row in compared(pairs))
     means = {kind: np.mean(values) for kind, values in moved.items() if values}
-    told = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
-    parts = [told[kind].format(mean) for kind, mean in means.items() if kind in told]
+    texts = {"error": "errors {:+.2f} %", "score": "scores {:+.3g}", "success": "share {:+.3g}"}
+    parts = [texts[kind].format(mean) for kind, mean in means.items() if kind in texts]
     return ", ".join([f"references up to {max(moved['same']):.2g}", *parts, f"{worse} worse"])

@@ -73,8 +73,8 @@ def failed_episodes(
                 for key, figure in benchmark.figures.items()
                 if key in row
             ]
-        told = "; ".join(texts) or "all of them are met, but not in time"
-        rows.append({key: row[key] for key in COLUMNS} | {"missed": told})
+        text = "; ".join(texts) or "all of them are met, but not in time"
+        rows.append({key: row[key] for key in COLUMNS} | {"missed": text})
     return pd.DataFrame(rows, columns=[*COLUMNS, "missed"])
 
 

@@ -246,14 +246,14 @@ class _Summary:
         counts = Counter(
             key for episode in both.to_dict("records") for key in missed(episode, benchmark)
         )
-        told = [
+        texts = [
             f"{criterion(benchmark, key)} in {count}" for key, count in counts.most_common()
         ]
         seeds = pages.listed(set(both.evaluation_seed))
         where = "" if row.condition == NOMINAL else f", {row.condition}"
         return (
             f"{row.env}, {row.demonstrations} demonstrations{where}, {row.policy}: "
-            f"{'; '.join(told) or 'no criterion of its own'}, of {len(both)} (evaluation "
+            f"{'; '.join(texts) or 'no criterion of its own'}, of {len(both)} (evaluation "
             f"seeds {seeds})"
         )
 
@@ -298,8 +298,8 @@ class _Summary:
             "Without disturbances. Which of the others is best is seen afterwards, which the "
             "correction allows for: it counts the comparisons with all of them."
         )
-        told = {(row.env, row.demonstrations): _statement(row) for row in best.itertuples()}
-        rows = [[env, *(told.get((env, n), "-") for n in self.counts)] for env in self.tasks]
+        texts = {(row.env, row.demonstrations): _statement(row) for row in best.itertuples()}
+        rows = [[env, *(texts.get((env, n), "-") for n in self.counts)] for env in self.tasks]
         yield pages.table(["task", *self._headings()], rows)
         yield pages.bullets(
             f"From {count} demonstrations {REFERENCE} is significantly better than the best of "
@@ -333,13 +333,13 @@ class _Summary:
             return
         yield "Mean of the tasks, its lowest, and on how many it has 95 % or more:"
         rates = self.nominal.groupby(["policy", "demonstrations", "env"]).success.mean()
-        told = {
+        texts = {
             place: f"{100 * part.mean():.0f} % ({100 * part.min():.0f} %; "
             f"{(part >= 0.95).sum()} of {len(part)})"
             for place, part in rates.groupby(["policy", "demonstrations"])
         }
         rows = [
-            [policy, *(told.get((policy, count), "-") for count in self.counts)]
+            [policy, *(texts.get((policy, count), "-") for count in self.counts)]
             for policy in pages.ordered(self.nominal.policy)
         ]
         yield pages.table(["policy", *self._headings()], rows)
@@ -385,12 +385,12 @@ class _Summary:
     def _described(self, condition: str) -> str:
         """What goes wrong, in the words of those who make it go wrong."""
         options = {k: v for b in self.benchmarks.values() for k, v in b.disturbances.items()}
-        told = [
+        texts = [
             f"`{json.dumps(options[name])}`." if name in options
             else str(type(parse_condition(name)[0]).__doc__).partition("\n")[0]
             for name in condition.split("+")
         ]  # fmt: skip
-        return " ".join(told)
+        return " ".join(texts)
 
     def _errors(self) -> Iterator[str]:
         """Figures of all policies, task by task."""

@@ -59,7 +59,7 @@ def located(batch: Mapping[str, Any], ranges: Mapping[int, range]) -> tuple[Tens
     for episode, index in zip(episodes.tolist(), indices.tolist(), strict=True):
         if index not in ranges.get(episode, ()):
             raise DataError(
-                f"the data set that the policy was told of has no frame {index} in episode "
+                f"the data set of the policy has no frame {index} in episode "
                 f"{episode}: give it the meta data of the set that it is trained on"
             )
     starts = torch.tensor([ranges[episode].start for episode in episodes.tolist()])
@@ -69,9 +69,9 @@ def located(batch: Mapping[str, Any], ranges: Mapping[int, range]) -> tuple[Tens
 class EpochRecorder:
     """Keeps each frame once, and knows when all are there.
 
-    The training part of a data set is not known beforehand: LeRobot tells a policy of the
-    whole set alone. An epoch is over when a frame comes again and no episode has a gap; by
-    then each of the training episodes has been seen, and no other.
+    The training part of a data set is not known beforehand: LeRobot names the whole
+    set alone to a policy. An epoch is over when a frame comes again and no episode has a gap;
+    by then each of the training episodes has been seen, and no other.
 
     Parameters
     ----------
