@@ -252,9 +252,7 @@ class Situation:
         if isinstance(joints, Mapping):
             if names is not None:
                 raise DataError("joints are given by name: leave out joint_names")
-            names, values = tuple(joints), joints.items()
-            parts = [as_tensor(value, f"joint {name!r}").reshape(-1) for name, value in values]
-            joints = torch.cat(parts or [torch.empty(0)])
+            names, joints = tuple(joints), _values(joints)
         joints = as_tensor(joints, "the start posture")
         if joints.ndim != 1 or not len(joints):
             shape = tuple(joints.shape)
@@ -327,6 +325,12 @@ class Situation:
             return dict(self.frames)
         recorded = recorded.to(time)
         return {name: frame.resampled(recorded, time) for name, frame in self.frames.items()}
+
+
+def _values(joints: Mapping[str, Any]) -> Tensor:
+    """The numbers of joints that are given by name, one behind the other."""
+    parts = [as_tensor(value, f"joint {name!r}").reshape(-1) for name, value in joints.items()]
+    return torch.cat(parts) if parts else torch.empty(0)
 
 
 def _columns(
