@@ -18,6 +18,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
 from tpgmm_torch.robots.kinematics import Described, Kinematics, RobotState, checked_dtype
@@ -161,6 +162,32 @@ class Robot(Described):
         ([0.5, 0.0, 1.3], [2.0])
         """
         return cls.from_urdf(mjcf_to_urdf(mjcf), links, **settings)
+
+    @classmethod
+    def from_chain(cls, chain: Any, links: Sequence[str], **settings: Any) -> Self:
+        """Build the kinematics of some frames of a ``pytorch_kinematics.Chain``.
+
+        That library reads SDF, too. It reads in single precision: its poses are 1e-8 to 1e-7 m
+        and rad away from those of the file, here as there, and what mimics another joint
+        moves freely. Of a URDF and an MJCF :meth:`from_urdf` and :meth:`from_mjcf` keep every
+        digit. A chain that was built in float64 keeps its digits here.
+
+        Parameters
+        ----------
+        chain : pytorch_kinematics.Chain
+            Or what is derived from it; it is not kept.
+        links : sequence of str
+            Names of the frames (or ``tools``) whose poses are wanted.
+        **settings
+            As for :meth:`from_urdf`. Everything is seen from where the chain begins,
+            ``world``, unless ``base`` is given.
+
+        Raises
+        ------
+        DataError, UnknownNameError
+            If it is no chain, or as for :meth:`from_urdf`.
+        """
+        return cls.from_urdf(chain_to_urdf(chain), links, **settings)
 
     @classmethod
     def from_file(
