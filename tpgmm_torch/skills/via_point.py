@@ -79,34 +79,35 @@ class ViaPoint:
             operator = parse_operator(operator)
         if not isinstance(operator, Operator):
             raise DataError(f"a via-point is of an operator, got {type(operator).__name__}")
-        if isinstance(value, Mapping):
-            if type(operator) is not Canonical:
-                raise DataError(
-                    "values by name are of joints, ViaPoint(time, 'canonical', {...}); the "
-                    f"operator is {format_operator(operator)}"
-                )
-            value = tuple((str(k), float(v)) for k, v in value.items())
-            numbers = as_tensor([v for _, v in value], "the value of a via-point")
-        else:
-            if isinstance(value, Frame):
-                value = torch.cat((value.position, value.orientation), -1)
-            numbers = as_tensor(value, "the value of a via-point")
-            if numbers.ndim != 1:
-                raise ShapeError(
-                    f"the value of a via-point has shape (D,), got {tuple(numbers.shape)}"
-                )
-            value = tuple(numbers.tolist())
-        widths = as_tensor(tolerance, "the tolerance of a via-point")
-        if not math.isfinite(float(time)) or not len(numbers) or not bool((widths >= 0).all()):
+        named = isinstance(value, Mapping)
+        if named and type(operator) is not Canonical:
             raise DataError(
-                "a via-point has a finite time, at least one value and no negative tolerance, "
-                f"got time={time}, value={value}, tolerance={tolerance}"
+                "values by name are of joints, ViaPoint(time, 'canonical', {...}); the "
+                f"operator is {format_operator(operator)}"
+            )
+        if isinstance(value, Frame):
+            value = torch.cat((value.position, value.orientation), -1)
+        numbers = as_tensor(
+            list(value.values()) if named else value, "the value of a via-point"
+        )
+        widths = as_tensor(tolerance, "the tolerance of a via-point")
+        if numbers.ndim != 1 or not len(numbers):
+            raise ShapeError(
+                f"the value of a via-point has shape (D,), got {tuple(numbers.shape)}"
+            )
+        if not math.isfinite(float(time)) or not bool((widths >= 0).all()):
+            raise DataError(
+                "a via-point has a finite time and no negative tolerance, got "
+                f"time={time}, tolerance={tolerance}"
             )
         object.__setattr__(self, "time", float(time))
         object.__setattr__(self, "operator", operator)
-        object.__setattr__(self, "value", value)
-        listed = tuple(widths.tolist()) if widths.ndim else float(widths)
-        object.__setattr__(self, "tolerance", listed)
+        pairs = (
+            zip(map(str, value), numbers.tolist(), strict=True) if named else numbers.tolist()
+        )
+        object.__setattr__(self, "value", tuple(pairs))
+        listed = widths.tolist()
+        object.__setattr__(self, "tolerance", tuple(listed) if widths.ndim else listed)
 
     @classmethod
     def parse(cls, text: str) -> Self:
@@ -128,17 +129,16 @@ class ViaPoint:
         try:
             if match is None:
                 raise ValueError
-            given = [part.strip() for part in match["value"].split(",")]
-            named = [part.rsplit(":", 1) for part in given]
-            value: Any = [float(part) for part in given] if ":" not in match["value"] else None
-            if value is None:
-                value = {name.strip(): float(number) for name, number in named}
-            tolerance: Any = [float(part) for part in (match["tolerance"] or "0").split(",")]
+            parts = [part.rpartition(":") for part in match["value"].split(",")]
+            value: Any = [float(number) for *_, number in parts]
+            if ":" in match["value"]:
+                value = {name.strip(): float(number) for name, _, number in parts}
+            tolerance = [float(part) for part in (match["tolerance"] or "0").split(",")]
             time = float(match["time"])
         except ValueError:
             raise DataError(f"via-point {text!r} is not of the form {GRAMMAR}") from None
-        tolerance = tolerance[0] if len(tolerance) == 1 else tolerance
-        return cls(time, parse_operator(match["what"].strip()), value, tolerance)
+        widths = tolerance if len(tolerance) > 1 else tolerance[0]
+        return cls(time, match["what"].strip(), value, widths)
 
     def __str__(self) -> str:
         parts = [f"{v[0]}:{v[1]!r}" if isinstance(v, tuple) else repr(v) for v in self.value]
