@@ -146,13 +146,9 @@ def gather_evidence(
     left_out = torch.linspace(0, number - 1, min(number, MOST_LEFT_OUT)).round().long()
     terms = []
     for index in left_out.tolist():
-        state = kinematics.state(joints[index])
-        frames = {name: frame.to(time) for name, frame in seen[index].frames.items()}
-        if holds:
-            there = seen[index].time.to(time)
-            state, frames = held_objects(state, there, frames, holds, attached=True)
+        known = _situation(seen[index], kinematics, holds)
         for operator, local in zip(operators, blocks, strict=True):
-            terms.append(_term(operator, local, index, kinematics, state, frames))
+            terms.append(_term(operator, local, index, kinematics, *known))
     count = len(operators)
     stacked = [
         tuple(map(torch.stack, zip(*terms[j::count], strict=True))) for j in range(count)
@@ -173,6 +169,16 @@ def gather_evidence(
         floor,
         max(number - 2.0, 1.0),
     )
+
+
+def _situation(
+    demonstration: Demonstration, kinematics: Kinematics, holds: Sequence[Hold]
+) -> tuple[RobotState, Mapping[str, Frame]]:
+    """State and frames (T,) of a demonstration, with what the robot holds attached to it."""
+    state = kinematics.state(demonstration.joints)
+    frames = {name: frame.to(state.joints) for name, frame in demonstration.frames.items()}
+    time = demonstration.time.to(state.joints)
+    return held_objects(state, time, frames, holds, attached=True)
 
 
 def _term(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any, Self
 
@@ -56,12 +56,14 @@ class _View:
 class _Split:
     """A partition of demonstrations that one stretch of one view shows.
 
-    ``bic`` (K,) is that of 1 to K modes there, ``gain`` the log-likelihood's, ``separation``
-    the smallest distance of two modes' means in standard deviations within them.
+    ``bic`` (K,) is that of 1 to K modes there, ``worth`` that less that of one, ``gain``
+    the log-likelihood's, ``separation`` the smallest distance of two modes' means in standard
+    deviations within them.
     """
 
     labels: NDArray[np.intp]
     bic: Array
+    worth: float
     gain: float
     separation: float
     view: _View
@@ -182,17 +184,17 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
         if count >= 2 * FEWEST and wanted != 1:
             self._divide(self._views(known))
         self.n_ways_ = int(self.labels_.max()) + 1
-        members = [np.flatnonzero(self.labels_ == way) for way in range(self.n_ways_)]
-        shown = [[known[index] for index in own] for own in members]
+        shown: list[list[Demonstration]] = [[] for _ in range(self.n_ways_)]
+        for label, one in zip(self.labels_, known, strict=True):
+            shown[label].append(one)
         self.models_ = [clone(self.model).fit(own) for own in shown]
         self.skill_: Ways | Regression = self.models_[0].skill
+        self.best_model_: Any = self.models_[0]
         if self.n_ways_ > 1:
-            pairs = list(zip(self.models_, shown, strict=True))
-            limits = [max(_surprise(model.skill, one) for one in own) for model, own in pairs]
-            weights = [len(own) / len(known) for own in members]
             skills = tuple(model.skill for model in self.models_)
-            self.skill_ = Ways(skills, tuple(weights), tuple(limits))
-        self.best_model_ = self.models_[0] if self.n_ways_ == 1 else self.skill_
+            limits = tuple(map(_largest_surprise, skills, shown))
+            self.skill_ = Ways(skills, tuple(len(own) / count for own in shown), limits)
+            self.best_model_ = self.skill_
         return self
 
     def report(self) -> str:
@@ -242,15 +244,13 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
         parts, whole = [np.arange(len(self.labels_))], []
         while parts:
             members = parts.pop(0)
-            split = None
-            if len(members) >= 2 * FEWEST:
-                here = [_View(v.operator, v.values[members], v.near) for v in views]
-                split = self._split(here, given)
-            if len(members) == len(self.labels_) and split is not None:
-                self.bic_[: len(split.bic)] = split.bic
-            if split is None or not split.labels.any():
+            here = [replace(view, values=view.values[members]) for view in views]
+            split = self._split(here, given)
+            if split is None:
                 whole.append(members)
                 continue
+            if not self._found:
+                self.bic_[: len(split.bic)] = split.bic
             self._found.append(split)
             new = [members[split.labels == k] for k in range(split.labels.max() + 1)]
             (whole if given else parts).extend(new)
@@ -259,32 +259,20 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
 
     def _split(self, views: Sequence[_View], given: int | None) -> _Split | None:
         """The best division of some demonstrations; None if BIC says that they are one mode."""
-        count = len(views[0].values)
+        most = min(given or self.max_ways, len(views[0].values) // FEWEST)
+        if most < 2:
+            return None
         shown = [(view, _stretches(view.values)) for view in views]
         places = [
-            (view, stretch, _axes(values[:, stretch]))
+            (view, stretch, along)
             for view, values in shown
             for stretch in range(values.shape[1])
+            for along in _axes(values[:, stretch])
         ]
-        cost = math.log(max(sum(len(axes) for _, _, axes in places), 1))
-        most = min(given or self.max_ways, count // FEWEST)
-        splits = []
-        for view, stretch, axes in places:
-            for along in axes:
-                partitions = _partitions(along, most)
-                scores = [_log_likelihood(along, labels, view.near) for labels in partitions]
-                k = np.arange(1, most + 1)
-                bic = -2 * np.array(scores) + k * math.log(count) + 2 * cost * (k - 1)
-                best = most - 1 if given else int(bic.argmin())
-                if best:
-                    labels = partitions[best]
-                    apart = _separation(along, labels, view.near)
-                    gain = scores[best] - scores[0]
-                    splits.append(_Split(labels, bic, gain, apart, view, stretch))
-        splits.sort(
-            key=lambda split: split.bic[-1 if given else split.labels.max()] - split.bic[0]
-        )
-        for split in splits:
+        cost = math.log(max(len(places), 1))
+        splits = [_divided(*place, cost, most, given) for place in places]
+        best = sorted((one for one in splits if one), key=lambda split: split.worth)
+        for split in best:
             if given or not (self._late(split) or _situational(split, shown)):
                 return split
         return None
@@ -303,6 +291,22 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
         others = same & ~np.eye(len(labels), dtype=bool)
         nearest = np.where(others, distances, np.inf).min(1)
         return bool(shifted[~same].min() <= APART * max(nearest.max(), split.view.near))
+
+
+def _divided(
+    view: _View, stretch: int, along: Array, cost: float, most: int, given: int | None
+) -> _Split | None:
+    """The best division along one axis of one stretch, if there is more than one mode."""
+    partitions = _partitions(along, most)
+    scores = np.array([_log_likelihood(along, labels, view.near) for labels in partitions])
+    k = np.arange(1, most + 1)
+    bic = -2 * scores + k * math.log(len(along)) + 2 * cost * (k - 1)
+    best = most - 1 if given else int(bic.argmin())
+    if not best:
+        return None
+    labels, gain = partitions[best], float(scores[best] - scores[0])
+    apart = _separation(along, labels, view.near)
+    return _Split(labels, bic, float(bic[best] - bic[0]), gain, apart, view, stretch)
 
 
 def _edges(count: int) -> NDArray[np.intp]:
@@ -394,7 +398,9 @@ def _situational(split: _Split, shown: Sequence[tuple[_View, Array]]) -> bool:
     return max(gains) > SITUATION * split.gain
 
 
-def _surprise(skill: Regression, demonstration: Demonstration) -> float:
-    """The largest surprise of a demonstration that a skill was learned from [nats]."""
-    motion = Motion.of(demonstration, skill.kinematics, skill.holds)
-    return float(skill.surprise(motion.time, motion.state.joints, motion.frames).max())
+def _largest_surprise(skill: Regression, demonstrations: Sequence[Demonstration]) -> float:
+    """The largest surprise of the demonstrations that a skill was learned from [nats]."""
+    motions = [Motion.of(one, skill.kinematics, skill.holds) for one in demonstrations]
+    return max(
+        float(skill.surprise(one.time, one.state.joints, one.frames).max()) for one in motions
+    )

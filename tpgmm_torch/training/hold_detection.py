@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from statistics import median
 from typing import Any
 
@@ -36,10 +37,6 @@ FINEST = 0.1
 LONG = 0.8
 #: Over so long motion is measured [s]: less is noise, more blurs where it begins.
 WINDOW = 0.2
-
-
-#: Opening of a gripper, as a share of its range, that is no opening.
-STILL = 0.1
 #: How far poses are from others, in units of the tolerances: at least 0, at most 1 if alike.
 Change = Callable[[Frame, Frame], Tensor]
 
@@ -49,7 +46,6 @@ def find_holds(
     kinematics: Kinematics,
     *,
     frames: Sequence[str] | None = None,
-    grippers: Mapping[str, str] | None = None,
     tolerance: float = 0.01,
     angle: float = 0.1,
     agreement: float = 0.5,
@@ -71,9 +67,6 @@ def find_holds(
         Whose links may hold.
     frames : sequence of str, optional
         Where to look; by default all frames.
-    grippers : mapping of str to str, optional
-        For links that have one, the joint that opens and closes it: a link holds as long as
-        that stands still too, to a tenth of its range.
     tolerance : float, default=0.01
         How much an object's position in the link may change while it is held [m].
     angle : float, default=0.1
@@ -90,7 +83,7 @@ def find_holds(
     Raises
     ------
     UnknownNameError
-        If there is no such frame, link or joint.
+        If there is no such frame.
     DataError
         If a tolerance is not positive.
 
@@ -114,31 +107,15 @@ def find_holds(
     for frame in frames or ():
         if frame not in known:
             raise UnknownNameError("frame", frame, "the demonstration", known)
-    for link, joint in (grippers or {}).items():
-        if link not in kinematics.links:
-            raise UnknownNameError("link", link, "the robot", kinematics.links)
-        if joint not in kinematics.joint_names:
-            raise UnknownNameError("joint", joint, "the robot", kinematics.joint_names)
-    names = [name for name in (known if frames is None else frames) if kinematics.links]
-    change = _change_in(tolerance, angle)
-    found: dict[str, list[list[Hold]]] = {name: [] for name in names}
-    for demonstration in demonstrations:
-        motion: _Motion | None = None
-        for name in names:
-            pose, shown = demonstration.frames[name], list[Hold]()
-            if pose.batch_shape and float(change(pose[:1], pose).max()) > TRAVEL:
-                motion = motion or _Motion.of(demonstration, kinematics, grippers or {})
-                shown = motion.holds(name, pose.to(motion.time), change)
-            found[name].append(shown)
-    holds = [hold for each in found.values() for hold in _agreed(each, agreement)]
-    return check_holds(holds, known, kinematics.links)
 
-
-def _change_in(tolerance: float, angle: float) -> Change:
     def change(one: Frame, other: Frame) -> Tensor:
         return one.change(other, tolerance, angle)
 
-    return change
+    motions = [_Motion(one, kinematics, change) for one in demonstrations]
+    holds: list[Hold] = []
+    for name in known if frames is None else frames:
+        holds += _agreed([motion.holds(name) for motion in motions], agreement)
+    return check_holds(holds, known, kinematics.links)
 
 
 def attach_holds(
@@ -234,48 +211,42 @@ def demonstrated_holds(
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """One demonstration: where the links were, and how open their grippers, over time (T,)."""
+    """Where the links of a robot were in one demonstration, and its objects."""
 
-    time: Tensor
-    links: Mapping[str, Frame]
-    grippers: Mapping[str, Tensor]
+    demonstration: Demonstration
+    kinematics: Kinematics
+    change: Change
 
-    @classmethod
-    def of(
-        cls, demonstration: Demonstration, kinematics: Kinematics, grippers: Mapping[str, str]
-    ) -> _Motion:
-        state = kinematics.state(demonstration.reordered(kinematics.joint_names).joints)
-        openings = {}
-        for link, joint in grippers.items():
-            opening = state.joints[:, kinematics.joint_names.index(joint)]
-            span = opening.amax() - opening.amin()
-            openings[link] = opening / (STILL * torch.where(span > 0, span, 1.0))
-        links = {link: state.pose(link) for link in kinematics.links}
-        return cls(demonstration.time.to(state.joints), links, openings)
+    @cached_property
+    def links(self) -> dict[str, Frame]:
+        """Poses (T,) of the links."""
+        ordered = self.demonstration.reordered(self.kinematics.joint_names)
+        state = self.kinematics.state(ordered.joints)
+        return {link: state.pose(link) for link in self.kinematics.links}
 
-    def holds(self, name: str, pose: Frame, change: Change) -> list[Hold]:
-        """The holds of an object that had these poses (T,), in the order of time."""
+    @cached_property
+    def time(self) -> Tensor:
+        """Instants (T,)."""
+        return self.demonstration.time.to(self.kinematics.lower)
+
+    def holds(self, name: str) -> list[Hold]:
+        """The holds of an object, in the order of time."""
+        pose, change = self.demonstration.frames[name], self.change
+        if not pose.batch_shape or float(change(pose[:1], pose).max()) <= TRAVEL:
+            return []
+        pose = pose.to(self.time)
         sooner, later = self._window()
         speed = change(pose[sooner], pose[later])
         found: list[tuple[int, int, Hold]] = []
         while float(speed.max()) > FINEST:
             seed = int(speed.argmax())  # the faster it moves, the surer is who holds it
             first, last = int(sooner[seed]), int(later[seed])
-            span = self._span(name, pose, seed, change)
+            span = self._span(name, pose, seed)
             if span is not None:
                 found.append(span)
                 first, last = span[:2]
             speed[first : last + 1] = 0
-        holds: list[Hold] = []
-        for _, _, hold in sorted(found, key=lambda span: span[:2]):
-            before = holds[-1] if holds else None
-            if before is None or before.end < hold.begin - WINDOW:
-                holds.append(hold)
-            elif before.link == hold.link:  # it slipped
-                holds[-1] = replace(before, end=max(before.end, hold.end))
-            elif before.begin < hold.begin < hold.end:  # from hand to hand
-                holds[-1:] = [replace(before, end=hold.begin), hold]
-        return holds
+        return _in_order([hold for *_, hold in sorted(found, key=lambda span: span[:2])])
 
     def _window(self) -> tuple[Tensor, Tensor]:
         """For each instant, those between which its motion is measured."""
@@ -283,17 +254,12 @@ class _Motion:
         later = later.clamp(max=len(self.time) - 1)
         return torch.searchsorted(self.time, self.time - WINDOW / 2), later
 
-    def _span(
-        self, name: str, pose: Frame, seed: int, change: Change
-    ) -> tuple[int, int, Hold] | None:
+    def _span(self, name: str, pose: Frame, seed: int) -> tuple[int, int, Hold] | None:
         """Around a moment in motion: who held the object, if anyone did, and for how long."""
-        carried: list[tuple[str, int, int, Tensor]] = []
+        carried, change = list[tuple[str, int, int, Tensor]](), self.change
         for link, hand in self.links.items():
             grasp = pose.seen_from(hand)
             slip = change(grasp[seed : seed + 1], grasp)
-            if link in self.grippers:
-                opening = self.grippers[link]
-                slip = torch.maximum(slip, (opening - opening[seed]).abs())
             first, last = _run(slip <= 1, seed)
             if float(change(pose[first : first + 1], pose[first : last + 1]).max()) > TRAVEL:
                 carried.append((link, first, last, slip))
@@ -313,30 +279,38 @@ class _Motion:
         lifted = first + max(int((~at_rest[first : seed + 1]).int().argmax()) - 1, 0)
         at_rest = change(pose[last : last + 1], pose) <= finest
         put = last - int((~at_rest[seed : last + 1]).flip(0).int().argmax()) + 1
-        begin = float(self.time[self._touched(link, pose, first, lifted, finest, change)])
+        begin = float(self.time[self._touched(link, pose, first, lifted, finest)])
         end = float(self.time[last] + self.time[min(put, last)]) / 2
-        if last == len(self.time) - 1:
-            end = math.inf
+        end = math.inf if last == len(self.time) - 1 else end
         return (first, last, Hold(name, link, begin, end)) if begin < end else None
 
-    def _touched(
-        self, link: str, pose: Frame, first: int, lifted: int, finest: float, change: Change
-    ) -> int:
+    def _touched(self, link: str, pose: Frame, first: int, lifted: int, finest: float) -> int:
         """The instant since which a link stands as it does before it lifts an object."""
-        hand = self.links[link]
+        hand, change = self.links[link], self.change
         sooner, later = self._window()
         close, _ = _run(change(hand[lifted : lifted + 1], hand) <= TRAVEL, lifted)
         speed = change(hand[sooner], hand[later])[close : lifted + 1]
         # the last of the slowest: commanded links are ahead of what they lift
         rests = lifted - int(speed.flip(0).argmin())
         still = change(hand[rests : rests + 1], hand) <= finest
-        if link in self.grippers:
-            opening = self.grippers[link]
-            still &= (opening - opening[lifted]).abs() <= 1
         stood, _ = _run(still, rests)
         # a hand that closes shifts an object a little; what comes further, somebody else brings
         near = change(pose[lifted : lifted + 1], pose[stood : lifted + 1]) <= TRAVEL
         return min(stood, first) if bool(near.all()) else first
+
+
+def _in_order(found: Sequence[Hold]) -> list[Hold]:
+    """Holds of an object, one at a time."""
+    holds: list[Hold] = []
+    for hold in found:
+        before = holds[-1] if holds else None
+        if before is None or before.end < hold.begin - WINDOW:
+            holds.append(hold)
+        elif before.link == hold.link:  # it slipped
+            holds[-1] = replace(before, end=max(before.end, hold.end))
+        elif before.begin < hold.begin < hold.end:  # from hand to hand
+            holds[-1:] = [replace(before, end=hold.begin), hold]
+    return holds
 
 
 def _run(true: Tensor, seed: int) -> tuple[int, int]:
@@ -347,19 +321,17 @@ def _run(true: Tensor, seed: int) -> tuple[int, int]:
     return first, int(after[0]) - 1 if len(after) else len(true) - 1
 
 
-def _agreed(shown: Sequence[list[Hold]], agreement: float) -> Iterator[Hold]:
+def _agreed(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
     """Of the holds of one object in each demonstration, what most of them show."""
-    orders = Counter(tuple(hold.link for hold in holds) for holds in shown if holds)
-    for order, count in orders.most_common(1):
-        if count < agreement * len(shown):
-            return
-        alike = [holds for holds in shown if tuple(hold.link for hold in holds) == order]
-        columns = list(zip(*alike, strict=True))
-        begins = [median(hold.begin for hold in holds) for holds in columns]
-        for holds, begin, following in zip(
-            columns, begins, [*begins[1:], math.inf], strict=True
-        ):
-            end = median(hold.end for hold in holds)
-            if following - end < WINDOW:  # as in one demonstration: from hand to hand
-                end = following
-            yield Hold(holds[0].frame, holds[0].link, begin, end)
+    orders = [tuple(hold.link for hold in holds) for holds in shown]
+    [(order, count)] = Counter(filter(None, orders)).most_common(1) or [((), 0)]
+    if count < max(agreement * len(shown), 1):
+        return []
+    alike = [holds for holds, own in zip(shown, orders, strict=True) if own == order]
+    found: list[Hold] = []
+    for holds in zip(*alike, strict=True):
+        begin, end = (median(getattr(h, name) for h in holds) for name in ("begin", "end"))
+        if found and begin - found[-1].end < WINDOW:  # as in one demonstration: handed on
+            found[-1] = replace(found[-1], end=begin)
+        found.append(replace(holds[0], begin=begin, end=end))
+    return found

@@ -236,14 +236,13 @@ def read_rows(
     later = next(walk, None)
     alone = later is None and processes.count == 1
 
-    def rows() -> Iterator[Tensor]:
-        for motion, x in zip(motions, local, strict=True):
-            yield local_rows(motion.time, x, *known)
-        for one in chain.from_iterable(chain([later or ()], walk)):
-            motion = Motion.of(one, kinematics, holds)
-            yield local_rows(motion.time, coordinates(motion), *known)
-
-    stored, spans, aligned = _stored(rows(), alone, processes)
+    following = (
+        Motion.of(one, kinematics, holds)
+        for one in chain.from_iterable(chain([later or ()], walk))
+    )
+    each = chain(zip(motions, local, strict=True), ((m, coordinates(m)) for m in following))
+    rows = (local_rows(motion.time, x, *known) for motion, x in each)
+    stored, spans, aligned = _stored(rows, alone, processes)
     first = _made_constant(stored, spans[0], operators, kinematics, processes)
     n_demonstrations = sum(processes.gather(len(spans)))
     if responsibilities == "instant" and not aligned:
@@ -251,18 +250,23 @@ def read_rows(
             "responsibilities='instant' needs demonstrations of one common time grid: "
             "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
         )
-    learned, size = stored, 1
-    if aligned and responsibilities != "point" and n_demonstrations > 1:
-        if alone:
-            size, together = n_demonstrations, stored[:].reshape(n_demonstrations, *first.shape)
-            learned = together.swapaxes(0, 1).reshape(-1, first.shape[1])
-        else:
-            learned, size = _equivalent(stored, first, columns_of(*known[:2])[0], processes)
+    if not aligned or responsibilities == "point" or n_demonstrations == 1:
+        learned, size = stored, 1
+    elif alone:
+        learned, size = _instants_together(stored[:], n_demonstrations), n_demonstrations
+    else:
+        learned, size = _equivalent(stored, first, columns_of(*known[:2])[0], processes)
     time = _typical_time(stored, spans, processes).to(kinematics.lower)
     return TrainingRows(
         learned, size, time, n_demonstrations, tuple(operators), holds, processes, stored,
         tuple(spans),
     )  # fmt: skip
+
+
+def _instants_together(rows: NDArray[Any], number: int) -> NDArray[Any]:
+    """Rows of some demonstrations of equal length, those of one instant one after the other."""
+    width = rows.shape[1]
+    return rows.reshape(number, -1, width).swapaxes(0, 1).reshape(-1, width)
 
 
 def _stored(

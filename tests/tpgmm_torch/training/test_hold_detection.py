@@ -12,7 +12,7 @@ from tests.support.worlds import upper_body
 from tpgmm_torch import Demonstration, Frame, Hold, quaternions
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
 from tpgmm_torch.operators import RelativePosition
-from tpgmm_torch.robots import Kinematics, Poses
+from tpgmm_torch.robots import Poses
 from tpgmm_torch.training.hold_detection import (
     attach_holds,
     demonstrated_holds,
@@ -45,19 +45,6 @@ def seen(frame: Frame, rng: np.random.Generator, size: float) -> Frame:
     shift, turn = (torch.from_numpy(size * rng.standard_normal(shape)) for _ in range(2))
     turned = quaternions.product(quaternions.exp(5 * turn), frame.orientation)
     return Frame(frame.position + shift, turned)
-
-
-class Gripping(Kinematics):
-    """Tracked bodies, and one number more."""
-
-    def __init__(self, poses: Poses) -> None:
-        self.poses, self.links = poses, poses.links
-        self.joint_names = (*poses.joint_names, "gripper")
-        self.upper = torch.full((len(self.joint_names),), torch.inf, dtype=torch.float64)
-        self.lower, self.velocity = -self.upper, self.upper
-
-    def state(self, joints):
-        return replace(self.poses.state(self.joint_tensor(joints)[..., :-1]), joints=joints)
 
 
 def test_the_bottle_is_held_from_the_grasp_until_it_is_let_go():
@@ -171,19 +158,6 @@ def test_of_two_hands_one_is_the_holder_in_all_demonstrations():
     assert find_holds([demonstration], poses)[0].link == "left"
 
 
-def test_a_gripper_narrows_the_hold():
-    x = 0.3 * ramp(2, 3)
-    opening = 0.05 - 0.04 * ramp(1.4, 1.6) + 0.04 * ramp(4.4, 4.6)
-    demonstration, poses = shown({"hand": along(x)}, cup=along(x))
-    gripping = Gripping(poses)
-    joints = torch.cat((demonstration.joints, opening[:, None]), 1)
-    closing = replace(demonstration, joints=joints)
-    [alone] = find_holds([closing], gripping)
-    assert alone.begin < 1.2 and alone.end == np.inf
-    [hold] = find_holds([closing], gripping, grippers={"hand": "gripper"})
-    assert 1.5 <= hold.begin <= 2 and 3 <= hold.end <= 4.5
-
-
 def test_the_median_demonstration_counts_and_most_must_agree():
     usual = list(carries()[:5])
     odd = [at_first(usual[0]), usual[1]]
@@ -199,10 +173,6 @@ def test_what_cannot_be_is_refused():
     one = list(carries()[:1])
     with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['bottle', 'tray'\]"):
         find_holds(one, upper_body(), frames=["cup"])
-    with pytest.raises(UnknownNameError, match="link 'tail' is not in the robot"):
-        find_holds(one, upper_body(), grippers={"tail": "l_elbow"})
-    with pytest.raises(UnknownNameError, match="joint 'finger' is not in the robot"):
-        find_holds(one, upper_body(), grippers={HAND: "finger"})
     for name in ("tolerance", "angle"):
         with pytest.raises(DataError, match=f"{name} must be positive and finite, got 0"):
             find_holds(one, upper_body(), **{name: 0})
