@@ -98,12 +98,16 @@ def _placed(skill: Skill, shown: Demonstration, number: int) -> Demonstration:
     first, last = np.unravel_index(np.where(possible, cost, np.inf).argmin(), cost.shape)
     scale = float((instants[last] - instants[first]) / shown.duration)
     begun = float(shown.time[0])
+
+    def clock(instant: Any) -> Any:
+        return instants[first] + scale * (instant - begun)
+
+    events = {name: clock(instant) for name, instant in shown.events.items()}
+    holds = shown.holds
+    if holds is not None:
+        holds = tuple(hold.retimed(clock) for hold in holds)
     return Demonstration(
-        instants[first] + scale * (shown.time - begun),
-        shown.joints,
-        shown.frames,
-        shown.joint_names,
-        {name: instants[first] + scale * (at - begun) for name, at in shown.events.items()},
+        clock(shown.time), shown.joints, shown.frames, shown.joint_names, events, holds
     )
 
 

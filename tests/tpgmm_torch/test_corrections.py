@@ -7,6 +7,7 @@ from sklearn.base import clone
 from tests.support.skills import handlings, hands, wave, waves
 from tpgmm_torch import Demonstration, Situation, TaskParameterizedGMM
 from tpgmm_torch.corrections import in_skill_time
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError
 
 NAMES = ("a", "b", "c")
@@ -32,8 +33,15 @@ def test_frames_say_where():
     shown = handlings()[2]
     part = slice(8, 22)
     time = shown.time[part] - shown.time[part][0]
-    segment = Demonstration(time, shown.joints[part], shown.frames, shown.joint_names)
+    name, link = next(iter(shown.frames)), hands().robot.links[0]
+    held = [Hold(name, link, float(time[5]))]
+    segment = Demonstration(
+        time, shown.joints[part], shown.frames, shown.joint_names, holds=held
+    )
     [placed] = in_skill_time(hands(), [segment])
+    [hold] = placed.holds
+    assert hold.begin == pytest.approx(float(placed.time[5]), abs=1e-12)
+    assert hold.end == float("inf")
     assert abs(float(placed.time[0] - shown.time[8])) < 0.08
     assert abs(float(placed.time[-1] - shown.time[21])) < 0.08
 

@@ -49,7 +49,7 @@ def retime(
     -------
     Demonstration
         Quaternions are interpolated by slerp, everything else linearly; constant frames are
-        the same. An event after the end of the path is left out.
+        the same. Holds stay with the motion; an event after the end of the path is left out.
     """
     own, joints = as_array(demonstration.time), demonstration.joints
     steps = np.arange(len(own))
@@ -67,14 +67,22 @@ def retime(
         name: frame.between(lower, fraction) if frame.batch_shape else frame
         for name, frame in demonstration.frames.items()
     }
-    reached = np.interp(list(demonstration.events.values()), own, steps).tolist()
+    grid = as_array(time)
+
+    def clock(instant: float) -> float:
+        return float(np.interp(np.interp(instant, own, steps), at, grid))
+
+    end_of_path = at[-1] + 1e-9
     events = {
-        name: float(np.interp(step, at, as_array(time)))
-        for name, step in zip(demonstration.events, reached, strict=True)
-        if step <= at[-1] + 1e-9
+        name: clock(instant)
+        for name, instant in demonstration.events.items()
+        if np.interp(instant, own, steps) <= end_of_path
     }
+    holds = demonstration.holds
+    if holds is not None:  # what is shorter than a step is none on the new clock
+        holds = tuple(h.retimed(clock) for h in holds if clock(h.begin) < clock(h.end))
     time = time.to(demonstration.time)
-    return Demonstration(time, moved, frames, demonstration.joint_names, events)
+    return Demonstration(time, moved, frames, demonstration.joint_names, events, holds)
 
 
 class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]

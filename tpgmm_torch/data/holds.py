@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 from tpgmm_torch.exceptions import DataError, UnknownNameError
@@ -100,6 +100,17 @@ class Hold:
     def __str__(self) -> str:
         begin, end = ("" if math.isinf(at) else repr(at) for at in (self.begin, self.end))
         return f"{self._names}:{begin}-{end}" if begin or end else self._names
+
+    def retimed(self, clock: Callable[[float], float]) -> Self:
+        """The same hold on another clock.
+
+        Parameters
+        ----------
+        clock : callable
+            Gives the new time of an instant [s]; strictly increasing. Open ends stay open.
+        """
+        begin, end = (at if math.isinf(at) else clock(at) for at in (self.begin, self.end))
+        return replace(self, begin=begin, end=end)
 
     @property
     def _names(self) -> str:

@@ -1,6 +1,7 @@
 """Playing demonstrations on another clock, and the contract of all alignments."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from tpgmm_torch.alignment import (
 from tpgmm_torch.alignment.base import retime
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.tracked_poses import Poses
 
@@ -98,6 +100,18 @@ def test_an_event_at_the_end_of_the_path_stays_in_spite_of_rounding():
     path = instants(own, [0.0, 1.0, 2.0 - 1e-12])
     retimed = retime(own, path, torch.tensor([0.0, 1.0, 2.0]).double())
     assert dict(retimed.events) == pytest.approx({"end": 2.0, "last step": 1.5})
+
+
+def test_holds_stay_with_the_motion():
+    frames = {"cup": Frame(torch.zeros(3))}
+    holds = [Hold("cup", "hand", 1.5, 3.0), Hold("cup", "other", 3.0)]
+    own = Demonstration(np.arange(5.0), np.eye(5), frames, holds=holds)
+    path, time = np.array([0.0, 1.0, 2.0, 4.0]), torch.tensor([0.0, 2.0, 3.0, 4.0]).double()
+    retimed = retime(own, path, time)
+    assert retimed.holds == (Hold("cup", "hand", 2.5, 3.5), Hold("cup", "other", 3.5))
+    early = retime(own, np.array([0.0, 1.0]), time[:2])  # ends before anything is held
+    assert early.holds == ()
+    assert retime(replace(own, holds=None), path, time).holds is None
 
 
 def test_quaternions_among_the_joints_turn_and_keep_unit_norm():
