@@ -4,57 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from itertools import chain
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
-from sklearn.utils import check_random_state
 from torch import Tensor
 
-from tpgmm_torch import gaussians
-from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.constraints import Interval, Options, check_parameters
-from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.control.rollout import rollout, sample
+from tpgmm_torch.control.situations import report_start, tick_inputs
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.holds import Hold, check_holds
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
-from tpgmm_torch.exceptions import DataError, NotFittedError
-from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.operators import Operator
-from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.training.learning import Learned, known, learn
 from tpgmm_torch.training.local_data import local_data
-from tpgmm_torch.training.mixture_settings import (
-    block_widths,
-    check_operators,
-    column_units,
-    kinematics_for,
-    regularization,
-)
-from tpgmm_torch.training.training_data import read
-from tpgmm_torch.training.training_rows import batches_of
 
 __all__ = ["TaskParameterizedGMM"]
-
-#: Parameters that are the mixture's too.
-SHARED = (
-    "n_components", "covariance_type", "covariance_shrinkage", "tol", "max_iter", "n_init",
-    "init_params", "random_state", "dtype", "device",
-)  # fmt: skip
 
 
 class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
@@ -252,30 +227,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
             cannot be what they are taken for.
         """
         check_parameters(self)
-        operators, batches = check_operators(self.operators), batches_of(X, processes)
-        head = next(batches)
-        kinematics = kinematics_for(head, operators, self.robot, self.dtype, self.device)
-        (self.fusion or InformationFusion()).check(operators, kinematics)
-        correlated = self.covariance_type in ("full", "tied") and self.covariance_shrinkage == 0
-        data = read(
-            chain([head], batches), operators, kinematics,
-            responsibilities=self.responsibilities, correlated=correlated, interval=interval,
-            processes=processes,
-        )  # fmt: skip
-        rows = data.rows
-        mixture = BlockGaussianMixture(
-            **self._mixture_settings(rows.operators, kinematics),
-            group_size=rows.group_size,
-            n_demonstrations=rows.n_demonstrations,
-            reg_covar=regularization(
-                ColumnMoments.of(rows.rows, processes), rows.operators, kinematics,
-                reg_covar=self.reg_covar, covariance_type=self.covariance_type,
-            ),
-        ).fit(rows.rows, processes=processes)  # fmt: skip
-        return self._set(
-            mixture, rows.operators, kinematics, rows.time, rows.holds, rows.n_demonstrations,
-            data.peaks, data.summary,
-        )  # fmt: skip
+        settings = self.get_params(deep=False)
+        return self._set(learn(X, settings, interval=interval, processes=processes))
 
     def predict(
         self, X: Situation | Iterable[Situation], *, candidates: bool = True
@@ -343,18 +296,14 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         >>> round(float(estimate.joints), 2)
         0.5
         """
-        skill, kinematics = self.skill, self.kinematics_
-        if not isinstance(state, Tensor | RobotState):
-            state = kinematics.joint_tensor(state)
-        known = {name: frame.to(kinematics.lower) for name, frame in (frames or {}).items()}
-        now = as_tensor(time, "time").to(kinematics.lower)
+        skill = self.skill
+        now, state, here = tick_inputs(skill, time, state, frames or {})
         if self._untried:  # wrong units are there from the first tick on: others cost nothing
             self._untried = False
             joints = state.joints if isinstance(state, RobotState) else state
-            summaries = [] if self.summary_ is None else [self.summary_]
-            check_situations(joints, known, now, kinematics, self.time_, summaries).act()
-        bounds = kinematics.lower, kinematics.upper
-        return skill.estimate(now, state, known, bounds, candidates=candidates)
+            report_start(skill, joints, here, now)
+        bounds = skill.kinematics.lower, skill.kinematics.upper
+        return skill.estimate(now, state, here, bounds, candidates=candidates)
 
     def sample(
         self,
@@ -383,15 +332,8 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DataError
             If ``n_samples`` is no positive integer, and as :meth:`predict` does.
         """
-        if not isinstance(n_samples, Integral) or n_samples < 1:
-            raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
-        [mean] = self.predict([situation], candidates=False)
-        draws = check_random_state(random_state).standard_normal(
-            (n_samples, *mean.joints.shape[1:])
-        )
-        factor = gaussians.cholesky(mean.covariance, "the covariance of the reproduction")
-        moved = (mean.joints + factor @ torch.from_numpy(z).to(factor) for z in draws)
-        return [replace(mean, joints=self.kinematics_.retract(joints)) for joints in moved]
+        skill: Any = self.skill
+        return sample(skill, situation, n_samples, random_state)
 
     def score(self, X: Sequence[Demonstration], y: object = None) -> float:
         """Mean log-likelihood per time step of local coordinates and time; higher is better.
@@ -403,11 +345,11 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
 
     def score_samples(self, X: Sequence[Demonstration]) -> NDArray[np.float64]:
         """Mean log-likelihood per time step of each demonstration, (n,); see :meth:`score`."""
-        skill, widths = self.skill, block_widths(self.operators_, self.kinematics_)
+        skill, widths = self.skill, [mean.shape[1] for mean in self.means_]
         n_samples = None if self.covariance_shrinkage == 0 else self.n_demonstrations_
         densities = []
         for rows in self.rows(X):
-            blocks = rows.split(list(widths), 1)
+            blocks = rows.split(widths, 1)
             local = [block[:, 1:] for block in blocks]
             density = skill.log_density(blocks[0][:, 0], local, n_samples)
             densities.append(float(density.mean()))
@@ -478,71 +420,29 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         DataError, ShapeError
             If they are no mixture, or do not fit the operators.
         """
-        weights, time = as_tensor(weights, "weights"), as_tensor(time, "time")
-        means = [as_tensor(mean, "a mean") for mean in means]
-        covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
         model = cls(**{"n_components": len(weights)} | settings)
         check_parameters(model)
-        operators, robot = check_operators(model.operators), model.robot
-        if robot is None:
-            raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
-        (model.fusion or InformationFusion()).check(operators, robot)
-        mixture = BlockGaussianMixture.from_parameters(
-            weights, means, covariances, **model._mixture_settings(operators, robot)
-        )
-        # it checked them; what it keeps went through their factors, and was rounded
-        mixture.weights_, mixture.means_, mixture.covariances_ = weights, means, covariances
-        holds = check_holds(holds, [hold.frame for hold in holds], robot.links)
-        kinematics = robot.to(time.dtype, model.device)
-        return model._set(
-            mixture, operators, kinematics, time, holds, n_demonstrations, peaks, summary
-        )
+        mixture = weights, means, covariances
+        learned = known(
+            *mixture, time, model.get_params(deep=False),
+            holds=holds, n_demonstrations=n_demonstrations, peaks=peaks, summary=summary,
+        )  # fmt: skip
+        return model._set(learned)
 
-    def _mixture_settings(
-        self, operators: Sequence[Operator], kinematics: Kinematics
-    ) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in SHARED} | {
-            "blocks": block_widths(operators, kinematics),
-            "column_units": column_units(operators, kinematics),
-            "timed_blocks": True,
-        }
-
-    def _set(
-        self,
-        mixture: BlockGaussianMixture,
-        operators: tuple[Operator, ...],
-        kinematics: Kinematics,
-        time: Tensor,
-        holds: tuple[Hold, ...],
-        n_demonstrations: int | None,
-        peaks: tuple[Tensor, Tensor] | None,
-        summary: TrainingSummary | None,
-    ) -> Self:
+    def _set(self, learned: Learned) -> Self:
         """Keep what was learned, and condition it on time."""
-        self.mixture_, self.operators_, self.kinematics_ = mixture, operators, kinematics
+        mixture = self.mixture_ = learned.mixture
         self.weights_, self.means_ = mixture.weights_, mixture.means_
-        self.covariances_, self.time_, self.holds_ = mixture.covariances_, time, tuple(holds)
-        self.n_demonstrations_, self.summary_ = n_demonstrations, summary
+        self.covariances_, self.time_ = mixture.covariances_, learned.time
+        self.operators_, self.kinematics_ = learned.operators, learned.kinematics
+        self.holds_, self.summary_ = learned.holds, learned.summary
+        self.n_demonstrations_ = learned.n_demonstrations
         self.n_iter_ = getattr(mixture, "n_iter_", 0)  # given parameters come from no EM
         self.converged_ = getattr(mixture, "converged_", False)
         self.lower_bound_ = getattr(mixture, "lower_bound_", math.nan)
         self._untried = True
-        limited = bool(kinematics.velocity.isfinite().any())
-        self._skill = Regression(
-            kinematics,
-            operators,
-            list(map(Conditionals.of, self.means_, self.covariances_)),
-            self.weights_.log(),
-            fusion=self.fusion or InformationFusion(),
-            n_samples=n_demonstrations if self.covariance_shrinkage == "auto" else None,
-            begin=float(time[0]),
-            end=float(time[-1]),
-            holds=self.holds_,
-            motion_bounds=MotionBounds.of(kinematics, peaks) if limited else None,
-            time=time,
-            summary=summary,
-            peaks=peaks,
-        )
+        own = self.fusion or InformationFusion()
+        self._skill = Regression.of(learned, own, moderated=self.covariance_shrinkage == "auto")
         self.frame_names_ = self._skill.frame_names
         return self
 

@@ -57,7 +57,6 @@ CEILINGS = {
     "functions of the core above complexity 10": 62,
     "longest function of the core": 110,
     "named numeric constants of the core": 185,
-    "imports of the estimator's module from the core": 28,
 }
 
 

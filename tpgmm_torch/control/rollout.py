@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
+from sklearn.utils import check_random_state
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.control.clocks import EvenClock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.holding import Holding
@@ -15,13 +19,14 @@ from tpgmm_torch.control.situations import completed_situations, with_novelty
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Candidate, Trajectory
+from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.regression import PART
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 
-__all__ = ["rollout"]
+__all__ = ["rollout", "sample"]
 
 
 def rollout(
@@ -74,6 +79,36 @@ def rollout(
     if isinstance(skill, ViaPoints):
         skill.missed(known, done).act()
     return with_novelty(skill, known, done)
+
+
+def sample(
+    skill: Skill,
+    situation: Situation | Demonstration,
+    n_samples: int = 1,
+    random_state: int | np.random.RandomState | None = None,
+) -> list[Trajectory]:
+    """Draw trajectories around the reproduction, ``q_t + L_t z`` with one z for all time.
+
+    Parameters
+    ----------
+    skill : Skill
+    situation : Situation or Demonstration
+    n_samples : int, default=1
+    random_state : int, RandomState instance or None
+
+    Raises
+    ------
+    DataError
+        If ``n_samples`` is no positive integer, and as :func:`rollout` does.
+    """
+    if not isinstance(n_samples, Integral) or n_samples < 1:
+        raise DataError(f"n_samples must be an integer of at least 1, got {n_samples!r}")
+    [mean] = rollout(skill, [situation])
+    rng = check_random_state(random_state)
+    factor = gaussians.cholesky(mean.covariance, "the covariance of the reproduction")
+    draws = torch.from_numpy(rng.standard_normal((n_samples, *mean.joints.shape[1:])))
+    moved = (mean.joints + factor @ z for z in draws.to(factor))
+    return [replace(mean, joints=skill.kinematics.retract(joints)) for joints in moved]
 
 
 def _groups(situations: Sequence[Situation]) -> list[list[int]]:

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from tpgmm_torch.checks.situations import check_situations
 from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.trajectories import Trajectory
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = [
@@ -22,6 +24,7 @@ __all__ = [
     "completed_frames",
     "completed_situations",
     "report_start",
+    "tick_inputs",
     "with_novelty",
 ]
 
@@ -108,7 +111,9 @@ def _completed(skill: Skill, given: Situation | Demonstration) -> Situation:
     return Situation(given.joints.to(like), frames, time)
 
 
-def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None:
+def report_start(
+    skill: Skill, joints: Any, frames: Mapping[str, Frame], time: Tensor | None = None
+) -> None:
     """Warn of start postures and frames unlike those of the demonstrations.
 
     Parameters
@@ -116,6 +121,8 @@ def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None
     skill : Skill
     joints : array-like of shape (..., n_joints)
     frames : mapping of str to Frame
+    time : Tensor, optional
+        When that is, by default the begin of the skill [s].
 
     Raises
     ------
@@ -125,7 +132,34 @@ def report_start(skill: Skill, joints: Any, frames: Mapping[str, Frame]) -> None
     start = skill.kinematics.joint_tensor(joints)
     span = _span(skill)
     known = {n: f.to(start) for n, f in frames.items() if n in skill.frame_names}
-    check_situations(start, known, span[0], skill.kinematics, span, _summaries(skill)).act()
+    now = span[0] if time is None else time
+    check_situations(start, known, now, skill.kinematics, span, _summaries(skill)).act()
+
+
+def tick_inputs(
+    skill: Skill, time: Any, state: RobotState | Any, frames: Mapping[str, Frame]
+) -> tuple[Tensor, Tensor | RobotState, dict[str, Frame]]:
+    """Time, joints and frames as tensors of the robot's dtype and device.
+
+    Parameters
+    ----------
+    skill : Skill
+    time : float or Tensor
+        [s].
+    state : RobotState, array-like of shape (..., n_joints), or mapping of str to array-like
+        Joints may go by name.
+    frames : mapping of str to Frame
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError
+        If one is not finite, or the joints are others than the robot's.
+    """
+    kinematics = skill.kinematics
+    if not isinstance(state, Tensor | RobotState):
+        state = kinematics.joint_tensor(state)
+    here = {name: frame.to(kinematics.lower) for name, frame in frames.items()}
+    return as_tensor(time, "time").to(kinematics.lower), state, here
 
 
 def _summaries(skill: Skill) -> list[TrainingSummary]:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
+from tpgmm_torch.training.learning import Learned
 
 __all__ = ["Components", "Regression"]
 
@@ -129,6 +130,35 @@ class Regression:
     peaks: tuple[Tensor, Tensor] | None = None
     summary: TrainingSummary | None = None
     time: Any = None
+
+    @classmethod
+    def of(cls, learned: Learned, fusion: Fusion, *, moderated: bool) -> Self:
+        """A learned mixture, conditioned on time (eqs 1 to 3).
+
+        Parameters
+        ----------
+        learned : Learned
+        fusion : InformationFusion or CovarianceFusion
+        moderated : bool
+            Whether joints give way by what the demonstrations leave unknown.
+        """
+        mixture, kinematics = learned.mixture, learned.kinematics
+        limited = bool(kinematics.velocity.isfinite().any())
+        return cls(
+            kinematics,
+            learned.operators,
+            list(map(Conditionals.of, mixture.means_, mixture.covariances_)),
+            mixture.weights_.log(),
+            fusion=fusion,
+            n_samples=learned.n_demonstrations if moderated else None,
+            begin=float(learned.time[0]),
+            end=float(learned.time[-1]),
+            holds=learned.holds,
+            motion_bounds=MotionBounds.of(kinematics, learned.peaks) if limited else None,
+            peaks=learned.peaks,
+            summary=learned.summary,
+            time=learned.time,
+        )
 
     def estimate(
         self,

@@ -1,0 +1,215 @@
+"""Learning from demonstrations: a mixture over local coordinates, and their ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+from torch import Tensor
+
+from tpgmm_torch.checks.report import Report
+from tpgmm_torch.checks.summary import TrainingSummary
+from tpgmm_torch.checks.training import EpisodeSummary, check, summarize
+from tpgmm_torch.data.arrays import as_tensor
+from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.holds import Hold, check_holds
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
+from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
+from tpgmm_torch.operators import Operator
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.mixture_settings import (
+    block_widths,
+    check_operators,
+    column_units,
+    kinematics_for,
+    regularization,
+)
+from tpgmm_torch.training.outlying_demonstrations import outlying_rows, unlike_the_others
+from tpgmm_torch.training.training_rows import TrainingRows, batches_of, read_rows
+
+__all__ = ["Learned", "known", "learn"]
+
+#: Parameters of the estimator that are the mixture's too.
+SHARED = (
+    "n_components", "covariance_type", "covariance_shrinkage", "tol", "max_iter", "n_init",
+    "init_params", "random_state", "dtype", "device",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Mixture of local coordinates, and ranges of the demonstrations it was learned from.
+
+    Parameters
+    ----------
+    mixture : BlockGaussianMixture
+        Of the local data of all operators side by side.
+    operators : tuple of Operator
+        With the mean orientations of the demonstrations.
+    kinematics : Kinematics
+    time : Tensor of shape (T,)
+        Time grid of a typical demonstration [s].
+    holds : tuple of Hold
+        In the time of the skill.
+    n_demonstrations : int or None
+    peaks : tuple of two Tensor of shape (n_joints,), or None
+        Accelerations [rad/s^2] and jerks [rad/s^3] of the demonstrations.
+    summary : TrainingSummary or None
+        Ranges of start postures and frames.
+    """
+
+    mixture: BlockGaussianMixture
+    operators: tuple[Operator, ...]
+    kinematics: Kinematics
+    time: Tensor
+    holds: tuple[Hold, ...] = ()
+    n_demonstrations: int | None = None
+    peaks: tuple[Tensor, Tensor] | None = None
+    summary: TrainingSummary | None = None
+
+
+def learn(
+    X: Iterable[Demonstration] | Iterable[Sequence[Demonstration]],
+    settings: Mapping[str, Any],
+    *,
+    interval: tuple[float, float] | None = None,
+    processes: Processes = ALONE,
+) -> Learned:
+    """Read demonstrations once, warn of what is implausible, and learn a mixture by EM.
+
+    Parameters
+    ----------
+    X : iterable of Demonstration, or of sequence of Demonstration
+        In one list, or in batches of a set that is larger than memory.
+    settings : mapping of str to object
+        Parameters of :class:`~tpgmm_torch.TaskParameterizedGMM`, all of them.
+    interval : tuple of float, optional
+        Learn from this part of the time only, begin and end [s].
+    processes : Processes
+        Among which the demonstrations are spread.
+
+    Raises
+    ------
+    DataError, ShapeError, UnknownNameError, PlausibilityError
+        If demonstrations do not fit together, or with the robot and the operators, or cannot
+        be what they are taken for.
+    """
+    operators, batches = check_operators(settings["operators"]), batches_of(X, processes)
+    head = next(batches)
+    where = settings["dtype"], settings["device"]
+    kinematics = kinematics_for(head, operators, settings["robot"], *where)
+    if settings["fusion"] is not None:
+        settings["fusion"].check(operators, kinematics)
+    peaks, episodes = DemonstratedPeaks(kinematics.joint_names), list[EpisodeSummary]()
+
+    def watched() -> Iterator[Sequence[Demonstration]]:
+        for batch in peaks.watch(chain([head], batches)):
+            episodes.extend(summarize(batch, kinematics))
+            yield batch
+
+    rows = read_rows(
+        watched(), operators, kinematics,
+        responsibilities=settings["responsibilities"], processes=processes,
+    )  # fmt: skip
+    rows = rows if interval is None else rows.within(*interval)
+    episodes = list(chain.from_iterable(processes.gather(episodes)))
+    _report(rows, episodes, kinematics, settings)
+    moments = ColumnMoments.of(rows.rows, processes)
+    shape = {name: settings[name] for name in ("reg_covar", "covariance_type")}
+    mixture = BlockGaussianMixture(
+        **_of_mixture(settings, rows.operators, kinematics),
+        group_size=rows.group_size,
+        n_demonstrations=rows.n_demonstrations,
+        reg_covar=regularization(moments, rows.operators, kinematics, **shape),
+    )
+    return Learned(
+        mixture.fit(rows.rows, processes=processes),
+        rows.operators,
+        kinematics,
+        rows.time,
+        rows.holds,
+        rows.n_demonstrations,
+        peaks.result(processes),
+        TrainingSummary.of(episodes, kinematics),
+    )
+
+
+def known(
+    weights: Any,
+    means: Sequence[Any],
+    covariances: Sequence[Any],
+    time: Any,
+    settings: Mapping[str, Any],
+    *,
+    holds: Sequence[Hold] = (),
+    **others: Any,
+) -> Learned:
+    """A mixture of given parameters, which are kept as they are.
+
+    Parameters
+    ----------
+    weights, means, covariances, time : array-like, or sequences of array-like
+        Of shapes (K,), (K, 1 + D_j), (K, 1 + D_j, 1 + D_j) and (T,).
+    settings : mapping of str to object
+        Parameters of :class:`~tpgmm_torch.TaskParameterizedGMM`, all of them.
+    holds : sequence of Hold
+        In the time of the skill.
+    **others
+        ``n_demonstrations``, ``peaks`` and ``summary`` of :class:`Learned`.
+
+    Raises
+    ------
+    DataError, ShapeError
+        If they are no mixture, or do not fit the operators.
+    """
+    weights, time = as_tensor(weights, "weights"), as_tensor(time, "time")
+    means = [as_tensor(mean, "a mean") for mean in means]
+    covariances = [as_tensor(covariance, "a covariance") for covariance in covariances]
+    operators, robot = check_operators(settings["operators"]), settings["robot"]
+    if robot is None:
+        raise DataError("the model has no robot: give it a Robot, Poses or a JointSpace")
+    if settings["fusion"] is not None:
+        settings["fusion"].check(operators, robot)
+    mixture = BlockGaussianMixture.from_parameters(
+        weights, means, covariances, **_of_mixture(settings, operators, robot)
+    )
+    # it checked them; what it keeps went through their factors, and was rounded
+    mixture.weights_, mixture.means_, mixture.covariances_ = weights, means, covariances
+    held = check_holds(holds, [hold.frame for hold in holds], robot.links)
+    kinematics = robot.to(time.dtype, settings["device"])
+    return Learned(mixture, operators, kinematics, time, held, **others)
+
+
+def _of_mixture(
+    settings: Mapping[str, Any], operators: Sequence[Operator], kinematics: Kinematics
+) -> dict[str, Any]:
+    """Parameters of the mixture of the local data of all operators."""
+    return {name: settings[name] for name in SHARED} | {
+        "blocks": block_widths(operators, kinematics),
+        "column_units": column_units(operators, kinematics),
+        "timed_blocks": True,
+    }
+
+
+def _report(
+    rows: TrainingRows,
+    episodes: Sequence[EpisodeSummary],
+    kinematics: Kinematics,
+    settings: Mapping[str, Any],
+) -> None:
+    """Warn once of what is implausible in the demonstrations; refuse what is impossible."""
+    full = settings["covariance_type"] in ("full", "tied")
+    correlated = full and settings["covariance_shrinkage"] == 0
+    findings = list(
+        check(episodes, kinematics, rows.operators, rows.holds, correlated=correlated)
+    )
+    if outlying := outlying_rows(rows, kinematics):
+        findings.append(unlike_the_others(outlying, rows.n_demonstrations))
+    report = Report.of(findings, f"{len(episodes)} demonstrations")
+    if rows.processes.rank == 0 or report.errors():
+        report.act()
