@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from torch import Tensor
 
@@ -25,12 +26,15 @@ class Estimate:
         Mixing weights h_i of the components.
     candidates : tuple of Candidate
         Each operator's own estimate; empty unless asked for.
+    after : Skill, optional
+        The skill for the next tick, if the one that made this estimate remembers something.
     """
 
     joints: Tensor
     covariance: Tensor
     activation: Tensor
     candidates: tuple[Candidate, ...] = ()
+    after: Any = None
 
     def __repr__(self) -> str:
         return (

@@ -33,12 +33,7 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians, quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.operators import (
-    AbsoluteOrientation,
-    Operator,
-    RelativeOrientation,
-    RelativePosition,
-)
+from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.stack import leaves
 from tpgmm_torch.regression.conditionals import Conditionals
 from tpgmm_torch.regression.estimate import Estimate
@@ -81,8 +76,8 @@ class PostureSearch:
     operators : sequence of Operator
     conditionals : sequence of Conditionals
         The components' Gaussians given time, as they are fused, one for each operator.
-    prior_std : float or Tensor of shape (n_joints,)
-        Of the prior N(q_{t-1}, .) where no operator determines every joint.
+    prior : Tensor of shape (n_joints,)
+        Precision of the prior around q_{t-1}: 0 where operators determine every joint.
     active : Tensor of bool, of shape (...), optional
         Robots whose regression is not trusted; None if there are none.
     minima, damping : Tensor of shape (K + 2, ..., n_joints) and (K + 2, ...), optional
@@ -95,7 +90,7 @@ class PostureSearch:
     kinematics: Kinematics
     operators: Sequence[Operator]
     conditionals: Sequence[Conditionals]
-    prior_std: float | Tensor
+    prior: Tensor
     active: Tensor | None = None
     minima: Tensor | None = None
     damping: Tensor | None = None
@@ -409,22 +404,14 @@ class PostureCost:
             mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
             term = Residual.of(operator.at(time), search.kinematics)
             self.local.append((term, mean, chosen.covariance))
-        closed = any(operator.determines_joints for operator in search.operators)
-        self.prior = None if closed else torch.as_tensor(search.prior_std).to(centre) ** -2
+        self.prior = search.prior
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (A, ...), downhill gradient (A, ..., n), and precision (A, ..., n, n)."""
         state = self.state_at(joints)
-        n = joints.shape[-1]
-        cost = joints.new_zeros(joints.shape[:-1])
-        vector, precision = torch.zeros_like(joints), joints.new_zeros(*joints.shape, n)
-        if self.prior is not None:
-            away = self.centre - joints
-            cost = cost + 0.5 * (self.prior * away.square()).sum(-1)
-            vector, precision = (
-                vector + self.prior * away,
-                precision + torch.diag_embed(self.prior.expand(n)),
-            )
+        away, n = self.centre - joints, joints.shape[-1]
+        cost = 0.5 * (self.prior * away.square()).sum(-1)
+        vector, precision = self.prior * away, self.prior.diag()
         first = not self.factors
         factors = []
         for j, (term, mean, covariance) in enumerate(self.local):
@@ -469,86 +456,53 @@ class Residual:
     operator : Operator
     starts : tuple of int
         Where the operator's quaternions begin.
-    blocks : Tensor of shape (Q, D), optional
-        Where the operator's quaternions are; None if it has none.
-    turns : Tensor of shape (Q, 3), optional
-        The rows of their displacements; None if they are not known.
-    half_gains : Tensor of shape (Q,)
-        Half of each quaternion operator's gain.
     leaves : tuple
-        Position and orientation operators that refer to a frame, and their first rows.
+        Position and orientation operators: each with the slices of its displacement and, of an
+        orientation, of its quaternion.
     """
 
     operator: Operator
     starts: tuple[int, ...]
-    blocks: Tensor | None
-    turns: Tensor | None
-    half_gains: Tensor
-    leaves: tuple[tuple[Any, int], ...]
+    leaves: tuple[tuple[Any, slice, slice | None], ...]
 
     @classmethod
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
-        like = kinematics.lower
-        starts = operator.quaternion_starts(kinematics)
-        size = operator.dimension(kinematics)
-        blocks = quaternions.quaternion_blocks(starts, size, like.dtype, like.device)
-        parts = leaves([operator])
-        rows, gains, relative, row = [], [], [], 0
+        parts: list[Any] = list(leaves([operator]))
+        found: list[tuple[Any, slice, slice | None]] = []
+        row, column = 0, 0
         for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
-            if leaf.rotation_vector_starts(kinematics):  # whose derivative is exact
-                row += 3
-                continue
-            if isinstance(leaf, AbsoluteOrientation | RelativeOrientation):
-                rows.append([row, row + 1, row + 2])
-                gains.append(leaf.gain / 2)
-            if isinstance(leaf, RelativePosition | RelativeOrientation):
-                relative.append((leaf, row))
-            row += 3
-        turns = torch.tensor(rows, device=like.device) if rows else None
-        return cls(
-            operator,
-            starts,
-            blocks if starts else None,
-            turns,
-            like.new_tensor(gains),
-            tuple(relative),
-        )
+            block = slice(column, column + 4) if leaf.gain is not None else None
+            if not leaf.rotation_vector_starts(kinematics):
+                found.append((leaf, slice(row, row + 3), block))
+            row, column = row + 3, column + leaf.dimension(kinematics)
+        return cls(operator, operator.quaternion_starts(kinematics), tuple(found))
 
     def __call__(
         self, mean: Tensor, state: RobotState, frames: Mapping[str, Frame]
     ) -> tuple[Tensor | None, Tensor, Tensor | None, Tensor | None]:
         """``M`` with the mean's signs, ``r``, minus its derivative (None: identity), noise."""
         at = self.operator.linearize(state, frames)
-        matrix, jacobian, flipped = at.matrix, at.jacobian, mean
-        if self.blocks is not None:
-            present = at.present
+        matrix, present = at.matrix, at.present
+        if self.starts:
             if present is None:
                 present = self.operator.coordinates(state, frames)
             signs = quaternions.hemisphere_signs(mean, present, self.starts)
-            flipped = mean * signs
-            if matrix is not None:
-                matrix = matrix * signs.unsqueeze(-2)
-        moved = flipped if at.matrix is None else (at.matrix @ flipped.unsqueeze(-1))[..., 0]
-        residual = moved + at.displacement
-        if jacobian is None:
-            return matrix, residual, None, at.noise
-        if self.turns is not None and self.blocks is not None:
-            assert present is not None  # there are quaternions
-            cosine = (flipped * present) @ self.blocks.mT * self.half_gains
-            turn = residual[..., self.turns] / 2
-            rows = jacobian[..., self.turns, :]
-            exact = cosine[..., None, None] * rows + _cross(turn, rows)
-            jacobian = jacobian.expand(*exact.shape[:-3], *jacobian.shape[-2:]).clone()
-            jacobian[..., self.turns, :] = exact
-        for leaf, row in self.leaves:
-            reference = leaf.moving_reference(state)
-            if reference is not None:
-                swing = state.angular_jacobian(reference)
-                part = slice(row, row + 3)
-                if self.turns is None:
-                    jacobian = jacobian.expand(*residual.shape, -1).clone()
-                jacobian[..., part, :] += _cross(residual[..., part], swing)
+            mean = mean * signs
+            matrix = None if matrix is None else matrix * signs.unsqueeze(-2)
+        moved = mean if at.matrix is None else (at.matrix @ mean.unsqueeze(-1))[..., 0]
+        residual, jacobian = moved + at.displacement, at.jacobian
+        if jacobian is None or not self.leaves:
+            return matrix, residual, jacobian, at.noise
+        jacobian = jacobian.expand(*residual.shape, -1).clone()
+        for leaf, rows, block in self.leaves:
+            still, own = residual[..., rows], jacobian[..., rows, :]
+            if block is not None:
+                assert present is not None  # there are quaternions
+                cosine = (mean[..., block] * present[..., block]).sum(-1)[..., None, None]
+                jacobian[..., rows, :] = leaf.gain / 2 * cosine * own + _cross(still / 2, own)
+            if (reference := leaf.moving_reference(state)) is not None:
+                jacobian[..., rows, :] += _cross(still, state.angular_jacobian(reference))
         return matrix, residual, jacobian, at.noise
 
 

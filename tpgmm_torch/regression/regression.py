@@ -175,37 +175,20 @@ class Regression:
         count for them.
         """
         if candidates:
-            whole = self.kinematics.state(state) if isinstance(state, Tensor) else state
-            estimate = self.estimate(time, whole, frames, bounds)
-            own = self.candidates(time, whole, frames, estimate)
-            return replace(estimate, candidates=own)
-        given = state if isinstance(state, RobotState) else None
+            state = self._state(state)
         joints = state.joints if isinstance(state, RobotState) else state
         poses = {name: frames[name] for name in self.frame_names if name in frames}
         shapes = [joints.shape[:-1], *(pose.batch_shape for pose in poses.values())]
         batch = gaussians.common_shape(*shapes, *([time.shape] if time.ndim else []))
         if batch.numel() <= PART or time.is_cuda:
-            whole = self.kinematics.state(joints) if given is None else given
-            return self.bounded(self._unbounded(time, whole, frames), bounds)
-        if given is not None:
-            given = given.flatten(batch)
-        joints = joints.expand(*batch, -1).flatten(0, -2)
-        poses = {name: pose.expand(batch).flatten() for name, pose in poses.items()}
-        time = time.expand(batch).flatten() if time.ndim else time
-        order = time.argsort() if time.ndim else torch.arange(batch.numel())
-        parts = []
-        for part in order.split(PART):
-            some = self.kinematics.state(joints[part]) if given is None else given[part]
-            here = {name: pose[part] for name, pose in poses.items()}
-            parts.append(self._unbounded(time[part] if time.ndim else time, some, here))
-        back = order.argsort()
-        mean = torch.cat([part.joints for part in parts])[back].unflatten(0, batch)
-        covariance = torch.cat([part.covariance for part in parts])[back].unflatten(0, batch)
-        activation = parts[0].activation
-        if activation.ndim > 1:
-            activation = torch.cat([part.activation for part in parts])[back]
-            activation = activation.unflatten(0, batch)
-        return self.bounded(Estimate(mean, covariance, activation), bounds)
+            found = self._unbounded(time, state, frames)
+        else:
+            found = self._in_parts(batch, time, state, poses)
+        found = self.bounded(found, bounds)
+        if candidates:
+            own = self.candidates(time, self._state(state), frames, found)
+            found = replace(found, candidates=own)
+        return found
 
     def fuse(
         self,
@@ -240,8 +223,12 @@ class Regression:
 
     def expected(self, operator: int, time: Tensor) -> Tensor:
         """Local coordinates (T, D_j) that one operator expects at times of shape (T,)."""
-        weights = torch.softmax(self._marginals.log_activation(time.unsqueeze(-1)), -1)
-        return (weights.unsqueeze(-2) @ self.conditionals[operator].at(time)).squeeze(-2)
+        means = self.conditionals[operator].at(time)
+        return (self.weights_at(time).unsqueeze(-2) @ means).squeeze(-2)
+
+    def weights_at(self, time: Tensor) -> Tensor:
+        """Mixing weights h_i (..., K) at times of shape (...)."""
+        return torch.softmax(self.marginals.log_activation(time.unsqueeze(-1)), -1)
 
     def log_likelihood(
         self,
@@ -253,7 +240,7 @@ class Regression:
         """Log-density of observed robots at times; see :meth:`Skill.log_likelihood`."""
         key = times.numpy(force=True).tobytes()
         if key not in self._likelihoods:
-            parts = self.kinematics, self.operators, self.conditionals, self._marginals
+            parts = self.kinematics, self.operators, self.conditionals, self.marginals
             with torch.inference_mode(False):
                 self._likelihoods[key] = TimeLikelihood(*parts, times)
         with torch.inference_mode():
@@ -264,9 +251,40 @@ class Regression:
 
         Of a stack of operators, those of which all frames and links are observed are kept.
         """
-        if names not in self._observed:
-            self._observed[names] = self._restricted(names)
-        return self._observed[names]
+        if names in self._observed:
+            return self._observed[names]
+        every = [
+            self._part(operator, one, names)
+            for operator, one in zip(self.operators, self.conditionals, strict=True)
+        ]
+        kept = [index for index, part in enumerate(every) if part is not None]
+        parts = [part for part in every if part is not None]
+        found: Regression | None = None
+        if [operator for operator, _ in parts] == list(self.operators):
+            found = self
+        elif parts:
+            operators, conditionals = zip(*parts, strict=True)
+            fusion = self.fusion
+            if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
+                fusion = replace(fusion, priorities=[fusion.priorities[k] for k in kept])
+            found = replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
+        self._observed[names] = found
+        return found
+
+    def _part(
+        self, operator: Operator, one: Conditionals, names: frozenset[str]
+    ) -> tuple[Operator, Conditionals] | None:
+        """What of an operator needs no other frames and links than these."""
+        members = leaves([operator])
+        there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
+        if all(there):
+            return operator, one
+        if not any(there):
+            return None
+        sizes = [leaf.dimension(self.kinematics) for leaf in members]
+        columns = torch.from_numpy(np.flatnonzero(np.repeat(there, sizes)))
+        seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
+        return Stack(*seen), one.marginal(columns)
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Regression:
         """The same for all robots; see :meth:`Skill.start`."""
@@ -282,7 +300,8 @@ class Regression:
 
     def posture_search(self) -> PostureSearch:
         """Search for the nearest posture; see :meth:`Skill.posture_search`."""
-        return PostureSearch(self.kinematics, self.operators, self.fused, self.prior_std)
+        parts = self.kinematics, self.operators, self.fused
+        return PostureSearch(*parts, self.free_precision)
 
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None
@@ -302,7 +321,7 @@ class Regression:
         -------
         Tensor of shape (T,)
         """
-        total = self._marginals.log_activation(time.unsqueeze(-1)) - 0.5 * math.log(2 * math.pi)
+        total = self.marginals.log_activation(time.unsqueeze(-1)) - 0.5 * math.log(2 * math.pi)
         for one, coordinates in zip(self.conditionals, local, strict=True):
             total = total + one.log_density(coordinates, time, n_samples)
         return torch.logsumexp(total, -1)
@@ -376,27 +395,21 @@ class Regression:
         where the joints are then depends on the situation, and few of them show too little of
         it: where a new one is turned otherwise, joints would hold the hands back.
         """
-        scales = [1.0] * len(self.operators)
-        if self.fusion.priorities is not None:
-            levels = sorted(set(self.fusion.priorities))
-            scales = [STRICT ** levels.index(one) for one in self.fusion.priorities]
-        wider = math.sqrt(predictive_scale(self.n_samples))
-        if all(isinstance(leaf, Canonical) for leaf in leaves(self.operators)):
-            wider = 1.0  # there is nobody to give way to
+        priorities = self.fusion.priorities or [0] * len(self.operators)
+        levels = sorted(set(priorities))
+        alone = all(isinstance(leaf, Canonical) for leaf in leaves(self.operators))
+        wider = 1.0 if alone else math.sqrt(predictive_scale(self.n_samples))
         fused = []
         # what is made while inference mode is on could not serve where gradients are wanted
         with torch.inference_mode(False):
-            for one, operator, own in zip(
-                self.conditionals, self.operators, scales, strict=True
-            ):
-                widths = one.covariance.new_tensor(
-                    [
-                        wider if isinstance(leaf, Canonical) else 1.0
-                        for leaf in leaves([operator])
-                        for _ in range(leaf.dimension(self.kinematics))
-                    ]
-                )
-                covariance = one.covariance * widths[:, None] * widths * own
+            parts = zip(self.conditionals, self.operators, priorities, strict=True)
+            for one, operator, priority in parts:
+                members = leaves([operator])
+                widths = [wider if isinstance(leaf, Canonical) else 1.0 for leaf in members]
+                sizes = [leaf.dimension(self.kinematics) for leaf in members]
+                scale = one.covariance.new_tensor(np.repeat(widths, sizes))
+                own = STRICT ** levels.index(priority)
+                covariance = one.covariance * scale[:, None] * scale * own
                 fused.append(replace(one, covariance=covariance))
         return tuple(fused)
 
@@ -411,15 +424,17 @@ class Regression:
             return KalmanUpdate(self.kinematics, self.operators, self.fused)
 
     @cached_property
-    def prior_std(self) -> Tensor:
-        """Standard deviations (n_joints,) of the prior where joints are left free."""
+    def free_precision(self) -> Tensor:
+        """Precision (n_joints,) of the prior around q_{t-1}: 0 where operators determine it."""
+        if any(one.determines_joints for one in self.operators):
+            return torch.zeros_like(self.kinematics.lower)
         return prior_widths(
             self.fusion.prior_std,
             self.kinematics,
             self.operators,
             self.conditionals,
             self.log_weights.exp(),
-        )
+        ).pow(-2)
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -439,37 +454,9 @@ class Regression:
     def _observed(self) -> dict[frozenset[str], Regression | None]:
         return {}
 
-    def _restricted(self, names: frozenset[str]) -> Regression | None:
-        """The mixture of those operators that need no other frames and links than these."""
-        operators: list[Operator] = []
-        conditionals: list[Conditionals] = []
-        kept: list[int] = []
-        for index, operator in enumerate(self.operators):
-            members = leaves([operator])
-            there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
-            if not any(there):
-                continue
-            one = self.conditionals[index]
-            if not all(there):
-                sizes = [leaf.dimension(self.kinematics) for leaf in members]
-                columns = np.flatnonzero(np.repeat(there, sizes))
-                one = one.marginal(torch.from_numpy(columns))
-                seen = [leaf for leaf, known in zip(members, there, strict=True) if known]
-                operator = Stack(*seen)
-            operators.append(operator)
-            conditionals.append(one)
-            kept.append(index)
-        if operators == list(self.operators):
-            return self
-        if not operators:
-            return None
-        fusion = self.fusion
-        if isinstance(fusion, InformationFusion) and fusion.priorities is not None:
-            fusion = replace(fusion, priorities=[fusion.priorities[index] for index in kept])
-        return replace(self, operators=operators, conditionals=conditionals, fusion=fusion)
-
     @cached_property
-    def _marginals(self) -> TimeMarginals:
+    def marginals(self) -> TimeMarginals:
+        """The components' weights over time."""
         first = self.conditionals[0]
         with torch.inference_mode(False):
             return TimeMarginals.of(self.log_weights, first.time_mean, first.time_variance)
@@ -482,7 +469,7 @@ class Regression:
             conditionals = (self._update.conditionals,)
         index = torch.arange(len(self.log_weights), device=self.log_weights.device)
         places = torch.eye(len(index), dtype=self.log_weights.dtype, device=index.device)
-        return Components(index, places, self._marginals, conditionals)
+        return Components(index, places, self.marginals, conditionals)
 
     @cached_property
     def _active(self) -> ActiveComponents | None:
@@ -491,7 +478,7 @@ class Regression:
         fusion = self.fusion
         if fusion.activation != "time" or fusion.negligible == 0 or learning:
             return None  # while learning, it would cost more than it saves
-        return ActiveComponents(self._marginals, fusion.negligible)
+        return ActiveComponents(self.marginals, fusion.negligible)
 
     @cached_property
     def _selected(self) -> dict[tuple[int, ...], Components]:
@@ -543,12 +530,46 @@ class Regression:
             curvature = curvature + 1 / one.time_variance
         return self.log_weights + 0.5 * (curvature.log() - slope.square() / curvature)
 
+    def _state(self, state: Tensor | RobotState) -> RobotState:
+        return state if isinstance(state, RobotState) else self.kinematics.state(state)
+
     def _unbounded(
-        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame]
+        self, time: Tensor, state: Tensor | RobotState, frames: Mapping[str, Frame]
     ) -> Estimate:
         components = self._components_at(time)
-        joints, covariance, weights = self.fuse(components, time, state, frames)
+        joints, covariance, weights = self.fuse(components, time, self._state(state), frames)
         return Estimate(joints, covariance, weights @ components.places)
+
+    def _in_parts(
+        self,
+        batch: torch.Size,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+    ) -> Estimate:
+        """Of many robots, part by part, of those that are at about the same time."""
+        if isinstance(state, RobotState):
+            state = state.flatten(batch)
+        else:
+            state = state.expand(*batch, -1).flatten(0, -2)
+        poses = {name: pose.expand(batch).flatten() for name, pose in frames.items()}
+        time = time.expand(batch).flatten() if time.ndim else time
+        order = time.argsort() if time.ndim else torch.arange(batch.numel())
+        parts = []
+        for part in order.split(PART):
+            here = {name: pose[part] for name, pose in poses.items()}
+            parts.append(self._unbounded(time[part] if time.ndim else time, state[part], here))
+        back = order.argsort()
+
+        def whole(name: str) -> Tensor:
+            return torch.cat([getattr(one, name) for one in parts])[back].unflatten(0, batch)
+
+        activation = parts[0].activation  # one of all, where they are at one time
+        return Estimate(
+            whole("joints"),
+            whole("covariance"),
+            whole("activation") if activation.ndim > 1 else activation,
+        )
 
     @staticmethod
     def bounded(estimate: Estimate, bounds: tuple[Tensor, Tensor] | None) -> Estimate:
@@ -601,9 +622,6 @@ class Regression:
         precision, vector, square = (
             sum(parts[1:], start=parts[0]) for parts in zip(*terms, strict=True)
         )
-        determined = any(one.determines_joints for one in self.operators)
-        if isinstance(self.fusion, InformationFusion) and not determined:
-            like = state.joints
-            identity = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
-            precision = precision + identity / self.prior_std**2
+        if isinstance(self.fusion, InformationFusion):
+            precision = precision + self.free_precision.diag()
         return precision, vector, square

@@ -65,7 +65,7 @@ def rotation_log_density(
             four = True
     if not four:
         return total
-    activation = torch.log_softmax(regression._marginals.log_activation(time[:, None]), -1)
+    activation = torch.log_softmax(regression.marginals.log_activation(time[:, None]), -1)
     return total - torch.logsumexp(activation + constant, -1)
 
 

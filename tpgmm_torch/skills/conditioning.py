@@ -179,6 +179,13 @@ class Conditioning:
         nothing = (None,) * len(clusters)
         return cls(regression, tuple(points), fade, None, tuple(clusters), nothing)
 
+    def of_robots(self, regression: Regression, robots: Tensor) -> Self:
+        """The same of some ``robots`` of the batch, with their ``regression``."""
+        if self.shift is None or self.shift.ndim == 1:
+            return replace(self, regression=regression)
+        moved = tuple(None if one is None else one[robots] for one in self.moved)
+        return replace(self, regression=regression, shift=self.shift[robots], moved=moved)
+
     def advance(
         self,
         time: Tensor,
@@ -224,7 +231,7 @@ class Conditioning:
                 shift, covariance = shift + moved, covariance - narrowed
             moved_by.append(there)
         given = replace(estimate, joints=here.joints + shift, covariance=covariance)
-        conditioned = self.regression.bounded(given, bounds)
+        conditioned = Regression.bounded(given, bounds)
         return conditioned, replace(self, shift=shift, moved=tuple(moved_by))
 
     def missed(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -10,15 +9,11 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.motion.minimum_jerk import minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
-from tpgmm_torch.regression.estimate import Estimate
-from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.skills.skill import CompositeSkill, Skill
 
 __all__ = ["Sequence"]
@@ -104,28 +99,6 @@ class Sequence(CompositeSkill):
         }
         return replace(first, frames=later | {**first.frames})
 
-    def estimate(
-        self,
-        time: Tensor,
-        state: Tensor | RobotState,
-        frames: Mapping[str, Frame],
-        bounds: tuple[Tensor, Tensor] | None = None,
-    ) -> Estimate:
-        """See :meth:`Skill.estimate`."""
-        shares = self.shares(time)
-        active = [k for k in range(len(self.skills)) if bool((shares[..., k] > 0).any())]
-        several = [self.skills[k].estimate(time, state, frames, bounds) for k in active]
-        if len(active) == 1:
-            return replace(several[0], activation=shares)
-        batch = gaussians.common_shape(*(one.joints.shape[:-1] for one in several))
-        weights = shares[..., active].expand(*batch, -1)
-        means = torch.stack([one.joints.expand(*batch, -1) for one in several], -2)
-        covariances = torch.stack(
-            [one.covariance.expand(*batch, *one.covariance.shape[-2:]) for one in several], -3
-        )
-        mean, covariance = gaussians.moment_match(weights, means, covariances)
-        return Estimate(mean, covariance, shares.expand(*batch, -1))
-
     def shares(self, time: Tensor) -> Tensor:
         """Shares (..., n_skills) of the skills at times (...); their sum is 1."""
         seams = time.new_tensor([one.end for one in self.skills[:-1]])
@@ -137,22 +110,8 @@ class Sequence(CompositeSkill):
         """The skill that has the largest share at a time [s]."""
         return self.skills[int(self.shares(self.time.new_tensor(time)).argmax())]
 
-    def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
-    ) -> Tensor:
-        """See :meth:`Skill.log_likelihood`."""
-        each = torch.stack(
-            [one.log_likelihood(times, state, frames, window) for one in self.skills], -1
-        )
-        own = self.shares(times[window]).argmax(-1)
-        return each.gather(-1, own.expand(each.shape[:-1]).unsqueeze(-1)).squeeze(-1)
-
     def observed(self, names: frozenset[str]) -> Skill | None:
         """See :meth:`Skill.observed`."""
         several = [one.observed(names) for one in self.skills]
         known = tuple(one for one in several if one is not None)
-        return Sequence(known, self.fade) if len(known) == len(several) else None
+        return self.with_skills(known) if len(known) == len(several) else None

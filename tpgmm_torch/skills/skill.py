@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, Self
 
+import torch
 from torch import Tensor
 
+from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
@@ -210,11 +212,15 @@ class Skill(Protocol):
         estimate : Estimate
             What :meth:`estimate` returned at this tick.
         """
-        return self
+        after: Skill | None = estimate.after
+        return self if after is None else after
 
 
 class CompositeSkill(Skill):
-    """A skill made of several others of one robot.
+    """A skill made of others of one robot, and mixed of them by their weights.
+
+    What they remember is handed on: where one of them starts, advances or is of fewer robots,
+    that of which it is a part does.
 
     Attributes
     ----------
@@ -244,3 +250,75 @@ class CompositeSkill(Skill):
     def carried_names(self) -> tuple[str, ...]:
         """See :attr:`Skill.carried_names`."""
         return tuple(dict.fromkeys(name for one in self.skills for name in one.carried_names))
+
+    def shares(self, time: Tensor) -> Tensor:
+        """Weights (..., n_skills) of the skills at times of shape (...), or of robots."""
+        raise NotImplementedError
+
+    def time_of(self, index: int, time: Tensor) -> Tensor:
+        """A time of this skill, on the clock of one of its skills."""
+        return time
+
+    def with_skills(self, skills: Iterable[Any]) -> Self:
+        """The same of other skills, if they are others."""
+        others = tuple(skills)
+        if all(one is other for one, other in zip(self.skills, others, strict=True)):
+            return self
+        whole: Any = self
+        made: Self = replace(whole, skills=others)
+        return made
+
+    def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Self:
+        """See :meth:`Skill.start`."""
+        return self.with_skills(one.start(joints, frames) for one in self.skills)
+
+    def of_robots(self, robots: Tensor) -> Self:
+        """See :meth:`Skill.of_robots`."""
+        return self.with_skills(one.of_robots(robots) for one in self.skills)
+
+    def estimate(
+        self,
+        time: Tensor,
+        state: Tensor | RobotState,
+        frames: Mapping[str, Frame],
+        bounds: tuple[Tensor, Tensor] | None = None,
+    ) -> Estimate:
+        """See :meth:`Skill.estimate`; the activation is that of the skills."""
+        shares, skills = self.shares(time.to(self.kinematics.lower)), list(self.skills)
+        active = shares.reshape(-1, len(self.skills)).any(0).nonzero()[:, 0].tolist()
+        several = []
+        for k in active:
+            one = skills[k].estimate(self.time_of(k, time), state, frames, bounds)
+            several.append(one)
+            skills[k] = skills[k].advance(one)
+        after = self.with_skills(skills)
+        if len(active) == 1:
+            return replace(several[0], activation=shares, candidates=(), after=after)
+        batch = gaussians.common_shape(
+            shares.shape[:-1], *(one.joints.shape[:-1] for one in several)
+        )
+        shares = shares.expand(*batch, -1)
+        means = torch.stack([one.joints.expand(*batch, -1) for one in several], -2)
+        covariances = torch.stack(
+            [one.covariance.expand(*batch, *one.covariance.shape[-2:]) for one in several], -3
+        )
+        mean, covariance = gaussians.moment_match(shares[..., active], means, covariances)
+        return Estimate(mean, covariance, shares, after=after)
+
+    def log_likelihood(
+        self,
+        times: Tensor,
+        state: RobotState,
+        frames: Mapping[str, Frame],
+        window: slice = slice(None),
+    ) -> Tensor:
+        """See :meth:`Skill.log_likelihood`: of the skill with the largest share."""
+        each = torch.stack(
+            [
+                one.log_likelihood(self.time_of(k, times), state, frames, window)
+                for k, one in enumerate(self.skills)
+            ],
+            -1,
+        )
+        own = self.shares(times[window]).argmax(-1).to(each.device)
+        return each.gather(-1, own.expand(each.shape[:-1]).unsqueeze(-1)).squeeze(-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -21,14 +21,6 @@ from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_point import ViaPoint
 
 __all__ = ["ViaPoints"]
-
-
-@dataclass(frozen=True, eq=False)
-class ConditionedEstimate(Estimate):
-    """An estimate given via-points, the skill's own, and where the next one starts from."""
-
-    unconditioned: Estimate | None = None
-    conditioning: Conditioning | None = None
 
 
 class ViaPoints:
@@ -105,19 +97,25 @@ class ViaPoints:
         estimate, after = self.conditioning.advance(time, unconditioned, frames, bounds, holds)
         mean, covariance, activation = estimate.joints, estimate.covariance, estimate.activation
         own = unconditioned.candidates
-        return ConditionedEstimate(mean, covariance, activation, own, unconditioned, after)
+        skill = self.skill.advance(unconditioned)
+        remembers = self._with(skill, replace(after, regression=skill))
+        return Estimate(mean, covariance, activation, own, remembers)
 
     def start(self, joints: Tensor, frames: Mapping[str, Frame]) -> Skill:
         """Conditioned on the same points; see :meth:`Skill.start`."""
         return ViaPoints(self.skill.start(joints, frames), self.points, self.fade)
 
+    def of_robots(self, robots: Tensor) -> Skill:
+        """See :meth:`Skill.of_robots`."""
+        skill = self.skill.of_robots(robots)
+        return self._with(skill, self.conditioning.of_robots(skill, robots))
+
     def advance(self, estimate: Estimate) -> Skill:
         """Go on from the last conditioned estimate; see :meth:`Skill.advance`."""
-        if not isinstance(estimate, ConditionedEstimate) or estimate.conditioning is None:
-            return self
-        assert estimate.unconditioned is not None
-        skill = self.skill.advance(estimate.unconditioned)
-        conditioning = replace(estimate.conditioning, regression=skill)
+        after: Skill | None = estimate.after
+        return self if after is None else after
+
+    def _with(self, skill: Any, conditioning: Conditioning) -> ViaPoints:
         other = object.__new__(type(self))
         vars(other).update(vars(self), skill=skill, conditioning=conditioning)
         return other

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch import gaussians
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
@@ -162,9 +161,10 @@ class Ways(CompositeSkill):
 
     def of_robots(self, robots: Tensor) -> Self:
         """See :meth:`Skill.of_robots`."""
-        if self.chosen is None or self.chosen.ndim == 0:
-            return self
-        return replace(self, chosen=self.chosen[robots])
+        some = super().of_robots(robots)
+        if some.chosen is None or some.chosen.ndim == 0:
+            return some
+        return replace(some, chosen=some.chosen[robots])
 
     def choose(self, joints: Any, frames: Mapping[str, Frame]) -> list[WayChoice]:
         """The way for each robot, and why; each way is tried on a coarse grid of time.
@@ -211,51 +211,22 @@ class Ways(CompositeSkill):
         bounds: tuple[Tensor, Tensor] | None = None,
     ) -> Estimate:
         """See :meth:`Skill.estimate`: each robot's by its way."""
-        joints = state.joints if isinstance(state, RobotState) else state
-        ways = self.start(joints, frames).chosen if self.chosen is None else self.chosen
-        assert ways is not None
-        found: Estimate | None = None
-        width = max(len(one.log_weights) for one in self.skills)
-        for way in ways.unique().tolist():
-            skill = self.skills[way]
-            one = skill.estimate(self.time_of(way, time), state, frames, bounds)
-            spare = width - one.activation.shape[-1]
-            padded = torch.nn.functional.pad(one.activation, (0, spare))
-            if found is None:
-                found = Estimate(one.joints, one.covariance, padded)
-                continue
-            batch = gaussians.common_shape(one.joints.shape[:-1], ways.shape)
-            own = (ways == way).to(joints.device).expand(batch).unsqueeze(-1)
-            found = Estimate(
-                torch.where(own, one.joints, found.joints),
-                torch.where(own.unsqueeze(-1), one.covariance, found.covariance),
-                torch.where(own, padded, found.activation),
-            )
-        assert found is not None
-        return found
+        if self.chosen is None:
+            joints = state.joints if isinstance(state, RobotState) else state
+            return self.start(joints, frames).estimate(time, state, frames, bounds)
+        return super().estimate(time, state, frames, bounds)
 
-    def time_of(self, way: int, time: Tensor) -> Tensor:
+    def shares(self, time: Tensor) -> Tensor:
+        """1 (..., n_ways) for the way of each robot, 0 for others; the first if unknown."""
+        ways = torch.zeros((), dtype=torch.long) if self.chosen is None else self.chosen
+        shares = torch.eye(len(self.skills), dtype=time.dtype, device=time.device)
+        return shares[ways.to(time.device)]
+
+    def time_of(self, index: int, time: Tensor) -> Tensor:
         """A time of the skill, on the clock of one of its ways."""
-        own = self.skills[way]
+        own = self.skills[index]
         share = (time - self.begin) / (self.end - self.begin)
         return own.begin + share * (own.end - own.begin)
-
-    def log_likelihood(
-        self,
-        times: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        window: slice = slice(None),
-    ) -> Tensor:
-        """See :meth:`Skill.log_likelihood`: each robot's by its way."""
-        ways = torch.zeros(()) if self.chosen is None else self.chosen
-        skills: Any = self.skills
-        each = [
-            one.log_likelihood(self.time_of(k, times), state, frames, window)
-            for k, one in enumerate(skills)
-        ]
-        own = ways.flatten().long().expand(len(each[0]))
-        return torch.stack(each)[own, torch.arange(len(own))]
 
 
 def _novelty(skill: Regression, joints: Tensor, frames: Mapping[str, Frame]) -> Array:

@@ -157,7 +157,7 @@ def test_states_may_be_given():
     assert all(torch.equal(one, other) for one, other in zip(given, plain, strict=True))
 
 
-def test_a_search_that_ended_begins_anew_where_the_robot_is():
+def test_a_search_that_ended_begins_where_the_robot_is():
     start = torch.stack((neutral(), neutral() + 0.05))
     _, search = searched(REACHED, start, 3)
     elsewhere = start - 0.2

@@ -51,7 +51,7 @@ def test_the_density_is_normalised_over_rotations(geometry, spread):
     if geometry == "quaternion":
         local = quaternions.match_hemisphere(local, regression.expected(0, now[None]))
     time = now.expand(count)
-    marginal = regression._marginals.log_activation(now[None]).logsumexp(-1)
+    marginal = regression.marginals.log_activation(now[None]).logsumexp(-1)
     log_time = marginal - 0.5 * math.log(2 * math.pi)
     # one instant has one normalisation
     first = rotation_log_density(regression, time[:1], [local[:1]], 4000)

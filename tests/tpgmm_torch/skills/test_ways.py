@@ -4,8 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.two_ways import Handles, Obstacle, another_handle_each, fitted
-from tpgmm_torch import Controller, Frame, Situation, Ways, rollout
+from tests.support.two_ways import (
+    Handles,
+    Obstacle,
+    another_handle_each,
+    fitted,
+    reach_of_one_handle,
+)
+from tpgmm_torch import Controller, Frame, Sequence, Situation, ViaPoints, Ways, rollout
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 
@@ -83,3 +89,44 @@ def test_ways_that_do_not_fit_together_are_refused():
             Ways((one, one), weights, limits)
     with pytest.raises(DataError):
         Ways(())
+
+
+@pytest.mark.filterwarnings("ignore:.*one thing is implausible")  # one handle is far away
+def test_the_way_is_one_that_the_robot_can_do():
+    ways, chosen = fitted(Handles).skill_, set()
+    for situation in (*reach_of_one_handle(2), *reach_of_one_handle(2, angles=(-0.6, 0))):
+        [choice] = ways.choose(situation.joints, situation.frames)
+        assert choice.misfit[1 - choice.way] > choice.misfit[choice.way]
+        assert choice.probabilities[choice.way] > 0.9
+        chosen.add(choice.way)
+        # what was shown more often does not help the arm to reach
+        other = np.where(np.arange(2) == choice.way, 0.01, 0.99)
+        biased = Ways(ways.skills, tuple(other), ways.limits)
+        assert biased.choose(situation.joints, situation.frames)[0].way == choice.way
+    assert chosen == {0, 1}
+
+
+@pytest.mark.filterwarnings("ignore:.*one thing is implausible")
+@pytest.mark.parametrize(
+    "wrapped",
+    [lambda ways: Sequence((ways,)), lambda ways: ViaPoints(ways, ["1.5:canonical=wrist:0.7"])],
+    ids=["sequence", "via-points"],
+)
+def test_ways_inside_of_other_skills_are_chosen_for_each_robot(wrapped):
+    ways, situations = fitted(Handles).skill_, another_handle_each()
+    starts = torch.stack([one.joints for one in situations])
+    frames = {"object": Frame.stack([one.frames["object"] for one in situations])}
+    begun = wrapped(ways).start(starts, frames)
+    inner = begun.skill if isinstance(begun, ViaPoints) else begun.skills[0]
+    assert sorted(inner.chosen.tolist()) == [0, 1]
+    now = torch.tensor(1.2, dtype=torch.float64)
+    together = begun.estimate(now, starts, frames)
+    after = begun.advance(together)
+    for row in range(2):
+        only = torch.arange(2) == row
+        frame = {"object": frames["object"][only]}
+        alone = begun.of_robots(only).estimate(now, starts[only], frame)
+        torch.testing.assert_close(alone.joints[0], together.joints[row], rtol=0, atol=1e-9)
+        again = after.of_robots(only).estimate(now + 0.1, starts[only], frame)
+        both = after.estimate(now + 0.1, starts, frames)
+        torch.testing.assert_close(again.joints[0], both.joints[row], rtol=0, atol=1e-9)

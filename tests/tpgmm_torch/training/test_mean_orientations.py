@@ -245,7 +245,7 @@ def test_the_density_is_normalised_over_rotations():
     local = operator.at(time[0]).coordinates(state, {})
     volume = torch.linalg.det(quaternions.left_jacobian(local))
     when = regression.log_density(time[:1], [local[:1]])  # of time alone, without the rotation
-    marginals = regression._marginals.log_activation(time[:1, None]).logsumexp(-1)
+    marginals = regression.marginals.log_activation(time[:1, None]).logsumexp(-1)
     log_time = marginals - 0.5 * math.log(2 * math.pi)
     assert bool(when.isfinite())
     density = (regression.log_density(time, [local]) - log_time).exp() / volume
