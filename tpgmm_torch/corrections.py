@@ -21,14 +21,14 @@ __all__ = ["in_skill_time"]
 
 #: What differs by this [rad], [m], or is twice as fast or slow, is one unit apart.
 JOINTS, LINKS, SLOPE = 0.1, 0.05, math.log(2.0)
-#: A person is at most so many times slower or faster than the skill.
-MOST = 4.0
-#: Instants of the skill that are compared, at most.
-STEPS = 400
 
 
 def in_skill_time(
-    model: TaskParameterizedGMM, demonstrations: Sequence[Demonstration]
+    model: TaskParameterizedGMM,
+    demonstrations: Sequence[Demonstration],
+    *,
+    max_slope: float = 4.0,
+    n_steps: int = 400,
 ) -> list[Demonstration]:
     """Bring what a person showed into the time of a skill, to fit it with the demonstrations.
 
@@ -44,6 +44,10 @@ def in_skill_time(
         Fitted.
     demonstrations : sequence of Demonstration
         Each of at least two time steps, on a clock of its own.
+    max_slope : float, default=4.0
+        How many times slower or faster than the skill a person may be.
+    n_steps : int, default=400
+        At how many instants of the skill, at most, they are compared; the cost is their square.
 
     Returns
     -------
@@ -66,15 +70,20 @@ def in_skill_time(
     (0.5, 1.5)
     """
     skill: Any = model.skill
-    return [_placed(skill, one, number) for number, one in enumerate(demonstrations)]
+    return [
+        _placed(skill, one, number, max_slope, n_steps)
+        for number, one in enumerate(demonstrations)
+    ]
 
 
-def _placed(skill: Skill, shown: Demonstration, number: int) -> Demonstration:
+def _placed(
+    skill: Skill, shown: Demonstration, number: int, max_slope: float, n_steps: int
+) -> Demonstration:
     kinematics, grid = skill.kinematics, skill.time
     if len(shown) < 2:
         raise DataError(f"demonstration {number} has one time step: it shows no motion")
     shown = shown.reordered(kinematics.joint_names)
-    count = min(STEPS, max(len(grid), 2))
+    count = min(n_steps, max(len(grid), 2))
     time = torch.linspace(float(grid[0]), float(grid[-1]), count, dtype=grid.dtype)
     situation = Situation(shown.joints[0], Situation.of(shown).frames, time)
     with warnings.catch_warnings():
@@ -88,11 +97,12 @@ def _placed(skill: Skill, shown: Demonstration, number: int) -> Demonstration:
     lasts = instants[None, :] - instants[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = np.log(lasts / shown.duration)
-    possible = np.abs(slope) <= math.log(MOST)
+    possible = np.abs(slope) <= math.log(max_slope)
     if not possible.any():
         raise DataError(
-            f"demonstration {number} lasts {shown.duration:.4g} s, more than {MOST:g} times as "
-            f"long or short as any part of the skill of {instants[-1] - instants[0]:.4g} s"
+            f"demonstration {number} lasts {shown.duration:.4g} s, more than {max_slope:g} "
+            "times as long or short as any part of the skill of "
+            f"{instants[-1] - instants[0]:.4g} s"
         )
     cost = begin[:, None] + end[None, :] + (slope / SLOPE) ** 2
     first, last = np.unravel_index(np.where(possible, cost, np.inf).argmin(), cost.shape)

@@ -16,13 +16,13 @@ from scipy.signal import find_peaks
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import SMOOTHING, Demonstration
+from tpgmm_torch.data.frames import LEVER, STILL
 from tpgmm_torch.data.pose_names import is_gripper, pose_groups, words
 from tpgmm_torch.training.hold_detection import find_holds
 
 __all__ = [
     "LEAST_CONFIDENCE",
-    "LEVER",
     "Boundary",
     "between_levels",
     "crossing_time",
@@ -40,26 +40,13 @@ __all__ = [
 
 #: Confidence, from 0 to 1, below which nothing is an event.
 LEAST_CONFIDENCE = 0.2
-#: A robot rests below this share of the smaller one of its peak speeds before and after, and
-#: moves above the second; slower than the third share of the peak speed is noise.
-REST, MOTION, NOISE = 0.15, 0.5, 0.005
-#: Events so far from a stop, as a share of the duration, happen at the stop.
-NEAR = 0.05
-#: Speeds are means over so long [s], and over this share of the duration, at least.
-SMOOTHING, SHARE = 0.15, 0.015
-#: Turning a link by one radian counts as this distance [m].
-LEVER = 0.2
+#: Slower than this share of the peak speed is noise.
+NOISE = 0.005
 #: A signal has come to its high level (1) above this share of the way, and is back at its low
 #: one (0) below the rest of it.
 ON = 0.65
-#: Spikes of half this length are no change of a signal [s].
-SPIKE = 0.1
 #: A swing counts fully from this share of the signal's magnitude on; less may be drift.
 LARGE_SWING = 0.2
-#: An object moves at the first share of its largest distance, and left its place at the second.
-AWAY, LEFT = 0.1, 0.02
-#: A smaller way of an object or link counts in proportion [m]: it may be noise.
-SMALL = 0.02
 
 
 @dataclass(frozen=True)
@@ -86,7 +73,9 @@ class Boundary:
     prepares: bool = False
 
 
-def find_boundaries(demonstration: Demonstration, robot: Any = None) -> list[Boundary]:
+def find_boundaries(
+    demonstration: Demonstration, robot: Any = None, *, margin: float = 0.05
+) -> list[Boundary]:
     """All instants at which one part may end and another begin, in the order of time.
 
     A stop at which a gripper moves or something is taken or let go is one boundary with these.
@@ -97,6 +86,8 @@ def find_boundaries(demonstration: Demonstration, robot: Any = None) -> list[Bou
         Of at least two time steps.
     robot : Kinematics, optional
         Where links are; without it there are no contacts.
+    margin : float, default=0.05
+        Events so far from a stop, as a share of the duration, happen at the stop.
 
     Examples
     --------
@@ -110,9 +101,9 @@ def find_boundaries(demonstration: Demonstration, robot: Any = None) -> list[Bou
     if len(demonstration) < 5:
         return []
     found = find_gripper_changes(demonstration) + find_contacts(demonstration, robot)
-    margin = NEAR * demonstration.duration
+    near_by = margin * demonstration.duration
     for stop in find_stops(demonstration, robot):
-        early, late = stop.begin - margin, stop.end + margin
+        early, late = stop.begin - near_by, stop.end + near_by
         near = [i for i, one in enumerate(found) if early <= one.time <= late]
         for i in near:  # poses alone locate a contact less exactly than a stop
             exact = found[i].begin < found[i].end and stop.begin <= found[i].time <= stop.end
@@ -166,7 +157,12 @@ def find_contacts(demonstration: Demonstration, robot: Any = None) -> list[Bound
 
 
 def find_stops(
-    demonstration: Demonstration, robot: Any = None, *, dwell: float = 0.35
+    demonstration: Demonstration,
+    robot: Any = None,
+    *,
+    dwell: float = 0.35,
+    rest: float = 0.15,
+    motion: float = 0.5,
 ) -> list[Boundary]:
     """When the whole robot comes to rest between two motions; rhythms go on.
 
@@ -183,6 +179,9 @@ def find_stops(
         Where the robot rests for this share of the time in which it does not move, at least,
         it stops; 0 also finds where rhythms turn back. The share is 0.47 where minimum-jerk
         motions meet, and 0.29 where a sinusoid turns back.
+    rest, motion : float, default=0.15, 0.5
+        It rests below the first share of the smaller one of its peak speeds before and after,
+        and moves above the second.
 
     References
     ----------
@@ -195,19 +194,19 @@ def find_stops(
         return []
     level = np.log(speed + NOISE * peak)
     level -= 1e-9 * np.arange(len(level))  # of two rests at which all stands, one is the lower
-    lows = find_peaks(-level, prominence=-np.log(REST))[0].tolist()
+    lows = find_peaks(-level, prominence=-np.log(rest))[0].tolist()
     edges = [0, *lows, len(time)]
     found = []
     for number, low in enumerate(lows):
         before = speed[edges[number] : low].max()
         least = min(before, speed[low + 1 : edges[number + 2]].max())
-        moves = np.flatnonzero(speed > MOTION * least)
+        moves = np.flatnonzero(speed > motion * least)
         leaves, comes = moves[moves < low][-1], moves[moves > low][0]
-        rests = leaves + np.flatnonzero(speed[leaves : comes + 1] <= REST * least)
-        begin, last = _crossing(time, speed, rests[0], -1, REST * least), rests[-1]
-        end = _crossing(time, speed, last, 1, REST * least)
-        still = _crossing(time, speed, comes - 1, 1, MOTION * least)
-        still -= _crossing(time, speed, leaves + 1, -1, MOTION * least)
+        rests = leaves + np.flatnonzero(speed[leaves : comes + 1] <= rest * least)
+        begin, last = _crossing(time, speed, rests[0], -1, rest * least), rests[-1]
+        end = _crossing(time, speed, last, 1, rest * least)
+        still = _crossing(time, speed, comes - 1, 1, motion * least)
+        still -= _crossing(time, speed, leaves + 1, -1, motion * least)
         if end - begin >= dwell * still:
             found.append(Boundary((begin + end) / 2, "stop", begin, end))
     return found
@@ -233,7 +232,7 @@ def _speed(demonstration: Demonstration, robot: Any) -> Array:
         joints = as_array(demonstration.joints)
         grippers = {j for j, name in enumerate(names) if is_gripper(name)}
         values = joints[:, [j for j in range(joints.shape[1]) if j not in grippers]]
-    return smooth_speed(values, time, max(SMOOTHING, SHARE * float(time[-1] - time[0])))
+    return smooth_speed(values, time, SMOOTHING)
 
 
 def smooth_speed(values: Array, time: Array, length: float) -> Array:
@@ -245,13 +244,15 @@ def smooth_speed(values: Array, time: Array, length: float) -> Array:
     return speed
 
 
-def move_start(position: Array, time: Array) -> tuple[float, float]:
+def move_start(
+    position: Array, time: Array, *, left: float = 0.02, away: float = 0.1
+) -> tuple[float, float]:
     """When an object with ``position`` (T, 3) at ``time`` leaves its place, and the confidence.
 
-    It is the last instant at which the object was within 2 % of its largest distance from
-    where it lay, before it came to 10 %. The confidence is the product of
+    It is the last instant at which the object was within the share ``left`` of its largest
+    distance from where it lay, before it came to ``away``. The confidence is the product of
 
-    - contrast: one less its scatter while it lay still, relative to these 10 %;
+    - contrast: one less its scatter while it lay still, relative to ``away``;
     - the share of the time after the event that it stays away;
     - its largest distance, in proportion below 2 cm.
     """
@@ -259,16 +260,16 @@ def move_start(position: Array, time: Array) -> tuple[float, float]:
     largest = float(distance.max())
     if largest <= 0:
         return float("nan"), 0.0
-    away = int(np.flatnonzero(distance >= AWAY * largest)[0])
-    left = int(np.flatnonzero(distance[:away] <= LEFT * largest)[-1])
-    contrast = max(0.0, 1 - float(distance[: left + 1].std()) / (AWAY * largest))
-    stays = float((distance[away:] >= AWAY * largest).mean())
-    return float(time[left]), contrast * stays * min(1.0, largest / SMALL)
+    came = int(np.flatnonzero(distance >= away * largest)[0])
+    went = int(np.flatnonzero(distance[:came] <= left * largest)[-1])
+    contrast = max(0.0, 1 - float(distance[: went + 1].std()) / (away * largest))
+    stays = float((distance[came:] >= away * largest).mean())
+    return float(time[went]), contrast * stays * min(1.0, largest / STILL)
 
 
-def without_spikes(values: Array, time: Array) -> Array:
-    """Medians of signals ``values`` (T, n) at ``time`` (T,) over a tenth of a second."""
-    half = max(1, round(SPIKE / 2 / float(np.median(np.diff(time)))))
+def without_spikes(values: Array, time: Array, length: float = 0.1) -> Array:
+    """Medians of signals ``values`` (T, n) at ``time`` (T,) over a ``length`` of time [s]."""
+    half = max(1, round(length / 2 / float(np.median(np.diff(time)))))
     filtered: Array = median_filter(values, size=(2 * half + 1, 1), mode="nearest")
     return filtered
 

@@ -50,9 +50,9 @@ __all__ = [
 #: Which entry of q = (q_1, q_2, q_3, q_4) stands where in H+(q) of eq. (20), with its sign.
 LEFT = ((1, -2, -3, -4), (2, 1, -4, 3), (3, 4, 1, -2), (4, -3, 2, 1))
 
-#: By how much R^T R of a rotation matrix may differ from the identity: data rounded to three
-#: digits are off by up to 2 * 3 * 0.5e-3.
-ROTATION_TOLERANCE = 3e-3
+#: Rotations are given with three digits at least, each number off by so much at most: a
+#: quaternion's norm then by up to twice, an element of ``R^T R`` by up to six times that.
+DIGITS = 5e-4
 
 
 def _constant(name: str, like: Tensor) -> Tensor:
@@ -401,10 +401,10 @@ def from_matrix(matrix: Tensor) -> Tensor:
     gram = matrix.mT @ matrix
     eye = torch.eye(4, dtype=matrix.dtype, device=matrix.device)
     error = (gram.detach() - eye[:3, :3]).abs().amax((-2, -1))
-    if not bool((error <= ROTATION_TOLERANCE).all()):  # NaN is refused, too
+    if not bool((error <= 6 * DIGITS).all()):  # NaN is refused, too
         raise DataError(
             "a matrix is no rotation: R^T R differs from the identity by "
-            f"{float(error.max()):.3g}, the tolerance is {ROTATION_TOLERANCE}"
+            f"{float(error.max()):.3g}, the tolerance is {6 * DIGITS:g}"
         )
     if bool((torch.linalg.det(matrix.detach()) < 0).any()):
         raise DataError("a matrix is no rotation but a reflection: its determinant is -1")

@@ -14,12 +14,12 @@ import numpy as np
 from tpgmm_datasets.checks.check import PACKAGE
 from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import SMOOTHING, Demonstration
+from tpgmm_torch.data.frames import STILL
 from tpgmm_torch.data.pose_names import words
 from tpgmm_torch.events import (
     LEAST_CONFIDENCE,
     ON,
-    SMALL,
     between_levels,
     crossing_time,
     gripper_groups,
@@ -45,8 +45,6 @@ __all__ = [
 
 #: A link rests below the first share of its peak speed, and moves above the second.
 REST, MOTION = 0.1, 0.3
-#: The speed of a link is a mean over so long [s].
-SMOOTHING = 0.2
 #: Edge and level of the events of signals.
 SIGNALS = {
     "closing": ("begin", "low"),
@@ -271,7 +269,7 @@ class Stop(Detector):
         contrast = max(0.0, 1 - float(speed[start:stop].mean()) / (MOTION * peak))
         way = float(np.linalg.norm(np.diff(position[: start + 1], axis=0), axis=1).sum())
         unique = _uniqueness(lengths, chosen) if self.number is None else 1.0
-        return Detection(float(time[start]), contrast * unique * min(1.0, way / SMALL))
+        return Detection(float(time[start]), contrast * unique * min(1.0, way / STILL))
 
 
 def find_events(

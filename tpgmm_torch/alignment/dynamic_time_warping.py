@@ -26,11 +26,7 @@ from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 
 __all__ = ["DynamicTimeWarping", "warn_of_linear_time"]
 
-#: Warping runs on at most this many steps; its memory and time grow with their square.
-LARGEST_GRID = 2000
-#: A warp has to lower the spread of features that it did not use by this fraction,
-LEAST_GAIN = 0.05
-#: unless it differs from linear time by less than this fraction of the duration.
+#: A warp needs no gain that differs from linear time by less than this share of the duration.
 NEARLY_LINEAR = 0.02
 
 
@@ -64,12 +60,14 @@ class DynamicTimeWarping(Alignment):
         run anywhere; 1 is linear time.
     smoothing : float, default=0.2
         Half the length of the kernel that smooths a warp [s].
-    fallback : bool, default=True
-        Whether demonstrations are left on linear time, with a warning, if warping them does
-        not pay: if the mean squared difference from the reference (for a barycentre, from
-        the demonstration that it started from) of features that are *not* used (of
-        directions, by default) falls by less than 5 %. Nothing is checked if no feature is
-        left over, and of warps within 2 % of linear time.
+    min_gain : float or None, default=0.05
+        Demonstrations are left on linear time, with a warning, if warping them does not pay:
+        if the mean squared difference from the reference (for a barycentre, from the
+        demonstration that it started from) of features that are *not* used (of directions, by
+        default) falls by less than this share. Nothing is checked if it is None, if no feature
+        is left over, and of warps within 2 % of linear time.
+    max_steps : int, default=2000
+        Warping runs on at most so many time steps; its memory and time grow with their square.
 
     Attributes
     ----------
@@ -105,7 +103,8 @@ class DynamicTimeWarping(Alignment):
         "penalty": [Interval(Real, 0, None, closed="left")],
         "max_slope": [Interval(Integral, 1, None, closed="left")],
         "smoothing": [Interval(Real, 0, None, closed="left")],
-        "fallback": ["boolean"],
+        "min_gain": [Interval(Real, 0, 1, closed="left"), None],
+        "max_steps": [Interval(Integral, 2, None, closed="left")],
     }
 
     def __init__(
@@ -117,7 +116,8 @@ class DynamicTimeWarping(Alignment):
         penalty: float = 1.5,
         max_slope: int = 2,
         smoothing: float = 0.2,
-        fallback: bool = True,
+        min_gain: float | None = 0.05,
+        max_steps: int = 2000,
     ) -> None:
         self.reference = reference
         self.features = features
@@ -125,7 +125,8 @@ class DynamicTimeWarping(Alignment):
         self.penalty = penalty
         self.max_slope = max_slope
         self.smoothing = smoothing
-        self.fallback = fallback
+        self.min_gain = min_gain
+        self.max_steps = max_steps
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Choose the reference and warp the demonstrations ``X`` onto it; ``y`` is ignored.
@@ -149,7 +150,7 @@ class DynamicTimeWarping(Alignment):
         self.reference_index_ = self._index(sequences)
         chosen = demonstrations[self.reference_index_]
         time = as_array(chosen.time)
-        self._clock = np.linspace(time[0], time[-1], min(len(time), LARGEST_GRID))
+        self._clock = np.linspace(time[0], time[-1], min(len(time), self.max_steps))
         self._target = resample(sequences[self.reference_index_], time, self._clock)
         self.time_ = chosen.time.detach().cpu().double()
         if self.reference == "barycenter":
@@ -157,7 +158,8 @@ class DynamicTimeWarping(Alignment):
             self.time_ = torch.from_numpy(self._clock)
         warps = list(map(self._warp, demonstrations, sequences))
         # features that warps do not depend on, and those of the reference on the clock
-        self._held_out = self._features.others(demonstrations) if self.fallback else None
+        checked = self.min_gain is not None
+        self._held_out = self._features.others(demonstrations) if checked else None
         if self._held_out is not None:
             warp = warps[self.reference_index_]
             self._held_out_target = resample(self._held_out(chosen), time, warp)
@@ -217,7 +219,11 @@ class DynamicTimeWarping(Alignment):
         """Why a demonstration should rather run linearly; empty if it should not."""
         linear = self._linear(demonstration)
         tolerance = NEARLY_LINEAR * demonstration.duration
-        if self._held_out is None or np.abs(warp - linear).max() <= tolerance:
+        if (
+            self._held_out is None
+            or self.min_gain is None
+            or np.abs(warp - linear).max() <= tolerance
+        ):
             return ""
         own, time = self._held_out(demonstration), as_array(demonstration.time)
         before, after = (
@@ -228,7 +234,7 @@ class DynamicTimeWarping(Alignment):
             )
             for w in (linear, warp)
         )
-        if after <= (1 - LEAST_GAIN) * before:
+        if after <= (1 - self.min_gain) * before:
             return ""
         return (
             f"its difference from the reference in {', '.join(self._held_out.names)} is "
@@ -254,7 +260,7 @@ def warn_of_linear_time(found: Iterable[str]) -> None:
     warnings.warn(
         f"left on linear time: {'; '.join(found)}. Warping does not bring nearer the features "
         "that it did not use: is it one skill, from its beginning to its end? Choose other "
-        "features, or set fallback=False",
+        "features, or set min_gain=None",
         PlausibilityWarning,
         stacklevel=3,
     )

@@ -13,20 +13,16 @@ from numpy.typing import NDArray
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.warping_paths import moving_average, resample
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import SMOOTHING, Demonstration
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
 __all__ = ["AlignmentFeatures", "quaternion_columns"]
 
-#: Half the length of the kernel that smooths joints before they are differentiated [s].
-VELOCITY_SMOOTHING = 0.1
 #: Below this fraction of a demonstration's root mean square speed the direction fades out.
 STANDSTILL = 0.3
 #: Weights of groups; the n others have ``n ** -0.5`` each. Postures differ between
 #: demonstrations at equal phase, by start and goal, and would shift a rhythm.
 WEIGHTS = {"speed": 5.0, "directions": 4.5}
-#: Columns that vary by less than this share of their size count as constant.
-CONSTANT = 1e-9
 
 
 def quaternion_columns(demonstration: Demonstration, robot: Any) -> list[list[int]]:
@@ -123,7 +119,7 @@ class AlignmentFeatures:
             within = np.stack([group.var(axis=0) for group in groups])
             variance = np.average(within, axis=0, weights=list(map(len, groups)))
             size = np.max([np.abs(group).max(axis=0) for group in groups], axis=0)
-            varying = np.sqrt(variance) > CONSTANT * size
+            varying = _varying(np.sqrt(variance), size)
             if varying.any():
                 columns[name] = varying
                 spread = float(np.sqrt(variance[varying].sum()))
@@ -194,9 +190,14 @@ def _velocity(values: Array, demonstration: Demonstration) -> Array:
     time = as_array(demonstration.time)
     even = np.linspace(time[0], time[-1], len(time))
     step = demonstration.duration / (len(time) - 1)
-    smooth = moving_average(resample(values, time, even), round(VELOCITY_SMOOTHING / step))
+    smooth = moving_average(resample(values, time, even), round(SMOOTHING / 2 / step))
     rates = resample(np.gradient(smooth, step, axis=0), even, time)
-    return np.where(values.std(axis=0) > CONSTANT * np.abs(values).max(axis=0), rates, 0.0)
+    return np.where(_varying(values.std(axis=0), np.abs(values).max(axis=0)), rates, 0.0)
+
+
+def _varying(deviation: Array, size: Array) -> NDArray[np.bool_]:
+    """Whether columns vary beyond what rounding leaves of their sizes."""
+    return np.asarray(deviation > np.finfo(np.float64).eps ** 0.5 * size)
 
 
 def _speed(velocity: Array) -> Array:

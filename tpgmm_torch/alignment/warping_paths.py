@@ -21,9 +21,6 @@ __all__ = ["barycenter", "medoid", "moving_average", "resample", "warping_map", 
 
 Floats = NDArray[np.floating[Any]]
 
-#: A warp never runs slower than this share of its mean: an event has one instant.
-SLOWEST = 1e-3
-
 
 def resample(values: Array, time: Floats, grid: Floats) -> Array:
     """Interpolate the columns of ``values`` (T, D), given at ``time`` (T,), on a ``grid``."""
@@ -110,12 +107,13 @@ def warping_path(
     return np.array(path[::-1], dtype=np.intp).reshape(-1, 2) - border, cost
 
 
-def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
+def warping_map(path: NDArray[np.intp], width: int = 0, min_slope: float = 1e-3) -> Array:
     """Turn a ``path`` (L, 2) into an increasing function of the reference index.
 
     Each reference index gets the mean of the source indices matched with it. The result is a
     staircase, whose steps would be bursts of speed: a moving average of that ``width`` removes
-    them. The ends of the path are kept.
+    them. It never runs slower than ``min_slope`` times its mean, so that an event has one
+    instant. The ends of the path are kept.
 
     Returns
     -------
@@ -126,7 +124,7 @@ def warping_map(path: NDArray[np.intp], width: int = 0) -> Array:
     means = np.bincount(path[:, 0], weights=path[:, 1]) / counts
     means[0], means[-1] = path[0, 1], path[-1, 1]
     line = np.linspace(means[0], means[-1], len(means))
-    return (1 - SLOWEST) * moving_average(means, width) + SLOWEST * line
+    return (1 - min_slope) * moving_average(means, width) + min_slope * line
 
 
 def medoid(sequences: Sequence[Array], max_slope: int = 2, n_steps: int = 200) -> int:

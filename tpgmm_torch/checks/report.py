@@ -11,8 +11,6 @@ from tpgmm_torch.exceptions import PlausibilityError, PlausibilityWarning
 
 __all__ = ["Finding", "Report", "in_columns", "listed"]
 
-#: Examples of one finding that a message names; how many more there are it counts.
-MOST_EXAMPLES = 3
 PACKAGE = str(Path(__file__).parents[1])
 
 
@@ -128,16 +126,16 @@ class Report:
         return self
 
 
-def listed(items: Sequence[str]) -> str:
-    """The first of some ``items``, and how many more there are.
+def listed(items: Sequence[str], most: int = 3) -> str:
+    """The first of some ``items``, ``most`` of them, and how many more there are.
 
     Examples
     --------
     >>> listed(["a", "b", "c", "d", "e"])
     'a, b, c and 2 more'
     """
-    shown = ", ".join(items[:MOST_EXAMPLES])
-    more = len(items) - MOST_EXAMPLES
+    shown = ", ".join(items[:most])
+    more = len(items) - most
     return f"{shown} and {more} more" if more > 0 else shown
 
 

@@ -13,6 +13,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, listed
 from tpgmm_torch.checks.training import EpisodeSummary, PathSummary
 from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.data.demonstrations import FEWEST
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.pose_names import quaternion_groups
 from tpgmm_torch.exceptions import DataError
@@ -22,8 +23,8 @@ __all__ = ["ALIKE", "FrameSummary", "Region", "TrainingSummary"]
 
 #: Situations that differ by less are the same: [rad or m], [m], [rad].
 ALIKE = {"start": 0.02, "place": 0.01, "turn": 0.05}
-#: Of fewer demonstrations the spread is not known, and taken for this standard deviation.
-FEWEST, SPREAD = 3, {"start": 0.2, "place": 0.05, "turn": float(np.deg2rad(20.0))}
+#: Where too few demonstrations show the spread, it is taken for this standard deviation.
+SPREAD = {"start": 0.2, "place": 0.05, "turn": float(np.deg2rad(20.0))}
 #: The unit of novelty is the distance of the furthest demonstration (1 is the edge of the
 #: region of the others), but at least and at most this: demonstrations that hardly differ, and
 #: one that is unlike the others, say little of how far new situations may be.
@@ -33,8 +34,6 @@ MOST_LEFT_OUT = 200
 #: A situation is unlikely beyond this novelty: of generated situations like the demonstrations,
 #: 2 % are with 3 to 6 demonstrations, and less than 0.1 % with 8 or more.
 UNLIKELY = 1.5
-#: A frame is at a link if it differs by less, the rounding of float32 [m, 1].
-ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Region:
             raise DataError("a covariance is not symmetric and positive definite")
 
     @classmethod
-    def of(cls, vectors: Array, kind: str, fewest: int = FEWEST) -> Self:
+    def of(cls, vectors: Array, kind: str, fewest: int = FEWEST + 1) -> Self:
         """Estimate the region of vectors (N, D), of start postures, places or turns.
 
         The covariance S of N - 1 degrees of freedom is joined with D of a round one of the same
@@ -423,12 +422,12 @@ class TrainingSummary:
 def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:
     """The largest distance of a demonstration from the regions of the others."""
     n = len(vectors[0][1])
-    if n < FEWEST:
+    if n <= FEWEST:
         return 1.0
     tried = np.unique(np.linspace(0, n - 1, min(n, MOST_LEFT_OUT)).round().astype(int))
     distances = [
         _joined(
-            Region.of(np.delete(given, i, axis=0), kind, fewest=2).distance(given[i])
+            Region.of(np.delete(given, i, axis=0), kind, FEWEST).distance(given[i])
             for kind, given in vectors
             if given.shape[1]
         )
@@ -458,7 +457,8 @@ def _same(pose: Frame, other: Frame) -> bool:
     other = other.to(pose.position)
     turn = quaternions.match_hemisphere(other.orientation, pose.orientation)
     differences = as_array(pose.position - other.position), as_array(pose.orientation - turn)
-    return all(bool((np.abs(one) < ROUNDING).all()) for one in differences)
+    rounding = 1e2 * np.finfo(np.float32).eps  # of positions of about a metre, and of 1
+    return all(bool((np.abs(one) < rounding).all()) for one in differences)
 
 
 def _outside(

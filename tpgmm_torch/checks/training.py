@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from tpgmm_torch.checks.report import Finding, Report, listed
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.frames import LEVER, STILL, Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.operators import Operator
@@ -33,17 +33,15 @@ __all__ = [
 
 #: Nothing turns a joint so far beyond its limits [rad]: the values are in another unit.
 IMPOSSIBLE = 2 * math.pi
-#: Limits and calibrations are not exact: values may be beyond by this share of the range, and
-#: at most by this [rad or m].
-BEYOND_SHARE, BEYOND = 0.1, 0.1
+#: Limits and calibrations are not exact: values may be beyond by this share of the range, of
+#: at most 1 rad or m of it.
+BEYOND = 0.1
 #: Nothing that a robot handles is so far from its base [m].
 FAR = 10.0
 #: No robot is recorded so slowly [s]; a set in milliseconds, or in numbers of frames, is.
 SLOWEST_STEP = 0.5
 #: Demonstrations on one clock begin together and last equally, up to this share.
 ONE_CLOCK = 0.05
-#: What moves by less stands still [m], [rad]: the noise of trackers.
-STILL, STILL_ANGLE = 0.02, 0.1
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class PathSummary:
             as_array(first.orientation),
             positions.min(axis=0),
             positions.max(axis=0),
-            bool((first.change(frame, STILL, STILL_ANGLE) > 1).any()),
+            bool((first.change(frame, STILL, STILL / LEVER) > 1).any()),
             bool(frame.batch_shape),
         )
 
@@ -238,7 +236,7 @@ def _limits(episodes: Sequence[EpisodeSummary], kinematics: Kinematics) -> Itera
     low = np.min([episode.low for episode in episodes], axis=0)
     high = np.max([episode.high for episode in episodes], axis=0)
     limits = np.stack((as_array(kinematics.lower), as_array(kinematics.upper)))
-    allowed = np.minimum(BEYOND_SHARE * (limits[1] - limits[0]), BEYOND)
+    allowed = BEYOND * np.minimum(limits[1] - limits[0], 1.0)
     # of the joints of the robot (rows) in the columns that were given
     excess = np.maximum(limits[0][:, None] - low, high - limits[1][:, None])
     own, names = excess.diagonal(), kinematics.joint_names

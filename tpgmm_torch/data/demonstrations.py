@@ -18,7 +18,19 @@ from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 
-__all__ = ["Demonstration", "Situation", "check_demonstrations", "check_robot"]
+__all__ = [
+    "FEWEST",
+    "SMOOTHING",
+    "Demonstration",
+    "Situation",
+    "check_demonstrations",
+    "check_robot",
+]
+
+#: The fewest demonstrations that have a variance; to leave one out takes one more.
+FEWEST = 2
+#: Over so long speeds are measured [s]: less is noise, more blurs where motions begin.
+SMOOTHING = 0.2
 
 
 def _checked_time(values: Any) -> Tensor:

@@ -13,11 +13,13 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import as_tensor
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["UNIT_NORM_TOLERANCE", "Frame"]
+__all__ = ["LEVER", "STILL", "Frame"]
 
-#: Quaternions whose norm is off by more than this are refused; below, they are rounded data
-#: (float32 recordings, a few printed digits) and brought to unit norm.
-UNIT_NORM_TOLERANCE = 1e-3
+#: Turning a thing by one radian counts as moving it by this distance, half its size [m].
+LEVER = 0.2
+#: What moves by less stands still [m]: the noise of trackers. What turns, by less than this for
+#: the lever.
+STILL = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +73,10 @@ class Frame:
             )
         norm = torch.linalg.vector_norm(orientation, dim=-1, keepdim=True)
         excess = norm.detach() - 1
-        if bool((excess.abs() > UNIT_NORM_TOLERANCE).any()):
+        if bool((excess.abs() > 2 * quaternions.DIGITS).any()):
             raise DataError(
                 "a frame's orientation must be a unit quaternion (w, x, y, z): a norm is off "
-                f"by {excess.abs().max():.3g}, the tolerance is {UNIT_NORM_TOLERANCE}"
+                f"by {excess.abs().max():.3g}, the tolerance is {2 * quaternions.DIGITS:g}"
             )
         # what is of unit norm but for rounding stays as it is, bit for bit
         rounded = excess.abs() <= 4 * torch.finfo(norm.dtype).eps

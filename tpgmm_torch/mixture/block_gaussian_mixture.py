@@ -39,14 +39,12 @@ from tpgmm_torch.mixture.expectation_maximization import (
 from tpgmm_torch.mixture.initialization import draw_starts
 from tpgmm_torch.mixture.points import Points
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.mixture.row_file import RowFile, Rows
+from tpgmm_torch.mixture.row_file import FILE_ROWS, RowFile, Rows
 
 __all__ = ["BlockGaussianMixture"]
 
 #: Least regularisation, as a share of the variance, that survives rounding.
 SMALLEST_SHARE = {torch.float64: 1e-12, torch.float32: 2e-6}
-#: Rows at a time when densities are evaluated.
-FEW_ROWS = 2**12
 
 
 class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
@@ -488,8 +486,8 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         exact, peaks = whiten(parameters.affine(torch.ones_like(center), -center))
         maps, peaks = [own.to(dtype) for own in exact], peaks.to(dtype)
         widths, found = [own.shape[1] for own in maps], []
-        for start in range(0, len(points), FEW_ROWS):
-            rows = torch.from_numpy(np.array(points[start : start + FEW_ROWS])).to(center)
+        for start in range(0, len(points), FILE_ROWS):
+            rows = torch.from_numpy(np.array(points[start : start + FILE_ROWS])).to(center)
             blocks = [
                 torch.nn.functional.pad(block, (0, 1), value=1.0).T.to(dtype)
                 for block in (rows - center).split(widths, 1)

@@ -24,9 +24,6 @@ from torch import Tensor
 
 __all__ = ["moderated_variances", "shrink", "shrinkage_intensity", "trigamma_inverse"]
 
-#: Logarithms of variances that differ by no more than this beyond chance are alike.
-ALIKE = 1e-9
-
 
 def shrinkage_intensity(
     covariance: Tensor, intensity: float | str, n_samples: Tensor | float
@@ -131,10 +128,11 @@ def moderated_variances(variances: Tensor, freedom: Tensor | float) -> Tensor:
     logs = variances.log() - torch.digamma(half) + half.log()
     mean = logs.mean(-1, keepdim=True)
     excess = logs.var(-1, keepdim=True) - torch.polygamma(1, half)
-    prior = trigamma_inverse(excess.clamp(min=ALIKE))  # m / 2
+    alike = torch.finfo(excess.dtype).eps ** 0.5  # below it the two results are equal
+    prior = trigamma_inverse(excess.clamp(min=alike))  # m / 2
     scale = (mean + torch.digamma(prior) - prior.log()).exp()
     posterior = (prior * scale + half * variances) / (prior + half)
-    return torch.where(excess > ALIKE, posterior, mean.exp())
+    return torch.where(excess > alike, posterior, mean.exp())
 
 
 def trigamma_inverse(value: Tensor, n_steps: int = 20) -> Tensor:

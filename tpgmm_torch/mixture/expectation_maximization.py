@@ -21,6 +21,7 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.points import Points
+from tpgmm_torch.mixture.row_file import FILE_ROWS
 
 __all__ = [
     "CovarianceFamily", "Expectation", "Fit", "Labeller", "Parameters", "dead_components",
@@ -28,16 +29,10 @@ __all__ = [
     "whiten",
 ]  # fmt: skip
 
-#: A component is left out of a chunk where its responsibilities are below exp(-36) = 2e-16 ...
-NEGLIGIBLE = 36.0
-#: ... and guessed to be where they are below exp(-40) by the densities of the last pass.
-GUESSED = 40.0
-#: Logarithm of the least responsibility: products with denormal numbers take very long.
-LEAST = -60.0
+#: A component is left out of a chunk where its responsibilities are below exp(-36), rounding,
+NEGLIGIBLE = -math.log(torch.finfo(torch.float64).eps)
 #: By how much a mean log-density may be off by rounding, relative to 1 and to itself.
 ROUNDING = {torch.float64: 2e-13, torch.float32: 1e-5}
-#: Components are reseeded at one of so many points at most.
-MOST_CANDIDATES = 2**14
 
 #: Components (n,) of the points of a chunk, given its standardised rows (n, sum D_j) and their
 #: numbers (n,).
@@ -239,8 +234,8 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     """
     maps, peaks = whiten(parameters)
     ceilings = _ceilings(parameters, peaks, points.spans)
-    limits = torch.full_like(ceilings[:, 0], -math.inf) if least is None else least - GUESSED
-    limits = torch.minimum(limits, ceilings.amax(1) - GUESSED)
+    limits = torch.full_like(ceilings[:, 0], -math.inf) if least is None else least - NEGLIGIBLE
+    limits = torch.minimum(limits, ceilings.amax(1) - NEGLIGIBLE)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
     rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)
@@ -258,7 +253,8 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
                 break
             limit = -math.inf  # the guess was wrong
             index = (ceiling > lowest.pop() - NEGLIGIBLE).nonzero()[:, 0]
-        gamma = joint.sub_(density).clamp_(min=LEAST).exp_()
+        # products with denormal numbers take very long
+        gamma = joint.sub_(density).clamp_(min=-2 * NEGLIGIBLE).exp_()
         found.add(index, gamma, blocks, whitened)
         found.total += density.sum(dtype=peaks.dtype)
     return found.expectation(parameters, rounded, points, limits.new_tensor(lowest))
@@ -416,7 +412,7 @@ def reseed(
         In the same state in all processes.
     """
     n_dead = int(dead.sum())
-    worst = _worst(explaining, points, max(n_dead, min(points.total // 20, MOST_CANDIDATES)))
+    worst = _worst(explaining, points, max(n_dead, min(points.total // 20, FILE_ROWS)))
     places = worst[rng.choice(len(worst), n_dead, replace=False)].split(points.widths, 1)
     weights = torch.where(dead, 1 / len(dead), proposal.weights)
     share = torch.where(dead, 0.0, proposal.weights)

@@ -21,8 +21,6 @@ Chunk = tuple[Tensor, Tensor]
 #: Whitened coordinates of a chunk in float64, in float32 twice as many: what a processor's
 #: cache holds, and what keeps a GPU busy.
 CHUNK_SIZE = {"cpu": 3 * 2**17, "gpu": 2**25}
-#: Starts are found from so many rows at most; of more, from a sample.
-LARGEST_SAMPLE = 2**16
 
 
 class Points:
@@ -112,7 +110,7 @@ class Points:
         return chunk.split([width + 1 for width in self.widths])
 
     def sample(self, every: int = 1) -> tuple[Tensor, Tensor]:
-        """At most ``LARGEST_SAMPLE`` rows of all processes; all of them where they are no more.
+        """At most ``FILE_ROWS`` rows of all processes; all of them where they are no more.
 
         Parameters
         ----------
@@ -127,8 +125,8 @@ class Points:
             Their numbers among those that count.
         """
         wanted = np.arange(self.total // every)
-        if len(wanted) > LARGEST_SAMPLE:
-            draws = np.random.RandomState(0).randint(0, len(wanted), LARGEST_SAMPLE)
+        if len(wanted) > FILE_ROWS:
+            draws = np.random.RandomState(0).randint(0, len(wanted), FILE_ROWS)
             wanted = np.unique(draws)
         places = wanted * every - self._first
         own = places[(places >= 0) & (places < len(self._rows))]

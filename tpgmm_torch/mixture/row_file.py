@@ -15,7 +15,7 @@ from tpgmm_torch.exceptions import DataError, ShapeError
 
 __all__ = ["FILE_ROWS", "RowFile", "Rows"]
 
-#: Rows that are read at once; memory holds no more of a file.
+#: Rows that are read, drawn or kept at once: memory holds no more of a file.
 FILE_ROWS = 2**16
 
 

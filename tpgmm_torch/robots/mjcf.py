@@ -38,8 +38,6 @@ from tpgmm_torch.robots.urdf import (
 __all__ = ["mjcf_to_urdf"]
 
 HOW_TO_INSTALL = "pip install 'tpgmm-torch[simulation]'"
-#: Geoms of these groups are shown by MuJoCo unless asked; those of others collide.
-SHOWN_GROUPS = 3
 
 
 def mjcf_to_urdf(mjcf: str | os.PathLike[str]) -> str:
@@ -190,8 +188,9 @@ class _Translation:
     def _visuals(self) -> dict[str, list[ElementTree.Element]]:
         """What links look like: the solids that URDF knows, without ellipsoids and planes."""
         visuals: dict[str, list[ElementTree.Element]] = {link: [] for link in self.links}
+        shown_groups = self.mujoco.MjvOption().geomgroup  # MuJoCo's own; others collide
         for geom in map(self.model.geom, range(self.model.ngeom)):
-            is_shown = geom.bodyid[0] and geom.group[0] < SHOWN_GROUPS and geom.rgba[3]
+            is_shown = geom.bodyid[0] and shown_groups[geom.group[0]] and geom.rgba[3]
             color, material = geom.rgba, int(geom.matid[0])
             if material >= 0 and np.allclose(color, [0.5, 0.5, 0.5, 1.0]):  # the default
                 color = self.model.mat_rgba[material]

@@ -56,8 +56,6 @@ XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf
 BEFORE_XML = "\ufeff \t\r\n"
 #: The axis of a joint that names none.
 X_AXIS = np.array([1.0, 0.0, 0.0])
-#: Lengths [m] and factors beyond this are mistakes, and their products would not be finite.
-LARGEST = 1e9
 
 
 @dataclass(frozen=True)
@@ -357,7 +355,9 @@ def _numbers(
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    largest = LARGEST if tag in ("origin", "mimic") else sys.float_info.max
+    # the squares of lengths and factors have to be finite in float32, too
+    whole = float(np.finfo(np.float32).max) ** 0.5
+    largest = whole if tag in ("origin", "mimic") else sys.float_info.max
     if len(values) != len(default) or not all(abs(value) <= largest for value in values):
         hint = f". {XACRO}" if re.search(r"\$[{(]", text) else ""
         raise DataError(

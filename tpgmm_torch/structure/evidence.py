@@ -30,11 +30,6 @@ __all__ = ["Evidence", "gather_evidence"]
 
 #: No sensor agrees with itself to less [m or rad]: what never varies stays finite.
 RESOLUTION = 1e-3
-#: Demonstrations that are left out in turn; of more, so many are taken, evenly.
-MOST_LEFT_OUT = 20
-#: Degrees of freedom of a variance's prior, whose scale is that of all demonstrations: of 3,
-#: two are left, and their agreement by chance would decide.
-PRIOR_DEGREES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +107,7 @@ def gather_evidence(
     *,
     tolerance: float,
     n_instants: int,
+    n_left_out: int = 20,
     holds: Sequence[Hold] = (),
 ) -> Evidence:
     """Leave each demonstration out, and ask operators about it.
@@ -126,6 +122,8 @@ def gather_evidence(
         Agreement below it means nothing [rad or m].
     n_instants : int
         T, at most: evenly spread.
+    n_left_out : int, default=20
+        M, at most: evenly chosen.
     holds : sequence of Hold, default=()
         Objects that the robot held.
     """
@@ -143,7 +141,7 @@ def gather_evidence(
     data = torch.stack(local_data(seen, operators, kinematics, holds=holds))  # (N, T, ...)
     widths = [1 + operator.dimension(kinematics) for operator in operators]
     blocks = [block[..., 1:] for block in data.split(widths, -1)]
-    left_out = torch.linspace(0, number - 1, min(number, MOST_LEFT_OUT)).round().long()
+    left_out = torch.linspace(0, number - 1, min(number, n_left_out)).round().long()
     terms = []
     for index in left_out.tolist():
         known = _situation(seen[index], kinematics, holds)
@@ -192,7 +190,9 @@ def _term(
     """Jacobian, residual, precision and vector of an operator, one demonstration left out."""
     number = len(local)
     others, degrees = torch.arange(number) != index, number - 2.0
-    share = PRIOR_DEGREES / (degrees + PRIOR_DEGREES)
+    # two that are left of three agree by chance: a prior with the variance of all
+    # demonstrations counts as much as one degree of freedom
+    share = 1 / (degrees + 1)
     own = local[others].var(0) * number / (number - 1)
     whole = local.var(0) * (number + 1) / number
     covariance = ((1 - share) * own + share * whole + RESOLUTION**2).diag_embed()

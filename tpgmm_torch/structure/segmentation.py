@@ -22,9 +22,6 @@ from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Segmentation"]
 
-#: Two boundaries of different demonstrations may be one if their progress differs by less.
-ALIKE = 0.1
-
 
 class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
     """Find the parts of a skill.
@@ -44,6 +41,9 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         The share of the demonstrations that must have a boundary.
     shortest : float, default=0.04
         Parts last at least this share of the duration.
+    shift : float, default=0.1
+        Share of the duration by which boundaries of different demonstrations may differ and be
+        one.
 
     Attributes
     ----------
@@ -79,6 +79,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         "robot": [Kinematics, None],
         "agreement": [Interval(Real, 0, 1, closed="right")],
         "shortest": [Interval(Real, 0, 1, closed="left")],
+        "shift": [Interval(Real, 0, 1, closed="left")],
     }
 
     def __init__(
@@ -87,10 +88,12 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         *,
         agreement: float = 0.6,
         shortest: float = 0.04,
+        shift: float = 0.1,
     ) -> None:
         self.robot = robot
         self.agreement = agreement
         self.shortest = shortest
+        self.shift = shift
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Find the parts.
@@ -190,7 +193,9 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         self, phases: Sequence[Array], reasons: Sequence[Sequence[str]]
     ) -> list[tuple[float, str, float]]:
         """Progress, reason and share of the boundaries that most demonstrations have."""
-        table = [np.array([_matched(one, other) for other in phases]) for one in phases]
+        table = [
+            np.array([_matched(one, other, self.shift) for other in phases]) for one in phases
+        ]
         # of the demonstration most like the others: what these lack counts as what they have
         matches = max(table, key=lambda row: 2 * np.sum(row >= 0) - row.size)
         shares = (matches >= 0).mean(0)
@@ -211,7 +216,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         """When the boundaries are in demonstrations, (M, B), given what may be some in each."""
         rows = np.empty((len(demonstrations), len(self.progress_)))
         for row, one, own in zip(rows, demonstrations, phases, strict=True):
-            match = _matched(self.progress_, own)
+            match = _matched(self.progress_, own, self.shift)
             there = match >= 0
             known = np.concatenate(([0.0], self.progress_[there], [1.0]))
             here = np.concatenate(([0.0], own[match[there]], [1.0]))
@@ -231,25 +236,25 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         return tags
 
 
-def _matched(one: Array, other: Array) -> NDArray[np.int64]:
+def _matched(one: Array, other: Array, shift: float) -> NDArray[np.int64]:
     """For each instant of one, (A,), which of the other (B,) it is, -1 where there is none.
 
     Those are matched that leave the least sum of distances, in the order of both; one that is
     left out costs as much as half the largest distance.
     """
     cost = np.empty((len(one) + 1, len(other) + 1))
-    cost[:, 0] = ALIKE / 2 * np.arange(len(one) + 1)
-    cost[0] = ALIKE / 2 * np.arange(len(other) + 1)
+    cost[:, 0] = shift / 2 * np.arange(len(one) + 1)
+    cost[0] = shift / 2 * np.arange(len(other) + 1)
     for i, at in enumerate(one):
         for j, there in enumerate(other):
-            left_out = ALIKE / 2 + min(cost[i, j + 1], cost[i + 1, j])
+            left_out = shift / 2 + min(cost[i, j + 1], cost[i + 1, j])
             cost[i + 1, j + 1] = min(cost[i, j] + abs(at - there), left_out)
     match, i, j = np.full(len(one), -1), len(one), len(other)
     while i and j:
         if cost[i, j] == cost[i - 1, j - 1] + abs(one[i - 1] - other[j - 1]):
             i, j = i - 1, j - 1
             match[i] = j
-        elif cost[i, j] == ALIKE / 2 + cost[i - 1, j]:
+        elif cost[i, j] == shift / 2 + cost[i - 1, j]:
             i -= 1
         else:
             j -= 1

@@ -14,7 +14,11 @@ from sklearn.base import BaseEstimator, clone
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.constraints import Interval, check_parameters
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import (
+    FEWEST,
+    Demonstration,
+    check_demonstrations,
+)
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import ConvergenceWarning, DataError
 from tpgmm_torch.operators import Canonical
@@ -25,8 +29,6 @@ __all__ = ["SelectComponents"]
 
 #: Each about a third more than the one before.
 CANDIDATES = (2, 3, 4, 5, 7, 10, 13, 17, 23, 30, 40, 53)
-#: Instants at which a demonstration is compared with the estimate.
-INSTANTS = 100
 
 
 class SelectComponents(BaseEstimator):  # type: ignore[misc]
@@ -55,6 +57,8 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
         Agreement of the joints below it means nothing [rad or m].
     threshold : float, default=0.25
         The least gain that more components are worth [nats per instant].
+    n_instants : int, default=100
+        At how many instants at most a demonstration is compared with the estimate.
 
     Attributes
     ----------
@@ -90,6 +94,7 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
         "n_folds": [Interval(Integral, 2, None, closed="left")],
         "tolerance": [Interval(Real, 0, None, closed="neither")],
         "threshold": [Interval(Real, 0, None, closed="left")],
+        "n_instants": [Interval(Integral, 1, None, closed="left")],
     }
 
     best_model_: TaskParameterizedGMM
@@ -102,12 +107,14 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
         n_folds: int = 5,
         tolerance: float = 0.005,
         threshold: float = 0.25,
+        n_instants: int = 100,
     ) -> None:
         self.model = model
         self.candidates = candidates
         self.n_folds = n_folds
         self.tolerance = tolerance
         self.threshold = threshold
+        self.n_instants = n_instants
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Find the number, and learn with it.
@@ -130,10 +137,11 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
         """
         check_parameters(self)
         demonstrations = check_demonstrations(X)
-        if len(demonstrations) < 3:
+        if len(demonstrations) <= FEWEST:
             raise DataError(
                 "the number of components is found on demonstrations that are left out: it "
-                f"takes at least 3, got {len(demonstrations)}; give n_components a number"
+                f"takes at least {FEWEST + 1}, got {len(demonstrations)}; give n_components a "
+                "number"
             )
         usable = self._usable(demonstrations)
         scores: list[list[float]] = []
@@ -191,7 +199,7 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
     def _score(self, skill: Regression, demonstration: Demonstration, n_learned: int) -> float:
         """Mean log-likelihood of the joints of a demonstration that was left out."""
         kinematics, like = skill.kinematics, skill.kinematics.lower
-        count = min(len(demonstration), INSTANTS)
+        count = min(len(demonstration), self.n_instants)
         index = torch.linspace(0, len(demonstration) - 1, count).round().long()
         motion = demonstration.at_steps(index).reordered(kinematics.joint_names)
         time = motion.time.to(like)

@@ -15,7 +15,11 @@ from torch import Tensor
 
 from tpgmm_torch.checks.report import in_columns
 from tpgmm_torch.constraints import Interval, check_parameters
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import (
+    FEWEST,
+    Demonstration,
+    check_demonstrations,
+)
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators import (
     AbsoluteOrientation,
@@ -35,8 +39,6 @@ from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
 
 __all__ = ["Judgement", "SelectOperators", "arranged", "candidate_operators"]
 
-#: Of two, one is left to learn from, and has no variance.
-FEWEST = 3
 POSITIONS = AbsolutePosition, RelativePosition
 ORIENTATIONS = AbsoluteOrientation, RelativeOrientation
 
@@ -102,6 +104,8 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         gains about ``s D log r``: three coordinates ten times more exactly, for 4 % of it.
     n_instants : int, default=50
         At how many instants the demonstrations are looked at.
+    n_left_out : int, default=20
+        How many demonstrations are left out in turn; of more, so many are chosen evenly.
 
     Attributes
     ----------
@@ -145,6 +149,7 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         "tolerance": [Interval(Real, 0, None, closed="neither")],
         "threshold": [Interval(Real, 0, None, closed="left")],
         "n_instants": [Interval(Integral, 2, None, closed="left")],
+        "n_left_out": [Interval(Integral, 1, None, closed="left")],
     }
 
     def __init__(
@@ -155,12 +160,14 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         tolerance: float = 0.005,
         threshold: float = 0.25,
         n_instants: int = 50,
+        n_left_out: int = 20,
     ) -> None:
         self.candidates = candidates
         self.robot = robot
         self.tolerance = tolerance
         self.threshold = threshold
         self.n_instants = n_instants
+        self.n_left_out = n_left_out
 
     def fit(self, X: Sequence[Demonstration], y: object = None) -> Self:
         """Find which candidates matter.
@@ -183,10 +190,10 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         """
         check_parameters(self)
         demonstrations = check_demonstrations(X)
-        if len(demonstrations) < FEWEST:
+        if len(demonstrations) <= FEWEST:
             raise DataError(
                 "which operators matter is seen from demonstrations that differ: it takes at "
-                f"least {FEWEST}, got {len(demonstrations)}; name the operators instead"
+                f"least {FEWEST + 1}, got {len(demonstrations)}; name the operators instead"
             )
         operators = check_operators(self._given(demonstrations[0]))
         kinematics = kinematics_for(demonstrations, operators, self.robot, "float64", "cpu")
@@ -202,6 +209,7 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
             kinematics,
             tolerance=self.tolerance,
             n_instants=self.n_instants,
+            n_left_out=self.n_left_out,
             holds=holds,
         )
         joints = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]

@@ -14,7 +14,11 @@ from sklearn.base import BaseEstimator, clone
 
 from tpgmm_torch.constraints import Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
+from tpgmm_torch.data.demonstrations import (
+    FEWEST,
+    Demonstration,
+    check_demonstrations,
+)
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError
 from tpgmm_torch.operators import Operator
@@ -30,12 +34,8 @@ __all__ = ["SelectWays"]
 
 #: Joints that hardly move are compared by this range [rad or m].
 SMALLEST_RANGE = 0.2
-#: A way that was shown once is an exception, and has no variance.
-FEWEST = 2
-#: Stretches of the skill of which each is looked at by itself,
+#: Stretches of the skill of which each is looked at by itself.
 STRETCHES = 20
-#: and principal axes of the coordinates there.
-AXES = 3
 #: Modes are so many times farther apart than the farthest next neighbour of one mode.
 APART = 3.0
 #: A partition that where demonstrations begin shows as well, to so large a share of what it
@@ -75,7 +75,7 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
 
     Two ways are far apart somewhere, in units of how much demonstrations of one way differ
     there. So each operator's coordinates are looked at stretch by stretch along aligned time:
-    the demonstrations' means there, on each of three principal axes, are divided into 1, 2, ...
+    the demonstrations' means there, on each of their principal axes, are divided into 1, 2, ...
     modes of one variance, and BIC says how many. To have looked at B places costs log B nats
     for each mode more, so that chance gaps between few demonstrations are none. Modes are
     divided again in the same manner.
@@ -323,10 +323,10 @@ def _stretches(values: Array) -> Array:
 
 
 def _axes(values: Array) -> Array:
-    """Coordinates (A, N) of N vectors (N, D) on their first principal axes."""
+    """Coordinates (A, N) of N vectors (N, D) on their principal axes."""
     apart = values - values.mean(0)
     u, s, _ = np.linalg.svd(apart, full_matrices=False)
-    return np.asarray((u * s).T[:AXES])
+    return np.asarray((u * s).T)
 
 
 def _partitions(values: Array, most: int) -> list[NDArray[np.intp]]:

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.demonstrations import SMOOTHING, Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning, UnknownNameError
@@ -35,8 +35,6 @@ TRAVEL = 3.0
 FINEST = 0.1
 #: A link that held an object for a smaller share of the time than another is not its holder.
 LONG = 0.8
-#: Over so long motion is measured [s]: less is noise, more blurs where it begins.
-WINDOW = 0.2
 #: How far poses are from others, in units of the tolerances: at least 0, at most 1 if alike.
 Change = Callable[[Frame, Frame], Tensor]
 
@@ -250,9 +248,9 @@ class _Motion:
 
     def _window(self) -> tuple[Tensor, Tensor]:
         """For each instant, those between which its motion is measured."""
-        later = torch.searchsorted(self.time, self.time + WINDOW / 2)
+        later = torch.searchsorted(self.time, self.time + SMOOTHING / 2)
         later = later.clamp(max=len(self.time) - 1)
-        return torch.searchsorted(self.time, self.time - WINDOW / 2), later
+        return torch.searchsorted(self.time, self.time - SMOOTHING / 2), later
 
     def _span(self, name: str, pose: Frame, seed: int) -> tuple[int, int, Hold] | None:
         """Around a moment in motion: who held the object, if anyone did, and for how long."""
@@ -304,7 +302,7 @@ def _in_order(found: Sequence[Hold]) -> list[Hold]:
     holds: list[Hold] = []
     for hold in found:
         before = holds[-1] if holds else None
-        if before is None or before.end < hold.begin - WINDOW:
+        if before is None or before.end < hold.begin - SMOOTHING:
             holds.append(hold)
         elif before.link == hold.link:  # it slipped
             holds[-1] = replace(before, end=max(before.end, hold.end))
@@ -331,7 +329,7 @@ def _agreed(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
     found: list[Hold] = []
     for holds in zip(*alike, strict=True):
         begin, end = (median(getattr(h, name) for h in holds) for name in ("begin", "end"))
-        if found and begin - found[-1].end < WINDOW:  # as in one demonstration: handed on
+        if found and begin - found[-1].end < SMOOTHING:  # as in one demonstration: handed on
             found[-1] = replace(found[-1], end=begin)
         found.append(replace(holds[0], begin=begin, end=end))
     return found

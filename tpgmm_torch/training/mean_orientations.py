@@ -14,9 +14,6 @@ from tpgmm_torch.training.local_data import Motion
 
 __all__ = ["with_mean_orientations"]
 
-#: Rows of a path at most: between them it is interpolated.
-MOST = 1000
-
 
 def with_mean_orientations(
     operators: Sequence[Operator], motions: Sequence[Motion], kinematics: Kinematics
@@ -38,8 +35,7 @@ def with_mean_orientations(
     tuple of Operator
     """
     grid = max((one.time for one in motions), key=lambda time: float(time[-1]))
-    places = torch.linspace(0, len(grid) - 1, min(len(grid), MOST)).round().long()
-    instants = grid.double()[places]
+    instants = grid.double()
 
     def completed(operator: Operator) -> Operator:
         if isinstance(operator, Stack):

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.summary import ALIKE
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import leaves
@@ -37,14 +38,8 @@ __all__ = [
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
-#: What is nearer to the median is like the others: a share of the range of coordinates,
+#: What is nearer to the median is like the others: a share of the range of coordinates.
 NEAR = 0.005
-#: and an angle [rad].
-NEAR_ANGLE = 0.05
-#: So many robust standard deviations from the median are unlike the others, where they last for
-#: so long [s]. On real recordings: at most 6.1 of those who are not, at least 11.6 of those
-#: whose frame was taken at a wrong instant, 5 to 15 cm beside the right one.
-UNLIKE, LONG = 8.0, 0.5
 #: Demonstrations of more numbers than this (512 MB) are compared at fewer instants.
 LARGEST_TABLE = 2**26
 
@@ -76,13 +71,16 @@ def outlying_demonstrations(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     kinematics: Kinematics,
+    *,
+    threshold: float = 8.0,
+    duration: float = 0.5,
 ) -> tuple[Outlying, ...]:
     """Demonstrations far from the median of all, at instants at which the others agree.
 
     In local coordinates, operator by operator and instant by instant: by Hampel's identifier,
-    more than eight times 1.4826 times the median distance from the median, for half a second
-    in all. Where the others agree to less than 0.5 % of the range of an operator's coordinates,
-    or 0.05 rad, that counts as their distance.
+    more than ``threshold`` times 1.4826 times the median distance from the median. Where the
+    others agree to less than 0.5 % of the range of an operator's coordinates, or 0.05 rad, that
+    counts as their distance.
 
     Parameters
     ----------
@@ -92,6 +90,12 @@ def outlying_demonstrations(
         show several ways rather than mistakes.
     operators : sequence of Operator
     kinematics : Kinematics
+    threshold : float, default=8.0
+        So many robust standard deviations from the median are unlike the others. On real
+        recordings those who are not reach 6.1, those whose frame was taken at a wrong instant,
+        5 to 15 cm beside the right one, at least 11.6.
+    duration : float, default=0.5
+        For how long in all [s].
 
     Returns
     -------
@@ -100,33 +104,42 @@ def outlying_demonstrations(
     """
     if len(demonstrations) < FEWEST:  # nothing is read
         return ()
-    return outlying_rows(read_rows([demonstrations], operators, kinematics), kinematics)
+    rows = read_rows([demonstrations], operators, kinematics)
+    return outlying_rows(rows, kinematics, threshold=threshold, duration=duration)
 
 
-def outlying_rows(rows: TrainingRows, kinematics: Kinematics) -> tuple[Outlying, ...]:
+def outlying_rows(
+    rows: TrainingRows,
+    kinematics: Kinematics,
+    *,
+    threshold: float = 8.0,
+    duration: float = 0.5,
+) -> tuple[Outlying, ...]:
     """:func:`outlying_demonstrations` of rows that are read, of all batches and processes.
 
     Parameters
     ----------
     rows : TrainingRows
     kinematics : Kinematics
+    threshold, duration : float
+        As there.
     """
     number = rows.n_demonstrations
     if number < FEWEST:
         return ()
-    duration = float(rows.time[-1] - rows.time[0])
+    lasts = float(rows.time[-1] - rows.time[0])
     most = LARGEST_TABLE // (number * rows.rows.shape[1])
-    most = max(most, math.ceil(2 * duration / LONG) + 1)
+    most = max(most, math.ceil(2 * lasts / duration) + 1)
     time = at_phases(rows.time, min(len(rows.time), most))
     data = rows.at_phases(len(time))
-    step = duration / max(len(time) - 1, 1)
-    count = min(max(round(LONG / step), 1), len(time)) if step > 0 else 1
+    step = lasts / max(len(time) - 1, 1)
+    count = min(max(round(duration / step), 1), len(time)) if step > 0 else 1
     found: dict[int, Outlying] = {}
     for operator, local, near in comparable_coordinates(data, rows.operators, kinematics):
         distance = torch.linalg.vector_norm(local - local.median(0).values, dim=-1)  # (M, T)
         usual = distance.median(0).values.clamp(min=near) / NormalDist().inv_cdf(0.75)
         ratios, instants = (distance / usual).topk(count, dim=1)
-        for episode in (ratios[:, -1] > UNLIKE).nonzero()[:, 0].tolist():
+        for episode in (ratios[:, -1] > threshold).nonzero()[:, 0].tolist():
             ratio, instant = float(ratios[episode, -1]), int(instants[episode, -1])
             if episode not in found or ratio > found[episode].ratio:
                 found[episode] = Outlying(episode, operator, float(time[instant]), ratio)
@@ -167,10 +180,10 @@ def comparable_coordinates(
             others = torch.ones(width, dtype=torch.bool)
             for start in leaf.quaternion_starts(kinematics):
                 others[start : start + 4] = False
-                yield leaf, 2 * local[..., start : start + 4], NEAR_ANGLE
+                yield leaf, 2 * local[..., start : start + 4], ALIKE["turn"]
             for start in leaf.rotation_vector_starts(kinematics):
                 others[start : start + 3] = False
-                yield leaf, local[..., start : start + 3], NEAR_ANGLE
+                yield leaf, local[..., start : start + 3], ALIKE["turn"]
             local = local[..., others]
             spread = local.flatten(0, 1).amax(0) - local.flatten(0, 1).amin(0)
             if not bool((spread > 0).any()):
@@ -187,6 +200,9 @@ def drop_outliers(
     demonstrations: Sequence[Demonstration],
     operators: Sequence[Operator],
     robot: Kinematics | None = None,
+    *,
+    threshold: float = 8.0,
+    duration: float = 0.5,
 ) -> list[Demonstration]:
     """Demonstrations without those unlike the others, of which a warning tells.
 
@@ -200,6 +216,10 @@ def drop_outliers(
         In whose coordinates they are compared.
     robot : Kinematics, optional
         As of the estimator.
+    threshold : float, default=8.0
+        So many robust standard deviations from the median are unlike the others,
+    duration : float, default=0.5
+        where they last for so long in all [s].
 
     Returns
     -------
@@ -214,7 +234,9 @@ def drop_outliers(
     kinematics = kinematics_for(known, operators, robot, "float64", "cpu")
     if known[0].holds is None:
         known = attach_holds(known, kinematics)
-    outlying = outlying_demonstrations(known, operators, kinematics)
+    outlying = outlying_demonstrations(
+        known, operators, kinematics, threshold=threshold, duration=duration
+    )
     if outlying:
         finding = replace(unlike_the_others(outlying, len(known)), remedy="They are left out")
         Report.of([finding], f"{len(known)} demonstrations").act()

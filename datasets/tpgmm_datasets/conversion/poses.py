@@ -15,7 +15,7 @@ from tpgmm_datasets.names import pose_groups
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import UNIT_NORM_TOLERANCE, Frame
+from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import UnknownNameError
 
 __all__ = ["FramePose", "LinkPose"]
@@ -121,7 +121,7 @@ class FramePose:
         position, rotation = tensor[..., :3] * self.scale, tensor[..., 3:]
         if self.rotation in ("wxyz", "xyzw"):
             off = (torch.linalg.vector_norm(rotation, dim=-1) - 1).abs().max()
-            if off > UNIT_NORM_TOLERANCE:
+            if off > 2 * quaternions.DIGITS:
                 message = (
                     f"the norm of a quaternion is off by {float(off):.3g}; are the columns "
                     f"and their order right? The rotation is read as {self.rotation!r}"

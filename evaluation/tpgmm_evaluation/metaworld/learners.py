@@ -165,7 +165,7 @@ class TaskParameterized:
             "features": ["hand"],
             "penalty": 0.3,
             "smoothing": 0.04,
-            "fallback": False,
+            "min_gain": None,
         }
     )
     nearness: Nearness | None = field(default_factory=Nearness)

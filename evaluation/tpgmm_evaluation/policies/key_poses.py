@@ -20,7 +20,8 @@ from torch import Tensor
 from tpgmm_evaluation.policies.aligned import Aligned
 from tpgmm_torch import Demonstration, Frame, Hold, find_holds, quaternions
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.events import LEVER, find_gripper_changes, find_stops
+from tpgmm_torch.data.frames import LEVER
+from tpgmm_torch.events import find_gripper_changes, find_stops
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.robots.robot import Robot

@@ -168,7 +168,7 @@ def test_one_demonstration_alone_stays_itself(reference):
         ({"reference": 7}, DataError, "reference 7 is out of range: there are 2"),
         ({"reference": "mean"}, ValueError, "reference"),
         ({"max_slope": 1.5}, ValueError, "max_slope"),
-        ({"fallback": "linear"}, ValueError, "fallback"),
+        ({"min_gain": "linear"}, ValueError, "min_gain"),
     ],
 )
 def test_errors_say_what_is_wrong_with_the_parameters(parameters, error, message):
@@ -198,7 +198,7 @@ def test_smoothing_covers_its_seconds_on_both_sides():
     waiting = Demonstration(even, halting[:, None])
     steady = Demonstration(np.linspace(0, 3, 301), np.linspace(0, 3, 301)[:, None])
     # a wait, that the other does not have, is steeper than any usual bound
-    options = {"features": ["joints"], "penalty": 0.0, "max_slope": 60, "fallback": False}
+    options = {"features": ["joints"], "penalty": 0.0, "max_slope": 60, "min_gain": None}
     sharp, smooth = (
         DynamicTimeWarping(0, smoothing=s, **options).fit([waiting, steady]).paths_[1]
         for s in (0.0, 0.5)
@@ -244,7 +244,7 @@ def test_a_grasp_and_a_lift_stay_together_that_directions_confuse(robot, order):
 
 @pytest.mark.parametrize("max_slope", [1, 2, 4])
 def test_no_second_of_a_warp_is_steeper_or_flatter_than_allowed(max_slope):
-    fitted = DynamicTimeWarping(0, features=["joints"], max_slope=max_slope, fallback=False)
+    fitted = DynamicTimeWarping(0, features=["joints"], max_slope=max_slope, min_gain=None)
     for path in fitted.fit(DEMONSTRATIONS[:4]).paths_:
         steps = round(1.0 / float(fitted.time_[1]))
         share = (path - path[0]) / (path[-1] - path[0])

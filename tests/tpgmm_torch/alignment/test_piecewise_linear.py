@@ -187,7 +187,7 @@ def test_parts_that_are_short_or_still_stay_even_and_a_fallback_is_reported():
         )
         for pace in (1.0, 1.5)
     ]
-    transformer = EventAlignment(within=DynamicTimeWarping(fallback=False)).fit(still)
+    transformer = EventAlignment(within=DynamicTimeWarping(min_gain=None)).fit(still)
     assert [part is None for part in transformer.parts_] == [False, True, True]
     # joints that do not agree on a warp: each part gains by one and loses by the other
     rng = np.random.default_rng(0)

@@ -91,7 +91,7 @@ def test_bins_along_time_of_large_data_come_from_a_sample(monkeypatch):
     rows = movements(2000)
     [exact] = drawn(points_of(rows), "time", n_starts=1)
     np.testing.assert_allclose(exact.weights, 0.2)
-    monkeypatch.setattr("tpgmm_torch.mixture.points.LARGEST_SAMPLE", 500)
+    monkeypatch.setattr("tpgmm_torch.mixture.points.FILE_ROWS", 500)
     [near] = drawn(points_of(rows), "time", n_starts=1)
     np.testing.assert_allclose(near.weights, 0.2, atol=0.03)
     assert not torch.equal(near.weights, exact.weights)

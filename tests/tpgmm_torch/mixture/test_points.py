@@ -46,7 +46,7 @@ def test_a_group_larger_than_all_chunks_is_not_cut(monkeypatch):
 @pytest.mark.parametrize("every", [1, 5])
 @pytest.mark.parametrize("largest", [2**16, 150])
 def test_few_rows_are_sampled_whole_and_of_many_some(every, largest, monkeypatch):
-    monkeypatch.setattr("tpgmm_torch.mixture.points.LARGEST_SAMPLE", largest)
+    monkeypatch.setattr("tpgmm_torch.mixture.points.FILE_ROWS", largest)
     samples = [points_of(ROWS, rows=rows).sample(every) for rows in (None, RowFile.of([ROWS]))]
     for found, numbers in samples:
         assert len(numbers) == 1200 // every if largest > 1200 else 100 < len(numbers) <= 150
