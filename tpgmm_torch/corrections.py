@@ -13,14 +13,15 @@ import torch
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
+from tpgmm_torch.data.frames import LEVER
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["in_skill_time"]
 
-#: What differs by this [rad], [m], or is twice as fast or slow, is one unit apart.
-JOINTS, LINKS, SLOPE = 0.1, 0.05, math.log(2.0)
+#: What differs by this [rad], or is twice as fast or slow, is one unit apart.
+JOINTS, SLOPE = 0.1, math.log(2.0)
 
 
 def in_skill_time(
@@ -124,6 +125,5 @@ def _placed(
 def _features(skill: Skill, joints: torch.Tensor) -> Array:
     """Joints and positions of links (T, D), in units of what counts as a difference."""
     state = skill.kinematics.state(joints)
-    parts = [state.joints / JOINTS]
-    parts += [state.position(link) / LINKS for link in skill.kinematics.links]
-    return as_array(torch.cat(parts, dim=-1))
+    positions = [state.position(link) / LEVER for link in skill.kinematics.links]
+    return as_array(torch.cat([state.joints, *positions], dim=-1) / JOINTS)

@@ -31,6 +31,9 @@ __all__ = [
 
 #: A component is left out of a chunk where its responsibilities are below exp(-36), rounding,
 NEGLIGIBLE = -math.log(torch.finfo(torch.float64).eps)
+#: and guessed to be by densities of the last pass that are less by so much more [nats]: of
+#: smaller margins more guesses are wrong, and evaluated again.
+MARGIN = 4.0
 #: By how much a mean log-density may be off by rounding, relative to 1 and to itself.
 ROUNDING = {torch.float64: 2e-13, torch.float32: 1e-5}
 
@@ -234,8 +237,12 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     """
     maps, peaks = whiten(parameters)
     ceilings = _ceilings(parameters, peaks, points.spans)
-    limits = torch.full_like(ceilings[:, 0], -math.inf) if least is None else least - NEGLIGIBLE
-    limits = torch.minimum(limits, ceilings.amax(1) - NEGLIGIBLE)
+    limits = (
+        torch.full_like(ceilings[:, 0], -math.inf)
+        if least is None
+        else least - (NEGLIGIBLE + MARGIN)
+    )
+    limits = torch.minimum(limits, ceilings.amax(1) - (NEGLIGIBLE + MARGIN))
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
     rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)

@@ -362,7 +362,7 @@ def _numbers(
         hint = f". {XACRO}" if re.search(r"\$[{(]", text) else ""
         raise DataError(
             f"joint {element.get('name')!r}: <{tag} {attribute}> needs {len(default)} finite "
-            f"number(s) up to {largest:g}, got {text[:100]!r}{hint}"
+            f"number(s) up to {largest:.3g}, got {text[:100]!r}{hint}"
         )
     return values
 

@@ -78,12 +78,14 @@ class Fold:
         return error, float(model.score(self.test))
 
 
-def _bottle(n: int) -> Fold:
-    """The bottle skill: so many demonstrations, and other situations of seed 1000."""
+def _bottle(n: int, n_operators: int = 2) -> Fold:
+    """The bottle skill: so many demonstrations, and others of seed 1000 to compare with."""
     skill = BottleShaking(rate=20)
     clock = DynamicTimeWarping(features=["directions"]).fit(shown := skill.demonstrations(n, 0))
     model = TaskParameterizedGMM(30, bottle_operators(), skill.robot, random_state=0)
     test = clock.transform(skill.demonstrations(10, 1000))
+    # without an operator of the joints the prior decides what the hands leave free
+    model.set_params(operators=model.operators[:n_operators])
     return Fold(clock.transform(shown), test, model, skill.robot, "r_hand")
 
 
@@ -119,6 +121,7 @@ def parameter_sensitivity(plan: Plan) -> Iterator[str]:
     sets = {
         "bottle, 5": [_bottle(5)],
         "bottle, 10": [_bottle(10)],
+        "bottle, 10, hands alone": [_bottle(10, 1)],
         "g1": list(_recorded(plan, "g1", "g1_bottle")),
         "honeytea": list(_recorded(plan, "honeytea", "honeytea_bimanual")),
     }
