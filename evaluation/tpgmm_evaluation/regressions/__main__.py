@@ -3,7 +3,6 @@
     python -m tpgmm_evaluation.regressions baseline --small
     python -m tpgmm_evaluation.regressions compare --small --only goldens,demo
     python -m tpgmm_evaluation.regressions sensitivity tpgmm_torch.regression.prior:PRIOR_STD
-    python -m tpgmm_evaluation.regressions sensitivity
 
 ``baseline`` writes one file for each cell into ``OUT/baseline`` (``OUT/baseline-small``);
 ``compare`` measures the present code in the same way into ``OUT/now`` (``OUT/now-small``) and
@@ -23,7 +22,6 @@ from pathlib import Path
 import torch
 
 from tpgmm_evaluation.regressions.comparison import compared, stored, table
-from tpgmm_evaluation.regressions.parameters import parameter_sensitivity
 from tpgmm_evaluation.regressions.plan import Plan
 from tpgmm_evaluation.regressions.sections import SECTIONS, measure, timed
 from tpgmm_evaluation.regressions.sensitivity import sensitivity
@@ -38,7 +36,7 @@ def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("what", choices=("baseline", "compare", "sensitivity"))
-    parser.add_argument("constant", nargs="?", help="MODULE:NAME; else parameters")
+    parser.add_argument("constant", nargs="?", help="MODULE:NAME, for sensitivity")
     parser.add_argument("--out", type=Path, default=Path("out"), metavar="DIR")
     parser.add_argument("--small", action="store_true", help="minutes in place of hours")
     parser.add_argument("--only", help="sections, with commas")
@@ -63,10 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     plan = Plan(before, given.small, workers=given.workers)
     if given.what == "sensitivity":
         plan = replace(plan, out=given.out / "sensitivity")
-        found = parameter_sensitivity(plan)
-        if given.constant:
-            found = sensitivity(given.constant, plan, given.only.split(","))
-        for line in found:
+        for line in sensitivity(given.constant or "", plan, given.only.split(",")):
             print(line, flush=True)
         return 0
     if given.what == "compare":

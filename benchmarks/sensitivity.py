@@ -1,9 +1,15 @@
-"""Sensitivity to parameters that a user may set: what is measured at half and at twice."""
+"""Sensitivity to parameters that a user may set: what is measured at half and at twice.
+
+    python -m benchmarks.sensitivity
+
+The recordings are read from ``../shared/data``, and left out where they are not there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,8 +30,6 @@ from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.outlying_demonstrations import outlying_demonstrations
-
-__all__ = ["parameter_sensitivity"]
 
 #: Values of the estimator's parameters beside the usual ones, which come first.
 VALUES: Mapping[str, Sequence[Any]] = {
@@ -82,10 +86,10 @@ def _bottle(n: int, n_operators: int = 2) -> Fold:
     """The bottle skill: so many demonstrations, and others of seed 1000 to compare with."""
     skill = BottleShaking(rate=20)
     clock = DynamicTimeWarping(features=["directions"]).fit(shown := skill.demonstrations(n, 0))
-    model = TaskParameterizedGMM(30, bottle_operators(), skill.robot, random_state=0)
+    # without the operator of the joints the prior decides what the hands leave free
+    operators = bottle_operators()[:n_operators]
+    model = TaskParameterizedGMM(30, operators, skill.robot, random_state=0)
     test = clock.transform(skill.demonstrations(10, 1000))
-    # without an operator of the joints the prior decides what the hands leave free
-    model.set_params(operators=model.operators[:n_operators])
     return Fold(clock.transform(shown), test, model, skill.robot, "r_hand")
 
 
@@ -166,3 +170,9 @@ def _found(fold: Fold, index: int, offset: float, settings: Any) -> tuple[int, i
     unlike = outlying_demonstrations(shown, bottle_operators(), fold.robot, **settings)
     numbers = [one.episode for one in unlike]
     return int(index in numbers), len(set(numbers) - {index})
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for line in parameter_sensitivity(Plan(Path())):
+        print(line, flush=True)
