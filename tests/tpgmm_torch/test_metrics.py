@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
-from sklearn.model_selection import GridSearchCV, KFold, cross_val_score
+from sklearn.model_selection import KFold, cross_val_score
 from sklearn.pipeline import make_pipeline
 
 from tests.support.skills import (
@@ -18,7 +18,6 @@ from tests.support.skills import (
     handlings,
     hands,
     hands_model,
-    wave,
     waves,
 )
 from tests.support.worlds import LEFT, OnPoses, upper_body
@@ -198,16 +197,6 @@ def test_a_pose_scorer_is_minus_the_mean_error():
 
 
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_a_pose_scorer_serves_scikit_learn():
-    shown = [replace(d, events={"close": 1.0}) for d in handlings(4)]
-    scorer = PoseScorer("right", "close")
-    search = GridSearchCV(
-        hands_model(), {"n_components": [1, 6]}, scoring=scorer, cv=KFold(2)
-    ).fit(shown)
-    assert search.best_params_ == {"n_components": 6}
-
-
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_scorers_of_a_pipeline_align_what_is_held_out():
     """The same skill at other speeds: apart on their own clocks, alike on the common one."""
     shown = [
@@ -248,10 +237,3 @@ def test_speed_and_acceleration_are_those_of_a_parabola(kind):
     last = float(3 * (time[-1] + time[-2]) / 2)
     assert largest_velocity(motion) == pytest.approx(max(3.0, last))
     assert largest_acceleration(motion) == pytest.approx(3.0, rel=1e-6)
-
-
-def test_the_speed_of_a_wave_is_its_derivative():
-    time = torch.linspace(0, 4, 4001, dtype=torch.float64)
-    motion = trajectory(time, wave(time))
-    assert largest_velocity(motion) == pytest.approx(3, rel=1e-4)
-    assert largest_acceleration(motion) == pytest.approx(9, rel=1e-4)

@@ -18,7 +18,6 @@ from tests.support.skills import (
 )
 from tpgmm_torch import (
     Canonical,
-    Controller,
     Demonstration,
     Hold,
     Sequence,
@@ -126,16 +125,6 @@ def test_what_is_held_is_kept_to_the_end(tmp_path):
     again = load_model(tmp_path / "model")
     assert again.holds_ == model.holds_ and len(again.holds_) == 2
     assert again.n_demonstrations_ is None and again.summary_ is None
-
-
-def test_controllers_run_what_was_loaded(tmp_path):
-    save(small_bottle(), tmp_path / "model")
-    shown = shown_to(small_bottle())
-    commands = []
-    for model in (small_bottle(), load_model(tmp_path / "model")):
-        controller = Controller(model.skill, shown.joints[0], shown.frames, clock="even")
-        commands.append([controller.step(0.05).reference for _ in range(5)][-1])
-    assert torch.equal(*commands)
 
 
 @dataclass(frozen=True)

@@ -39,16 +39,6 @@ def test_every_demonstration_has_a_start_and_an_end():
         shown.event("open")
 
 
-def test_a_demonstration_knows_its_size():
-    demo = demonstration()
-    assert (len(demo), demo.n_joints, demo.duration) == (5, 2, 2.0)
-    assert demo.joint_names == ("shoulder", "elbow")
-    assert repr(demo) == (
-        "Demonstration(5 steps, 2.00 s, 2 joints, frames=['bottle', 'tray'], "
-        "events={'grasp': 0.5})"
-    )
-
-
 def test_frames_are_found_by_name():
     assert demonstration().frame("bottle").position.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(UnknownNameError) as error:
@@ -121,12 +111,6 @@ def test_nothing_given_to_a_demonstration_is_shared_or_modified():
 def test_attributes_cannot_be_replaced(attribute):
     with pytest.raises(AttributeError, match="cannot assign to field"):
         setattr(demonstration(), attribute, None)
-
-
-def test_poses_cannot_be_replaced():
-    demo = demonstration()
-    with pytest.raises(AttributeError, match="cannot assign to field"):
-        demo.frames["bottle"].position = torch.ones(3)
 
 
 def test_reordered_moves_the_columns_and_keeps_the_rest():

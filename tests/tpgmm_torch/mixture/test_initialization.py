@@ -51,13 +51,6 @@ def test_bins_of_a_whole_sample_are_exact(distinct):
     np.testing.assert_array_equal(labelled(times, sizes), expected)
 
 
-def test_groups_have_one_label():
-    times = np.random.RandomState(0).permutation(20.0 * np.arange(12))
-    found = labelled(times, [3, 4, 5], group_size=3).reshape(12, 3)
-    assert (found == found[:, :1]).all()
-    assert np.bincount(found[:, 0]).tolist() == [3, 4, 5]
-
-
 @pytest.mark.parametrize("distinct", [2, 10**9])
 def test_bins_of_a_sample_hold_nearly_equal_parts(distinct):
     """Ties or not, no bin is empty: points of equal time differ by their numbers."""

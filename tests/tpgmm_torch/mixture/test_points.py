@@ -53,11 +53,3 @@ def test_few_rows_are_sampled_whole_and_of_many_some(every, largest, monkeypatch
         assert (np.diff(numbers) > 0).all() and numbers.max() > 0.9 * (1200 // every)
         expected = ((ROWS - ROWS.mean(0)) / ROWS.std(0))[::every][numbers]
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
-
-
-def test_rows_that_may_not_be_written_are_left_alone():
-    rows = ROWS.copy()
-    rows.setflags(write=False)
-    points = points_of(rows)
-    assert len(list(points)) >= 1
-    np.testing.assert_array_equal(rows, ROWS)

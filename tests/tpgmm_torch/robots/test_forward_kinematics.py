@@ -2,18 +2,15 @@
 
 import numpy as np
 import pytest
-import pytorch_kinematics
 import torch
 
 from tests.support.robot_zoo import (
-    HANDS,
     g1,
     random_joints,
     upper_body,
     written_out,
     zoo,
 )
-from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import quaternions
 
 ROBOTS = {
@@ -48,16 +45,6 @@ def test_every_robot_of_a_batch_is_the_products_along_its_tree(make, count):
         np.testing.assert_allclose(jacobians[index], expected, rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_the_type_is_the_one_asked_for(count):
-    robot = zoo()
-    joints = random_joints(robot, count)
-    single = robot.to(torch.float32).forward_kinematics(joints.float())
-    for rounded, exact in zip(single, robot.forward_kinematics(joints), strict=True):
-        assert rounded.dtype == torch.float32
-        torch.testing.assert_close(rounded.double(), exact, rtol=0, atol=2e-6)
-
-
 def test_a_turn_beyond_a_half_comes_back_with_a_real_part_that_is_not_negative():
     robot = zoo(("turret",), joints=["swivel"])
     for angle in (2.0, 3.5, 6.0, -3.5):
@@ -79,28 +66,6 @@ def test_one_robot_has_any_shape():
         for name in ("positions", "orientations", "jacobians"):
             part, whole = getattr(alone, name), getattr(state, name)
             assert torch.equal(whole, part.expand(*batch, *part.shape))
-
-
-def test_no_robot_at_all_is_a_batch_too():
-    state = upper_body().state(torch.zeros(0, 17))
-    assert state.positions.shape == (0, 2, 3)
-    assert state.jacobians.shape == (0, 2, 6, 17)
-
-
-@pytest.mark.parametrize("repeats", [1, 10])
-def test_upper_body_agrees_with_pytorch_kinematics(repeats):
-    robot = upper_body()
-    chain = pytorch_kinematics.build_chain_from_urdf(upper_body_urdf().encode())
-    assert tuple(chain.get_joint_parameter_names()) == robot.joint_names
-    joints = random_joints(robot, 20).repeat(repeats, 1)
-    state = robot.state(joints)
-    poses = chain.to(dtype=torch.float64).forward_kinematics(joints)
-    for hand in HANDS:
-        matrix = poses[hand].get_matrix()
-        # it keeps the origins of the joints in float32
-        torch.testing.assert_close(state.position(hand), matrix[:, :3, 3], rtol=0, atol=1e-6)
-        rotation = quaternions.to_matrix(state.orientation(hand))
-        torch.testing.assert_close(rotation, matrix[:, :3, :3], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 3])

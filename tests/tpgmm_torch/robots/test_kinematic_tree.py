@@ -3,13 +3,11 @@
 from typing import Any
 
 import numpy as np
-import pytest
 
 from tests.support.robot_zoo import (
     ZOO,
     ZOO_JOINTS,
 )
-from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots.kinematic_tree import Body, reduce
 from tpgmm_torch.robots.urdf import placement, read_urdf
 
@@ -29,19 +27,6 @@ def test_only_joints_on_the_way_are_kept_and_parents_come_first():
     assert [body.joint for body in reduced] == [None, 0, 1, 2, 4, None, None]
     assert [body.parent for body in reduced] == [0, 0, 1, 2, 0, 3, 4]
     assert [body.slides for body in reduced] == [False, True, *[False] * 5]
-
-
-def test_followers_say_how_they_follow():
-    reduced = tree(("r_finger", "tip"))
-    following = {(b.joint, b.multiplier, b.shift) for b in reduced[1:-2]}
-    assert following == {
-        (0, 1.0, 0.0),
-        (1, 1.0, 0.0),
-        (2, 1.0, 0.0),
-        (3, -1.0, 0.01),
-        (4, 1.0, 0.0),
-        (2, 0.5, 0.2),
-    }
 
 
 def test_what_two_links_share_is_there_once():
@@ -64,14 +49,3 @@ def test_the_pose_in_a_link_is_kept_behind_what_is_folded_into_it():
     reduced = reduce(read_urdf(ZOO), "arm", [("flange", tool)], COLUMNS, {})
     assert [body.joint for body in reduced] == [None, None]
     np.testing.assert_allclose(reduced[1].pose, weld @ tool, atol=1e-15)
-
-
-def test_joints_of_several_degrees_of_freedom_are_refused_only_on_the_way():
-    text = ZOO.replace("</robot>", "") + (
-        '<link name="world"/><joint name="free" type="floating">'
-        '<parent link="world"/><child link="ground"/></joint></robot>'
-    )
-    model, wanted = read_urdf(text), [("flange", np.eye(4))]
-    assert len(reduce(model, "ground", wanted, COLUMNS, {})) == 5
-    with pytest.raises(DataError, match="'free' of type 'floating' lies between"):
-        reduce(model, "world", wanted, COLUMNS, {})

@@ -134,12 +134,6 @@ class TestNames:
         assert robot.joint_names == ("pan", "tilt", "extend", "joint3", "left")
         assert read_urdf(mjcf_to_urdf(scene)).name == "bench"
 
-    def test_settings_are_those_of_urdf(self, scene: Path) -> None:
-        robot = Robot.from_mjcf(
-            scene, ["tip"], joints="*t*", locked={"pan": 0.1}, coordinates=["grip"]
-        )
-        assert robot.joint_names == ("tilt", "extend", "joint3", "left", "grip")
-
     def test_nobody_needs_mujoco_to_load_one(self, scene: Path, monkeypatch) -> None:
         robot = Robot.from_mjcf(scene, ["tip"])
         saved = encode(robot)
@@ -180,11 +174,6 @@ class TestLimits:
         joints = '<joint name="j"/><joint name="k" axis="1 0 0"/>'
         tie = f'<equality><joint joint1="j" joint2="k" {equality}/></equality>'
         assert Robot.from_mjcf(one(joints, tie), ["b"]).joint_names == ("j", "k")
-
-
-def test_a_byte_order_mark_does_not_make_a_text_a_path():
-    text = one('<joint name="j" axis="0 0 1"/>')
-    assert mjcf_to_urdf(f"\ufeff\n{text}\n") == mjcf_to_urdf(text)
 
 
 RADIANS = '<mujoco><compiler angle="radian"/>'
@@ -245,18 +234,6 @@ class TestRefusing:
             Robot.from_mjcf(scene, ["tip"])
         with pytest.raises(DataError, match="cannot be read"):
             Robot.from_mjcf("none.xml", ["tip"])
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ("<mujoco", "not well-formed"),
-            ("<mujoco><arm/></mujoco>", "MuJoCo cannot compile"),
-            (upper_body_urdf(), "root element <mujoco>, got <robot>"),
-        ],
-    )
-    def test_what_is_no_mjcf(self, text: str, message: str) -> None:
-        with pytest.raises(DataError, match=message):
-            Robot.from_mjcf(text, ["b"])
 
     def test_urdf_says_what_reads_an_mjcf(self) -> None:
         with pytest.raises(DataError, match=r"Robot\.from_mjcf"):
