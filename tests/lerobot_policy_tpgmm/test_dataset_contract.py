@@ -86,14 +86,6 @@ def test_what_does_not_fit_a_data_set_is_refused(options, features, message):
         TPGMMPolicy(made, dataset_meta=dataset(20, **features))
 
 
-def test_a_robot_may_be_an_mjcf_or_one_that_comes_with_the_package(tmp_path):
-    body = '<body name="hand"><joint name="lift"/><geom size="0.1"/></body>'
-    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-    made = config(robot=str(tmp_path / "arm.xml"), links=["hand"])
-    assert made.kinematics().joint_names == ("lift",)
-    assert config(robot="so101").kinematics().links == ("gripper_frame_link",)
-
-
 @pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])
 def test_joints_are_chosen_by_patterns(joints):
     made = draccus.parse(

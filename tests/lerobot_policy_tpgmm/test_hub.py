@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 from lerobot.envs.factory import make_env
-from lerobot.policies import PreTrainedPolicy
 
 from lerobot_env_bimanual import CarryAndPutConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
@@ -34,14 +33,6 @@ def test_a_policy_comes_back_from_the_hub(hub):
     assert "--policy.path=lab/shake" in card
     again = TPGMMPolicy.from_pretrained("lab/shake")
     assert torch.equal(act(again, batch(), 5), act(policy, batch(), 5))
-
-
-def test_the_card_of_lerobot_train_says_what_the_mixture_does(monkeypatch):
-    theirs = SimpleNamespace(content="# LeRobot's card\n")
-    monkeypatch.setattr(PreTrainedPolicy, "generate_model_card", lambda *_, **__: theirs)
-    card = fitted().generate_model_card("lab/set", "tpgmm", None, None)
-    assert card.content.startswith("# LeRobot's card\n")
-    assert "## What matters, and when" in card.content
 
 
 def test_lerobot_loads_the_environments_from_the_hub(hub, tmp_path):

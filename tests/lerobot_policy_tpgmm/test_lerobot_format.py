@@ -68,12 +68,6 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
     assert "exists and is not a tpgmm policy" in refusal(*arguments, tmp_path / "policy")
 
 
-def test_an_unknown_format_is_refused(tmp_path):
-    line = refusal("fit", tmp_path, "--out", tmp_path / "out", "--format", "onnx")
-    assert "format 'onnx' is not known here; there are ['lerobot', 'tpgmm']" in line
-    assert "pip install lerobot_policy_tpgmm" in line
-
-
 def test_lerobot_eval_runs_it(directory, tmp_path):
     done = lerobot(
         "eval", f"--policy.path={directory}", "--env.type=bottle_shaking", "--env.fps=20",

@@ -15,9 +15,8 @@ from tests.support.skills import (
     waves,
 )
 from tests.support.skills import new_handling as situation
-from tpgmm_torch import TaskParameterizedGMM, save
+from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, ShapeError
-from tpgmm_torch.persistence import load_model
 from tpgmm_torch.robots.joint_space import JointSpace
 
 DIMENSIONS = [operator.dimension(HANDS) for operator in HANDLING]
@@ -47,23 +46,6 @@ def test_a_model_comes_back_equal(covariance_type):
     [one], [other] = (m.predict([situation()[0]]) for m in (back, model))
     # the last digit of a covariance, times its condition number
     torch.testing.assert_close(one.joints, other.joints, rtol=0, atol=1e-7)
-
-
-def test_a_float32_model_comes_back():
-    model = canonical(dtype="float32").fit(waves())
-    back = parameters_of(model).to_estimator(
-        canonical(dtype="float32", robot=JointSpace(("a", "b", "c"), torch.float32))
-    )
-    assert back.weights_.dtype == torch.float32
-    same(back, model, 1e-6)
-
-
-def test_a_model_that_was_restored_can_be_saved(tmp_path):
-    back = parameters_of(hands()).to_estimator(hands_model())
-    save(back, tmp_path / "model")
-    loaded = load_model(tmp_path / "model")
-    same(loaded, back)
-    assert loaded.n_iter_ == 0 and loaded.lower_bound_ != loaded.lower_bound_
 
 
 def test_the_copies_share_no_memory_with_the_model():
@@ -109,30 +91,6 @@ def test_covariances_stay_positive_definite_whatever_the_step(step):
     if step == 1.0:
         for covariance in made.tensors()[2]:
             assert not torch.linalg.cholesky_ex(covariance)[1].any()
-
-
-def test_sizes_follow_from_the_arguments():
-    made = parameters_of(hands())
-    sizes = {name: tuple(value.shape) for name, value in made.state_dict().items()}
-    assert sizes == {
-        "logits": (6,),
-        "means.0": (6, 8),
-        "means.1": (6, 8),
-        "factors.0": (6, 8, 8),
-        "factors.1": (6, 8, 8),
-        "time": (30,),
-        "fitted": (),
-    }
-    sizes |= {"time": (0,)}
-    unfitted = MixtureParameters(6, DIMENSIONS).state_dict()
-    assert {name: tuple(value.shape) for name, value in unfitted.items()} == sizes
-
-
-def test_the_time_grid_becomes_the_models():
-    made = MixtureParameters(6, DIMENSIONS)
-    made.copy_from(hands())
-    assert torch.equal(made.time, hands().time_)
-    assert made.state_dict()["time"].shape == (30,)
 
 
 def test_what_does_not_fit_is_refused():

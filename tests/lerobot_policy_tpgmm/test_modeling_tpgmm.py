@@ -1,13 +1,8 @@
 """What a policy does is what its model predicts, in every way that LeRobot asks for it."""
 
-import copy
-import logging
-
-import numpy as np
 import pytest
 import torch
 
-import lerobot_policy_tpgmm
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.carrying import carrying_model, scenes
@@ -33,20 +28,9 @@ from tests.support.skills import (
     small_bottle,
     waves,
 )
-from tpgmm_torch import (
-    Canonical,
-    Controller,
-    Frame,
-    Situation,
-    TaskParameterizedGMM,
-)
+from tpgmm_torch import Canonical, Controller, Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.control.rollout import rollout
-from tpgmm_torch.exceptions import (
-    DataError,
-    ModelFileError,
-    NotFittedError,
-    ShapeError,
-)
+from tpgmm_torch.exceptions import DataError, ModelFileError, NotFittedError, ShapeError
 
 #: Actions per second in tests of the closed loop: a robot that is held is missed for longer.
 RATE = 20.0
@@ -210,20 +194,6 @@ def test_tracked_bodies_are_moved_on_their_manifold():
         torch.testing.assert_close(norms, torch.ones_like(norms), rtol=0, atol=1e-5)
 
 
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_a_gradient_can_follow_inference():
-    acting = policy()
-    act(acting, batch(), 2)
-    model = acting.to_estimator()
-    weights, means, _ = acting.mixture.tensors()
-    (weights.square().sum() + means[0].sum()).backward()
-    assert acting.mixture.logits.grad is not None
-    joints = small_bottle().time_.new_zeros(17).requires_grad_()
-    frame = situations(batch())[0].frames["bottle"]
-    model.step(0.0, model.kinematics_.state(joints), {"bottle": frame}).joints.sum().backward()
-    assert joints.grad is not None
-
-
 # Closed loop
 
 
@@ -281,23 +251,6 @@ def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what):
     # after its patience and braking it stands, and then it moves again
     assert float(speed[1, 68:88].max()) < 1e-3 < 0.05 < float(speed[1, 92:].max())
     assert bool((speed <= fitted().kinematics.velocity * (1 + 1e-4)).all())
-
-
-def test_a_stopped_robot_is_waited_for():
-    kept = {}
-
-    def observe(step, now):
-        if 40 <= step < 240:  # its drives hold it for ten seconds
-            now[STATE][1] = kept.setdefault("state", now[STATE][1].clone())
-        return now
-
-    steps = round((float(small_bottle().time_[-1]) + 11) * RATE)
-    acting = closed()
-    actions, free = run(acting, steps, observe), run(acting, steps, as_it_is)
-    assert_close(actions[:1], free[:1].double())
-    nominal = round(float(small_bottle().time_[-1]) * RATE)
-    late, there = ((actions[1, k] - free[1, -1]).abs().max() for k in (nominal, -1))
-    assert there < 0.01 < 0.1 < late
 
 
 def test_timestamps_tell_how_much_time_has_passed():
@@ -361,17 +314,6 @@ def test_estimators_that_cannot_be_written_are_refused():
     model = canonical(operators=[Mine()]).fit(waves())
     with pytest.raises(ModelFileError, match="'Mine', which is not known here"):
         TPGMMPolicy.from_estimator(model)
-
-
-def test_a_seed_that_is_no_number_is_left_out(caplog):
-    model = copy.copy(canonical().fit(waves())).set_params(
-        random_state=np.random.RandomState(0)
-    )
-    with caplog.at_level(logging.WARNING):
-        policy = TPGMMPolicy.from_estimator(model, chunk_size=4)
-    assert policy.config.em.random_state is None and policy.config.chunk_size == 4
-    assert not caplog.records
-    assert lerobot_policy_tpgmm.TPGMMConfig is type(policy.config)
 
 
 def test_what_is_held_is_part_of_the_policy(tmp_path):

@@ -105,13 +105,6 @@ def test_a_pose_may_have_a_default():
     assert torch.equal(act(other, batch(), 5), act(fitted(), batch(), 5))
 
 
-def test_a_missing_pose_is_refused():
-    with pytest.raises(
-        DataError, match=r"pose of 'bottle' is missing.*default_environment_state"
-    ):
-        act(fitted(), {STATE: batch()[STATE]}, 1)
-
-
 def test_what_is_no_pose_is_refused():
     with pytest.raises(ShapeError, match=r"shape \(2, 7\), got \(2, 14\): is this policy for"):
         act(fitted(), {**batch(), ENVIRONMENT: torch.zeros(2, 14)}, 1)

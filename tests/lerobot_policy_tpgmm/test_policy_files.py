@@ -65,13 +65,6 @@ def test_a_policy_comes_back_equal(saved):
     assert torch.equal(act(made, batch(), 20), wanted)
 
 
-def test_saving_twice_replaces(directory):
-    other = changed(fitted(), chunk_size=3)
-    other.save_pretrained(directory)
-    assert files_of(directory).keys() == FILES
-    assert TPGMMPolicy.from_pretrained(directory).config.chunk_size == 3
-
-
 def test_an_interrupted_save_leaves_what_was_there(directory, monkeypatch):
     (directory / "notes.txt").write_text("mine")
     before, other = files_of(directory), changed(fitted(), chunk_size=3)
@@ -101,13 +94,6 @@ def test_the_pipelines_around_it_change_nothing(saved):
         through = after(fitted().select_action(before(observed)))
     assert torch.equal(through, act(fitted(), batch(), 1)[:, 0])
     assert torch.equal(before(observed)[STATE], batch()[STATE])
-
-
-def test_an_episode_starts_the_skill_that_is_there():
-    acting = fitted()
-    model = acting.to_estimator()
-    act(acting, batch(), 1)
-    assert acting.to_estimator() is model
 
 
 def test_what_gradient_steps_changed_is_saved(directory):

@@ -20,7 +20,18 @@ from torch import Tensor
 import tpgmm_torch
 from tests.support import oracles
 from tests.support.local_coordinates import local_coordinates
-from tests.support.worlds import OBJECT, World, moved
+from tests.support.worlds import (
+    CARRIED,
+    LEFT,
+    OBJECT,
+    RIGHT,
+    CarryingOnPoses,
+    CarryingOnRobot,
+    OnPoses,
+    OnRobot,
+    World,
+    moved,
+)
 from tpgmm_torch import Demonstration, Frame, quaternions
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots import RobotState
@@ -273,3 +284,35 @@ class OrientationLaws(OperatorLaws):
             other[..., start : start + 4] *= -1
         answer = self.candidate(wanted, state, frames)
         torch.testing.assert_close(self.candidate(other, state, frames), answer)
+
+
+FREE, CARRYING = (OnRobot, OnPoses), (CarryingOnRobot, CarryingOnPoses)
+#: Where operators of one link, or of a link seen from something, are tested.
+PLACES = {
+    "Absolute": (FREE, LEFT),
+    "Relative": (FREE, RIGHT, OBJECT),
+    "HandToHand": (FREE, RIGHT, LEFT),
+    "Carried": (CARRYING, CARRIED),
+    "CarriedToPlace": (CARRYING, CARRIED, OBJECT),
+    "OtherHandToCarried": (CARRYING, LEFT, CARRIED),
+}
+
+
+def laws_in_places(kinds, rows, laws, places=PLACES, **options) -> dict[str, type]:
+    """Test classes of an absolute and a relative operator, by name, for each place and world.
+
+    ``kinds`` and ``rows`` are a pair each, of operators and of their rows of Table I.
+    """
+    made = {}
+    for place, (worlds, *names) in places.items():
+        relative = len(names) == 2
+        held = {"held": True} if relative and names[1] == CARRIED else {}
+        for world in worlds:
+            bases = (world, RelativeLaws, laws) if relative else (world, laws)
+            body = {
+                "operator": kinds[relative](*names, **options, **held),
+                "row": lambda _, at, row=rows[relative], names=names: row(at, *names),
+            }
+            name = f"Test{place}{world.__name__}"
+            made[name] = type(world)(name, bases, body)
+    return made

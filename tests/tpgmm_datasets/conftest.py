@@ -2,9 +2,7 @@
 
 import pytest
 
-from tests.support.lerobot_sets import (
-    write,
-)
+from tests.support.lerobot_sets import write
 
 
 @pytest.fixture

@@ -16,10 +16,7 @@ from tests.support.lerobot_sets import (
     to_v21,
     undeclared,
 )
-from tpgmm_datasets import (
-    describe_lerobot,
-    load_lerobot,
-)
+from tpgmm_datasets import describe_lerobot, load_lerobot
 
 
 def test_a_description_tells_what_is_there(root):

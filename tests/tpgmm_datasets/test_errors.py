@@ -4,13 +4,8 @@ import pickle
 
 import pytest
 
-from tests.support.lerobot_sets import (
-    DATA,
-)
-from tpgmm_datasets import (
-    DatasetError,
-    load_lerobot,
-)
+from tests.support.lerobot_sets import DATA
+from tpgmm_datasets import DatasetError, load_lerobot
 
 
 def test_errors_survive_pickling(root):

@@ -2,18 +2,8 @@
 
 import pytest
 
-from tests.support.lerobot_sets import (
-    NAMES,
-    Arm,
-    assert_equal,
-    change_info,
-    joints_of,
-    to_v21,
-)
-from tpgmm_datasets import (
-    DatasetError,
-    load_lerobot,
-)
+from tests.support.lerobot_sets import NAMES, Arm, assert_equal, change_info, joints_of, to_v21
+from tpgmm_datasets import DatasetError, load_lerobot
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Data sets read as demonstrations: what is chosen, what is refused, what damage does."""
 
-import inspect
 import json
 
 import numpy as np
@@ -18,13 +17,7 @@ from tests.support.lerobot_sets import (
     spoil,
     to_v21,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    LinkPose,
-    iter_lerobot,
-    load_lerobot,
-)
-from tpgmm_datasets.reader import open_recording
+from tpgmm_datasets import DatasetError, LinkPose, iter_lerobot, load_lerobot
 from tpgmm_torch.exceptions import TPGMMError
 
 
@@ -100,14 +93,3 @@ def test_no_json_file_needs_to_be_complete_for_what_is_not_read(root):
         del info[name]
     (root / "meta" / "info.json").write_text(json.dumps(info))
     assert len(load_lerobot(root)) == 3
-
-
-@pytest.mark.parametrize("function", [load_lerobot, iter_lerobot])
-def test_options_are_those_of_what_opens_a_recording(function, root):
-    shown, opened = inspect.signature(function), inspect.signature(open_recording)
-    assert shown.parameters == opened.parameters
-    assert "Demonstration" in shown.return_annotation
-    with pytest.raises(TypeError, match="robto"):
-        function(root, robto=None)
-    for name in opened.parameters:
-        assert name in function.__doc__

@@ -11,13 +11,7 @@ import torch
 
 from examples.leave_one_out import G1_HAND
 from tests.support.robot_zoo import G1_JOINTS, G1_PATH
-from tpgmm_datasets import (
-    DatasetError,
-    LinkPose,
-    Scale,
-    describe_lerobot,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, LinkPose, Scale, describe_lerobot, load_lerobot
 from tpgmm_torch import Canonical, Situation, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.metrics import joint_rmse
@@ -110,15 +104,6 @@ def example():
     del sys.modules[spec.name]
 
 
-def test_the_angle_between_orientations_ignores_the_sign_of_quaternions(example):
-    half = torch.tensor(0.25, dtype=torch.float64)
-    turned = torch.stack((half.cos(), half.sin(), 0 * half, 0 * half))
-    still = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
-    for sign in (1, -1):
-        angle = example.degrees_between(sign * turned, still)
-        assert float(angle) == pytest.approx(np.rad2deg(0.5))
-
-
 @needs_recordings
 @pytest.mark.filterwarnings("ignore:left on linear time")
 def test_g1_grasps_an_unseen_bottle_an_order_better_than_both_baselines(example):
@@ -163,18 +148,6 @@ def test_honeytea_pours_into_an_unseen_cup_better_than_both_baselines(example):
         assert np.median(model[:, MILLIMETRES]) < np.median(baseline[:, MILLIMETRES]) / 3
         assert np.median(model[:, DEGREES]) < np.median(baseline[:, DEGREES])
     assert np.isnan(model[:, 4]).all()  # no robot, no joints
-
-
-@needs_recordings
-@pytest.mark.filterwarnings("ignore:left on linear time")
-def test_the_example_prints_its_table(example, capsys):
-    example.main([str(DATA / "honeytea_bimanual"), "--set", "honeytea", "--folds", "1"])
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("honeytea: 1 of 9 episodes held out, {'n_components': 8,")
-    methods = ["TP-GMM", "TP-GMM, cup unknown", "mean", "nearest"]
-    gap = lines.index("")  # the intervals stand below
-    for rows in (lines[2:gap], lines[gap + 2 :]):
-        assert [row[:26].strip() for row in rows] == methods
 
 
 def test_intervals_of_the_median_end_at_the_episodes_that_the_sign_test_says(example):

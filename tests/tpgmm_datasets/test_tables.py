@@ -142,22 +142,17 @@ def put(row, column, value):
     return change
 
 
+TURN = [f"hand.left.{part}" for part in POSE_PARTS[3:]]
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
         (without("time"), UnknownNameError, "column 'time' is not in the table; it has"),
-        (
-            lambda t: t.rename(columns={"elbow": "shoulder"}),
-            DataError,
-            r"one name: \['shoulder'\]",
-        ),
+        (lambda t: t.rename(columns={"elbow": "shoulder"}), DataError, r"\['shoulder'\]"),
         (lambda t: t[:0], DataError, "no rows"),
         (put(2, "episode", np.nan), DataError, "'episode' lacks a value"),
-        (
-            put(2, "elbow", np.nan),
-            DataError,
-            "episode 0 of the table: column 'elbow' .* in row 2",
-        ),
+        (put(2, "elbow", np.nan), DataError, "episode 0 .* column 'elbow' .* in row 2"),
         (put(2, "elbow", np.inf), DataError, "episode 0 .*joints holds 1 value"),
         (put(7, "hand.left.qz", np.nan), DataError, "episode 1 .*'hand.left.qz' .* row 7"),
         (put(1, "hand.left.qw", 3.0), DataError, "episode 0 .*unit quaternion"),
@@ -166,17 +161,9 @@ def put(row, column, value):
         (put(1, "shoulder", "left"), DataError, "'shoulder' holds no numbers"),
         (without("bottle.qz"), DataError, r"part of the pose of 'bottle', .*\['bottle.qz'\]"),
         (without("bottle.z"), DataError, r"part of the pose of 'bottle', .*\['bottle.z'\]"),
-        (
-            lambda t: t.drop(columns=[f"hand.left.{part}" for part in POSE_PARTS[3:]]),
-            DataError,
-            r"part of the pose of 'hand.left', .*'hand.left.qw'.*1, 0, 0, 0",
-        ),
+        (lambda t: t.drop(columns=TURN), DataError, r"'hand.left', .*'hand.left.qw'.*1, 0, 0"),
         (lambda t: t.reset_index(), DataError, r"\['index'\] count the rows .*index=False"),
-        (
-            lambda t: t.assign(frame=t.groupby("episode").cumcount()),
-            DataError,
-            r"\['frame'\] count the rows",
-        ),
+        (lambda t: t.assign(frame=[*range(6)] * 2), DataError, r"\['frame'\] count the rows"),
     ],
 )
 def test_other_tables_are_refused(change, error, message):

@@ -16,7 +16,7 @@ from tests.support.lerobot_sets import (
     undeclared,
 )
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
-from tpgmm_datasets.units import as_scale, guess_unit, with_pose_units
+from tpgmm_datasets.units import guess_unit, with_pose_units
 
 
 def test_declared_units_are_believed(root):
@@ -77,11 +77,6 @@ def test_calibrated_values_are_angles_from_the_zero(zero, per_turn, stored):
         tick = low + share * (high - low) - (2000 if zero is None else zero)
         angle = 2 * math.pi * tick / per_turn
         assert scale.factor * value + scale.offset == pytest.approx(angle, abs=1e-12)
-
-
-def test_an_unknown_unit_is_refused_with_its_column():
-    with pytest.raises(DatasetError, match=r"column 'c': unit 'turn' is unknown; .*'deg'"):
-        as_scale("turn", "c")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ from tests.support.skills import HANDLING, HANDS, JOINT_NAMES, handlings, hands,
 from tests.support.worlds import OnPoses
 from tpgmm_tools.plotting import (
     figure,
-    legend,
     plot_candidates,
     plot_components,
     plot_joints,
@@ -27,16 +26,6 @@ from tpgmm_torch.operators.text import format_operator
 
 def joints_model() -> TaskParameterizedGMM:
     return TaskParameterizedGMM(4).fit(waves())
-
-
-def test_phases_are_bands_with_names():
-    [axes] = figure(1, "").axes
-    shade(axes, {"reach": (0.5, 1.5), "shake": (2.0, 4.0)})
-    assert [(p.get_x(), p.get_x() + p.get_width()) for p in axes.patches] == [
-        (0.5, 1.5),
-        (2.0, 4.0),
-    ]
-    assert [(t.get_text(), t.xy[0]) for t in axes.texts] == [("reach", 1.0), ("shake", 3.0)]
 
 
 def test_joints_are_drawn_with_bands_and_events_in_the_panels_given():
@@ -122,23 +111,6 @@ def test_candidates_are_drawn_with_their_spread():
     assert float(height.max()) == pytest.approx(float((candidate.mean[:, 1] + spread).max()))
     assert float(height.min()) == pytest.approx(float((candidate.mean[:, 1] - spread).min()))
     assert axes.get_ylabel() == "b [rad]"
-
-
-def test_a_legend_names_all_that_is_drawn_once():
-    demonstrations, drawing = handlings(2), figure(2, "")
-    [trajectory] = hands().predict(demonstrations[:1])
-    frames = demonstrations[0].frames
-    shown = [(trajectory, frames, {}), (trajectory, frames, {"label": "another"})]
-    for column, axes in enumerate(drawing.axes):
-        plot_local(axes, hands(), 0, column, demonstrations, shown)
-    legend(drawing)
-    [box] = drawing.legends
-    assert [text.get_text() for text in box.get_texts()] == [
-        "demonstrations",
-        "reproduction",
-        "another",
-        "Gaussians, one standard deviation",
-    ]
 
 
 @pytest.mark.parametrize(

@@ -202,29 +202,6 @@ def test_leading_dimensions_broadcast(left, right):
             assert_close(result.expand(batch + single.shape)[index], single)
 
 
-def test_gradients_are_those_of_finite_differences():
-    rng = np.random.default_rng(8)
-    means, factors = normal(rng, 3, 3), normal(rng, 3, 3, 3)
-    weights, jacobian = normal(rng, 3), normal(rng, 2, 3)
-    inputs = [t.requires_grad_() for t in (weights, means, factors, jacobian)]
-
-    def mixture(weights: Tensor, means: Tensor, factors: Tensor, jacobian: Tensor):
-        covariances = factors @ factors.mT + torch.eye(3, dtype=torch.float64)
-        image = affine(means, covariances, jacobian, means[..., :2])
-        precision, vector, size = gaussians.information(jacobian, image[0][..., None], image[1])
-        closed = precision + torch.eye(3, dtype=torch.float64)
-        return (
-            *gaussians.moment_match(weights.softmax(-1), means, covariances),
-            *gaussians.product(means, covariances),
-            *gaussians.from_information(closed, vector[..., 0]),
-            *gaussians.condition(means, covariances, 1),
-            gaussians.whiten(covariances, means[..., None], "the covariance"),
-            size,
-        )
-
-    assert torch.autograd.gradcheck(mixture, inputs, fast_mode=True)
-
-
 # Singular matrices
 
 

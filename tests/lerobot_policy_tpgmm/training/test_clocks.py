@@ -4,11 +4,7 @@ import numpy as np
 import torch
 
 from lerobot_policy_tpgmm.training.clocks import Clock
-from tests.support.training import (
-    FPS,
-    WAVES,
-    trained,
-)
+from tests.support.training import FPS, WAVES, trained
 from tpgmm_datasets import load_lerobot
 from tpgmm_torch.alignment import DynamicTimeWarping
 

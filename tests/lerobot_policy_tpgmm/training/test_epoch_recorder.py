@@ -3,11 +3,7 @@
 import pytest
 import torch
 
-from tests.support.training import (
-    WAVES,
-    epoch,
-    fresh,
-)
+from tests.support.training import WAVES, epoch, fresh
 from tpgmm_torch.exceptions import DataError
 
 

@@ -1,7 +1,6 @@
 """What a policy learns from the batches of a training loop: the demonstrations, by EM."""
 
 import logging
-import re
 
 import numpy as np
 import pytest
@@ -162,49 +161,6 @@ def test_commanded_joints_are_learned_by_name(commanded):
 
 
 # What is said
-
-
-def said(caplog, data, n_epochs, **options):
-    with caplog.at_level(logging.INFO, "lerobot_policy_tpgmm"):
-        policy = fresh(data, alignment="none", **WAVES, **options)
-        losses = []
-        for _ in range(n_epochs):
-            for batch in epoch(data, 41):
-                losses.append(policy.forward(batch)[0].item())
-    return losses, [record.getMessage() for record in caplog.records]
-
-
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
-def test_the_log_tells_of_collecting_aligning_em_and_the_loss_that_follows(caplog, waves):
-    losses, lines = said(caplog, waves, 2)
-    frames = len(waves)
-    assert lines[0].startswith("collecting: the loss is 0 until every frame has come; 41 of")
-    assert lines[1] == f"{frames} frames of 4 episodes collected"
-    assert lines[2] == "EM: fitting 5 components"
-    assert re.match(r"5 components fitted by \d+ steps of EM: the policy is trained", lines[3])
-    [printed] = re.findall(
-        r"^negative log-likelihood per frame, with the prior: (-?[\d.]+); ", lines[4]
-    )
-    # the same figure as the loss of all frames
-    assert frames % 41 == 0 and np.mean(losses[3:]) == pytest.approx(float(printed), abs=2e-3)
-
-
-def test_a_policy_can_be_of_float32(waves):
-    demonstrations = LinearTimeNormalization().fit_transform(load_lerobot(waves.root))
-    options = {**WAVES, "dtype": "float32"}
-    model = TaskParameterizedGMM(**options).fit(demonstrations)
-    policy = trained(waves, alignment="linear", **options)
-    same(policy.to_estimator(), model, 1e-6)
-    loss, _ = policy.train().forward(epoch(waves, 16)[0])
-    loss.backward()
-    assert loss.dtype == policy.mixture.means[0].grad.dtype == torch.float32
-
-
-def test_the_features_of_the_alignment_are_configured(waves):
-    aligner = DynamicTimeWarping(features=["directions"])
-    model = TaskParameterizedGMM(**WAVES).fit(aligner.fit_transform(load_lerobot(waves.root)))
-    policy = trained(waves, alignment_features=["directions"], **WAVES)
-    same(policy.to_estimator(), model, 1e-12)
 
 
 def test_episodes_that_are_held_out_are_not_learned(waves):

@@ -66,15 +66,6 @@ def policy(grips):
     return trained(grips, link_frames=AT_LINKS, operators=OPERATORS, **OPTIONS)
 
 
-def test_training_learns_what_the_loader_and_the_estimator_do(policy, grips):
-    read = load_lerobot(grips.root, robot=robot(), frames=AT_LINKS)
-    assert [one.events["close"] for one in read] == pytest.approx(list(CLOSINGS), abs=0.11)
-    aligned = EventAlignment(robot=robot()).fit_transform(read)
-    operators = [parse_operator(OPERATORS[0]), Canonical()]
-    model = TaskParameterizedGMM(3, operators, robot(), random_state=0)
-    same(policy.to_estimator(), model.fit(aligned), 1e-6)
-
-
 def test_a_running_policy_is_told_the_object_and_computes_the_start(policy, grips, tmp_path):
     assert policy.frames.frame_names == ("bottle",)
     policy.save_pretrained(tmp_path / "policy")

@@ -1,8 +1,6 @@
 """``lerobot-train`` with a tpgmm policy, in a process of its own."""
 
-import json
 import re
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,15 +9,13 @@ from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_commands import lerobot
 from tests.support.skills import same
 from tests.support.worlds import upper_body
-from tpgmm_datasets import FramePose, load_lerobot, save_lerobot
+from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import TaskParameterizedGMM
-from tpgmm_torch.alignment import DynamicTimeWarping, EventAlignment
-from tpgmm_torch.operators.text import parse_operator
+from tpgmm_torch.alignment import DynamicTimeWarping
 
 RATE, BATCH, K = 10, 128, 8
-LAST = Path("out", "checkpoints", "last", "pretrained_model")
 
 
 @pytest.fixture(scope="module")
@@ -93,27 +89,6 @@ def test_then_the_loss_falls_by_gradient(folder, log, n_steps):
     fitted, trained = (saved(folder, step).to_estimator() for step in (n_steps, 2 * n_steps))
     change = (trained.means_[0] - fitted.means_[0]).abs().max()
     assert 1e-4 < change < 1e-4 * 1.01 * n_steps  # Adam's steps are of the size optimizer_lr
-
-
-def test_events_that_the_set_keeps_anchor_time_and_frames(folder, demonstrations):
-    """Columns ``event.*`` do not come with the batches: they are read from the files."""
-    at = {"handle": "l_hand@grasp"}
-    operators = ["pose:l_hand@bottle + position:l_hand@handle", "canonical"]
-    steps = -(-sum(map(len, demonstrations)) // 256)
-    train(
-        folder, "--policy.type=tpgmm", "--policy.robot=upper_body", "--policy.device=cpu",
-        "--policy.n_components=5", "--policy.training.alignment=events", "--num_workers=0",
-        f"--policy.training.link_frames={json.dumps(at)}",
-        f"--policy.operators={json.dumps(operators)}",
-        "--dataset.repo_id=local/shake", f"--dataset.root={folder / 'set'}",
-        "--batch_size=256", f"--steps={steps}", f"--save_freq={steps}",
-        f"--output_dir={folder / 'events'}",
-    )  # fmt: skip
-    frames = {"bottle": FramePose("observation.environment_state"), **at}
-    read = load_lerobot(folder / "set", robot=upper_body(), frames=frames)
-    aligned = EventAlignment(robot=upper_body()).fit_transform(read)
-    model = TaskParameterizedGMM(5, [parse_operator(o) for o in operators], upper_body())
-    same(saved(folder, steps, "events").to_estimator(), model.fit(aligned), 1e-6)
 
 
 def test_a_run_is_resumed(folder, log, n_steps):

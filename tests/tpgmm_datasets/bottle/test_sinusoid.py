@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from tpgmm_datasets.bottle.sinusoid import sinusoid
-from tpgmm_torch.exceptions import ShapeError
 
 
 @pytest.mark.parametrize("frequency", [0.4, 0.667, 1.9, 7.3])
@@ -27,12 +26,3 @@ def test_what_a_sinusoid_leaves_is_the_noise():
     assert found.frequency == pytest.approx(5 / (2 * np.pi), rel=2e-3)
     assert found.amplitude == pytest.approx(1, rel=5e-3)
     assert found.residual == pytest.approx(0.02, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("time", "signal"),
-    [(np.arange(7), np.arange(7)), (np.arange(9), np.arange(8)), (np.eye(9), np.eye(9))],
-)
-def test_signals_too_short_or_of_other_shapes_are_refused(time, signal):
-    with pytest.raises(ShapeError, match="two equal vectors of 8 or more"):
-        sinusoid(time, signal)

@@ -1,7 +1,6 @@
 """Units, order, limits and speeds of joint vectors, with the names and numbers in messages."""
 
 import numpy as np
-import pytest
 import torch
 
 from tpgmm_datasets import check
@@ -30,29 +29,6 @@ def found(robot, *scales, names=None):
 def test_joints_within_their_limits_are_plausible():
     assert found(bounded((-1, 1), (-0.1, 2)), 0.9, 1.5) == []
     assert found(None, 0.9, 12.0) == []
-
-
-def test_one_joint_in_degrees_is_an_error_for_all():
-    [finding] = found(bounded((-1, 1), (-1, 1)), 50.0, 0.5)
-    assert (finding.check, finding.impossible, finding.names) == ("units", True, ("j0",))
-    assert finding.value == pytest.approx(49, abs=0.1)
-    assert "whole joint vector" in finding.remedy
-
-
-def test_joints_beyond_their_limits_are_named():
-    robot = bounded((-1, 1), (-1, 1))
-    assert found(robot, 0.99, 0.5) == []
-    [finding] = found(robot, 1.4, 0.5)
-    assert finding.check == "limits" and not finding.impossible
-    assert "'j0' from 0 to 1.43, limits -1 to 1" in finding.message
-
-
-def test_an_order_that_fits_is_named_only_for_joints_without_names():
-    robot = bounded((-0.1, 0.5), (-0.1, 2.0))
-    [finding] = found(robot, 1.5, 0.3)
-    assert finding.check == "order" and "the columns [1, 0]" in finding.message
-    [finding] = found(robot, 1.5, 0.3, names=robot.joint_names)
-    assert finding.check == "limits"
 
 
 def test_speeds_beyond_the_robot_are_named_with_the_limit():

@@ -47,10 +47,6 @@ def test_random_scenes_are_plausible(seed):
         assert found(scene(box(n, seed), turns), Poses(("hand",))) == []
 
 
-def test_objects_too_far_away_are_in_another_unit():
-    assert found(scene(100 * box(5))) == [("units", ())]
-
-
 def test_w_last_is_known_where_objects_turn_about_the_vertical():
     turns = about_z(8)
     assert found(scene(box(8), turns)) == []

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.lerobot_sets import (
-    FPS,
-    Arm,
-    assert_equal,
-    demonstration,
-)
+from tests.support.lerobot_sets import FPS, Arm, assert_equal, demonstration
 from tpgmm_datasets import (
     DatasetError,
     DatasetWarning,

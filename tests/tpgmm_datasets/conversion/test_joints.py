@@ -11,10 +11,7 @@ from tests.support.lerobot_sets import (
     joints_of,
     to_v21,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, load_lerobot
 
 
 @pytest.mark.parametrize("names", [None, ["state"], [1, 2, 3], ["a", "a", "b"]])

@@ -6,19 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.lerobot_sets import (
-    DATA,
-    Arm,
-    add_feature,
-    change_table,
-    set_column,
-)
-from tpgmm_datasets import (
-    DatasetError,
-    FramePose,
-    LinkPose,
-    load_lerobot,
-)
+from tests.support.lerobot_sets import DATA, add_feature, change_table, set_column
+from tpgmm_datasets import DatasetError, FramePose, load_lerobot
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_torch import quaternions
 
@@ -96,14 +85,6 @@ def test_a_frame_that_does_not_fit_its_feature_is_refused(root, pose, message):
 def test_an_unknown_rotation_is_refused():
     with pytest.raises(DatasetError, match="rotation 'wzyx'"):
         FramePose("x", rotation="wzyx")
-
-
-def test_a_link_at_an_unknown_event_is_refused(root):
-    frames = {"cup": LinkPose("hand", "open")}
-    with pytest.raises(
-        DatasetError, match=r"event 'open' is not .*\['close', 'end', 'start'\]"
-    ):
-        load_lerobot(root, robot=Arm("left_elbow"), frames=frames)
 
 
 def test_a_frame_that_is_stored_by_another_name_is_not_taken_for_it():

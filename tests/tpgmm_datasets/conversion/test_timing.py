@@ -12,10 +12,7 @@ from tests.support.lerobot_sets import (
     change_table,
     set_column,
 )
-from tpgmm_datasets import (
-    FramePose,
-    load_lerobot,
-)
+from tpgmm_datasets import FramePose, load_lerobot
 
 
 def test_resampling_is_linear_and_keeps_what_coincides(root):

@@ -19,11 +19,7 @@ from tests.support.lerobot_sets import (
     stuck,
     to_v21,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    DatasetWarning,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, DatasetWarning, load_lerobot
 
 
 def nulls(root):

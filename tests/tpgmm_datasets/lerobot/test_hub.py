@@ -6,10 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tpgmm_datasets import (
-    DatasetError,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, load_lerobot
 from tpgmm_torch.exceptions import DependencyError
 
 

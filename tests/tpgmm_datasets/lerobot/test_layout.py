@@ -14,10 +14,7 @@ from tests.support.lerobot_sets import (
     in_info,
     set_column,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, load_lerobot
 
 EXTRA = "data/chunk-000/file-007.parquet"
 INFO = ("meta/info.json",)

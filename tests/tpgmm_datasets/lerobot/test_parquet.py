@@ -16,11 +16,7 @@ from tests.support.lerobot_sets import (
     set_column,
     to_v21,
 )
-from tpgmm_datasets import (
-    DatasetError,
-    DatasetWarning,
-    load_lerobot,
-)
+from tpgmm_datasets import DatasetError, DatasetWarning, load_lerobot
 from tpgmm_datasets.lerobot import parquet
 
 

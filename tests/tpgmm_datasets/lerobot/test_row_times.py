@@ -3,18 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.support.lerobot_sets import (
-    DATA,
-    FPS,
-    assert_refused,
-    in_data,
-    later,
-    spoil,
-    stuck,
-)
-from tpgmm_datasets import (
-    load_lerobot,
-)
+from tests.support.lerobot_sets import DATA, FPS, assert_refused, in_data, later, spoil, stuck
+from tpgmm_datasets import load_lerobot
 from tpgmm_datasets.lerobot.row_times import row_times, time_problems
 
 

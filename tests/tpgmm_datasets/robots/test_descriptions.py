@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from tpgmm_datasets.robots import so101_urdf
-from tpgmm_torch import Frame, Robot, quaternions
+from tpgmm_torch import Robot, quaternions
 
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
@@ -44,14 +43,3 @@ def test_its_joints_turn_as_they_are_called() -> None:
     rolled, rotation = arm(0, 0, 0, 0, 0.5)
     assert rolled[0] == pytest.approx(straight[0])
     assert rotation[:, 2] == pytest.approx([1, 0, 0], abs=1e-12)
-
-
-def test_two_of_them_are_one_robot() -> None:
-    one = Robot.from_urdf(so101_urdf(), ["gripper_frame_link"])
-    apart = {"left": Frame([0.0, 0.2, 0.0]), "right": Frame([0.0, -0.2, 0.0])}
-    both = Robot.combine(apart, left=one, right=one)
-    assert both.joint_names[:2] == ("left_shoulder_pan", "left_shoulder_lift")
-    joints = torch.full((6,), 0.2, dtype=torch.float64)
-    hands = both.state(torch.cat((joints, joints))).positions
-    between = hands[0] - hands[1]
-    torch.testing.assert_close(between, between.new_tensor([0, 0.4, 0]), rtol=0, atol=1e-14)

@@ -12,10 +12,7 @@ from safetensors.torch import load_file
 from tests.support.command_line import UPPER_BODY, output, refusal
 from tests.support.skills import waves
 from tpgmm_datasets import save_lerobot
-from tpgmm_torch import (
-    Demonstration,
-    Hold,
-)
+from tpgmm_torch import Demonstration, Hold
 from tpgmm_torch.operators.text import default_operators, format_operator
 from tpgmm_torch.persistence import load_model, load_skill
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion

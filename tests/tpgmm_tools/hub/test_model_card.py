@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.skills import small_bottle, waves
 from tests.support.two_ways import Handles, fitted
-from tpgmm_tools.hub import describe, model_card
+from tpgmm_tools.hub import describe
 from tpgmm_torch import Frame, Situation, TaskParameterizedGMM
 from tpgmm_torch.skills.sequence import Sequence
 from tpgmm_torch.skills.via_point import ViaPoint
@@ -54,25 +54,6 @@ def test_what_matters_changes_from_the_object_to_the_joints():
     wanted = 100 * trajectory.candidates[joints].share.mean(-1)
     first = wanted[: len(np.array_split(np.arange(len(wanted)), len(spans))[0])].mean()
     assert shares[0, joints] == pytest.approx(float(first), abs=0.51)
-
-
-class Unknown(TaskParameterizedGMM):
-    """A model that keeps nothing of its demonstrations."""
-
-    @property
-    def skill(self):
-        return replace(super().skill, summary=None)
-
-
-def test_nothing_is_made_up_where_nothing_is_known():
-    model = Unknown(3).fit(waves())
-    card = model_card(model, "lab/wave", notes="One more thing.")
-    assert "What was shown is not known." in card
-    assert "Not known: it depends on the situation" in card
-    assert "Nothing was stated." in card
-    assert "One more thing." in card
-    assert 'hub.load("lab/wave")' in card
-    assert "license:" not in card
 
 
 def test_settings_other_than_the_defaults_are_told_and_no_others():

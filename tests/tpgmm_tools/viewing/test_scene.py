@@ -101,18 +101,6 @@ def test_what_is_held_goes_with_the_hand_and_stays_where_it_is_put():
     torch.testing.assert_close(put, put[:1].expand_as(put))
 
 
-def test_ellipsoids_are_drawn_along_the_path(bottle):
-    drawing, _ = bottle
-    chosen = shown_at(drawing)
-    few = chosen[np.linspace(0, len(chosen) - 1, min(40, len(chosen))).astype(int)]
-    state = upper_body().state(drawing.trajectory.joints[few])
-    half_axes, turns = ellipsoids(state, drawing.trajectory.covariance[few], "r_hand")
-    drawn = drawing.ellipsoids["/covariance/r_hand"]
-    np.testing.assert_allclose(drawn.centres, state.position("r_hand"), atol=1e-9)
-    np.testing.assert_allclose(drawn.half_axes, half_axes.clip(min=5e-4), atol=1e-9)
-    np.testing.assert_allclose(drawn.orientations, turns, atol=1e-9)
-
-
 def test_an_ellipsoid_holds_the_share_of_a_gaussian_that_it_should():
     robot, generator = upper_body(), torch.Generator().manual_seed(0)
     joints = torch.linspace(-0.2, 0.2, 17, dtype=torch.float64)

@@ -8,12 +8,7 @@ from tests.support.motions import DEMONSTRATIONS, Arm, turning
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.alignment.features import AlignmentFeatures, quaternion_columns
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import (
-    DataError,
-    ShapeError,
-    UnknownNameError,
-)
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.robots.tracked_poses import Poses
 
 
@@ -63,19 +58,6 @@ def variance(rows):
 def test_a_group_has_the_square_of_its_weight_as_variance(name, weight):
     family = DEMONSTRATIONS[:3]
     assert variance(scaled(family, name, Arm())) == pytest.approx(weight**2)
-
-
-def test_speed_and_directions_weigh_more_than_all_others_together():
-    family = DEMONSTRATIONS[:3]
-    assert AlignmentFeatures.fit(family).names == ("speed", "joints")
-    names = ["speed", "joints", "directions", "elbow", "hand"]
-    features = AlignmentFeatures.fit(family, Arm(), names)
-    assert features.names == tuple(names)
-    alone = {n: AlignmentFeatures.fit(family, Arm(), [n]).scales[n] for n in names}
-    shares = {name: features.scales[name] / alone[name] for name in names}
-    other = 3**-0.5
-    expected = {"speed": 1.0, "joints": other, "directions": 1.0, "elbow": other, "hand": other}
-    assert shares == pytest.approx(expected)
 
 
 def test_features_are_what_they_are_called():
@@ -136,13 +118,6 @@ def test_the_others_are_what_is_not_used(names, left):
     assert features.others(family).names == left
     everything = AlignmentFeatures.fit(family, None, ["joints", "speed", "directions"])
     assert everything.others(family) is None
-    # of what never changes in any other way than the features do, nothing is left
-    still = [
-        Demonstration(d.time, torch.zeros_like(d.joints), {"bottle": Frame(d.joints[:, :3])})
-        for d in family
-    ]
-    seen = AlignmentFeatures.fit(still, Arm(), ["hand in bottle"])
-    assert seen.others(still) is None
 
 
 def test_speeds_are_those_of_links_or_of_the_joints_over_their_own_usual_one():

@@ -65,26 +65,6 @@ def test_the_path_is_optimal_within_the_slopes(seed, lengths, penalty, max_slope
         assert runs.max() - 1 < max_slope
 
 
-def test_a_path_without_a_bound_in_effect_is_that_of_dynamic_time_warping():
-    a, b = walks(np.random.default_rng(1), (15, 11))
-    costs = np.full((16, 12), np.inf)
-    costs[0, 0] = 0
-    for (i, x), (j, y) in itertools.product(enumerate(a, 1), enumerate(b, 1)):
-        before = (costs[i - 1, j] + 0.25, costs[i, j - 1] + 0.25, costs[i - 1, j - 1])
-        costs[i, j] = ((x - y) ** 2).sum() + min(before)
-    assert warping_path(a, b, penalty=0.5, max_slope=15)[1] == pytest.approx(costs[-1, -1])
-
-
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(2, 60), width=st.integers(0, 80))
-def test_smoothing_keeps_ends_order_and_straight_lines(seed, n, width):
-    increasing = np.random.default_rng(seed).uniform(0, 1, n).round().cumsum()
-    smooth = moving_average(increasing, width)
-    assert smooth[[0, -1]] == pytest.approx(increasing[[0, -1]])
-    assert (np.diff(smooth) >= -1e-12).all()
-    line = np.linspace(-1, 4, n)
-    assert moving_average(line, width) == pytest.approx(line)
-
-
 @pytest.mark.parametrize("shape", [(30,), (30, 2)])
 @pytest.mark.parametrize("width", [0, 1, 4, 29, 50])
 def test_the_moving_average_is_a_hann_window_over_point_reflections(shape, width):

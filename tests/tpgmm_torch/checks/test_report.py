@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 
-from tpgmm_torch.checks.report import Finding, Report, listed
+from tpgmm_torch.checks.report import Finding, Report
 from tpgmm_torch.exceptions import DataError, PlausibilityError, PlausibilityWarning
 
 SLOW = Finding("time", "a step is 30 s", "Is it in milliseconds?", ("t",), (1,), 30)
@@ -41,7 +41,3 @@ def test_an_impossible_thing_is_an_error():
     with pytest.raises(PlausibilityError, match="time: a step is 30 s") as caught:
         report(DEGREES, SLOW).act()
     assert isinstance(caught.value, DataError)
-
-
-def test_long_lists_are_cut():
-    assert listed(["a", "b"]) == "a, b" and listed(list("abcde")) == "a, b, c and 2 more"

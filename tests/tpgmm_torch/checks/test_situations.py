@@ -1,6 +1,5 @@
 """Situations and first ticks that are unlike the demonstrations are named."""
 
-import math
 import warnings
 
 import pytest
@@ -38,12 +37,6 @@ def test_a_batch_names_the_most_unlike_robot():
     [finding] = report(joints, {"bottle": Frame(away, bottle.orientation)})
     assert finding.check == "place" and finding.value > 5
     assert "situation 1, bottle: " in finding.message
-
-
-def test_degrees_are_one_error():
-    [one] = given()
-    [finding] = report(one.joints * 180 / math.pi, one.frames)
-    assert finding.impossible and finding.check == "units"
 
 
 def test_only_limits_and_clock_count_without_a_summary():

@@ -72,17 +72,6 @@ def test_nan_and_infinity_are_refused_with_their_index(values, index, bad):
         [torch.ones((), requires_grad=True), torch.ones(())],
         {"a": 1.0},
     ],
-    ids=[
-        "ragged",
-        "word",
-        "digits",
-        "complex",
-        "complex tensor",
-        "date",
-        "huge",
-        "mixed",
-        "dict",
-    ],
 )
 def test_what_is_no_array_of_numbers_is_refused(values):
     with pytest.raises(DataError, match="joints must be an array of numbers"):

@@ -53,43 +53,22 @@ def test_frames_are_found_by_name():
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"time": []}, ShapeError, r"time has shape \(T,\) with T >= 1, got \(0,\)"),
-        ({"time": 1.0}, ShapeError, r"time has shape \(T,\) with T >= 1, got \(\)"),
+        ({"time": []}, ShapeError, r"\(T,\) with T >= 1, got \(0,\)"),
+        ({"time": 1.0}, ShapeError, r"\(T,\) with T >= 1, got \(\)"),
         ({"time": [[0.0, 1.0]]}, ShapeError, r"got \(1, 2\)"),
-        (
-            {"time": [0.0, 1.0, 1.0, 2.0, 3.0]},
-            DataError,
-            "increase strictly: it goes from 1 to 1 s at index 2",
-        ),
+        ({"time": [0.0, 1.0, 1.0, 2.0, 3.0]}, DataError, "from 1 to 1 s at index 2"),
         ({"time": [0, 1, 2, 3, 2.5]}, DataError, "from 3 to 2.5 s at index 4"),
         ({"time": [0, 1, 2, 3, math.nan]}, DataError, "time holds 1 value"),
         ({"joints": np.zeros((4, 2))}, ShapeError, r"T = 5 as in time, got \(4, 2\)"),
         ({"joints": np.zeros(5)}, ShapeError, r"T = 5 as in time, got \(5,\)"),
         ({"joints": np.full((5, 2), math.inf)}, DataError, "joints holds 10 value"),
         ({"joint_names": ("a",)}, ShapeError, r"needs 2 different names, got \('a',\)"),
-        ({"joint_names": ("a", "a")}, ShapeError, r"needs 2 different names, got \('a', 'a'\)"),
-        (
-            {"frames": {"cup": moving_frame(4)}},
-            ShapeError,
-            r"frame 'cup' has leading shape \(4,\); it is one pose, \(\), or one per time "
-            r"step, \(5,\)",
-        ),
-        (
-            {"frames": {"cup": [0.0, 0.0, 0.0]}},
-            DataError,
-            "frames maps names to Frame objects, got 'cup': list",
-        ),
-        (
-            {"frames": {1: Frame([0.0, 0.0, 0.0])}},
-            DataError,
-            "frames maps names to Frame objects, got 1: Frame",
-        ),
-        (
-            {"events": {"grasp": 2.5}},
-            DataError,
-            "event 'grasp' at 2.5 s lies outside the demonstration, 0 to 2 s",
-        ),
-        ({"events": {"grasp": math.nan}}, DataError, "event 'grasp' at nan s lies outside"),
+        ({"joint_names": ("a", "a")}, ShapeError, "needs 2 different names"),
+        ({"frames": {"cup": moving_frame(4)}}, ShapeError, r"'cup' .* \(4,\); .* \(5,\)"),
+        ({"frames": {"cup": [0.0, 0.0, 0.0]}}, DataError, "Frame objects, got 'cup': list"),
+        ({"frames": {1: Frame([0.0, 0.0, 0.0])}}, DataError, "Frame objects, got 1: Frame"),
+        ({"events": {"grasp": 2.5}}, DataError, "at 2.5 s lies outside .*, 0 to 2 s"),
+        ({"events": {"grasp": math.nan}}, DataError, "'grasp' at nan s lies outside"),
     ],
 )
 def test_demonstrations_refuse_bad_input(changes, error, message):
@@ -193,14 +172,13 @@ def test_without_time_frames_per_step_have_one_length():
         Situation([0.0], frames | {"d": moving_frame(6)})
 
 
+OF_THREE = {"frames": {"cup": moving_frame(3)}}
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        (
-            {"joints": [[0.0]]},
-            ShapeError,
-            r"posture is a number for each joint, got shape \(1, 1\)",
-        ),
+        ({"joints": [[0.0]]}, ShapeError, r"a number for each joint, got shape \(1, 1\)"),
         ({"joints": [math.nan]}, DataError, "the start posture holds 1 value"),
         ({"joints": {"a": math.nan}}, DataError, "joint 'a' holds 1 value"),
         ({"joints": {"a": [1.0, 2.0]}}, ShapeError, "2 different names"),
@@ -209,18 +187,10 @@ def test_without_time_frames_per_step_have_one_length():
         ({"joints": {"a": 1.0}, "joint_names": ("a",)}, DataError, "leave out joint_names"),
         ({"joints": [1.0], "joint_names": ("a", "b")}, ShapeError, "1 different names"),
         ({"frames_time": [1.0, 1.0]}, DataError, "time must increase strictly"),
-        (
-            {"frames_time": [0.0, 1.0], "frames": {"cup": moving_frame(3)}},
-            ShapeError,
-            r"frame 'cup' has leading shape \(3,\); .* \(2,\)",
-        ),
+        ({"frames_time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
         ({"frames": {"cup": [0.0] * 3}}, DataError, "maps names to Frame objects, got 'cup'"),
         ({"time": [1.0, 0.0]}, DataError, "time must increase strictly"),
-        (
-            {"time": [0.0, 1.0], "frames": {"cup": moving_frame(3)}},
-            ShapeError,
-            r"frame 'cup' has leading shape \(3,\); .* \(2,\)",
-        ),
+        ({"time": [0.0, 1.0]} | OF_THREE, ShapeError, r"'cup' .* \(3,\); .* \(2,\)"),
     ],
 )
 def test_situations_refuse_bad_input(arguments, error, message):
@@ -234,6 +204,9 @@ def test_check_demonstrations_takes_any_sequence():
         assert check_demonstrations(sequence) == demos
 
 
+WIDER = demonstration(joints=np.zeros((5, 3)), joint_names=None)
+
+
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
@@ -242,15 +215,11 @@ def test_check_demonstrations_takes_any_sequence():
         ([], DataError, "at least one demonstration, got an empty list"),
         ([demonstration(), None], DataError, "item 1 is NoneType"),
         (np.zeros((2, 3)), DataError, "item 0 is ndarray"),
-        (
-            [demonstration(), demonstration(joints=np.zeros((5, 3)), joint_names=None)],
-            ShapeError,
-            "demonstration 1 has 3 joints, the first has 2",
-        ),
+        ([demonstration(), WIDER], ShapeError, "demonstration 1 has 3 joints, the first has 2"),
         (
             [demonstration(), demonstration(frames={})],
             DataError,
-            r"demonstration 1 has frames \[\], the first has \['bottle', 'tray'\]",
+            r"1 has frames \[\], .*'tray'",
         ),
     ],
     ids=["one", "number", "empty", "other type", "array", "joints", "frames"],

@@ -27,16 +27,7 @@ from tests.support.own_operators import (
     Q,
     planar_jacobian,
 )
-from tests.support.worlds import (
-    CARRIED,
-    GRASP,
-    LEFT,
-    OBJECT,
-    RIGHT,
-    OnPoses,
-    OnRobot,
-    World,
-)
+from tests.support.worlds import CARRIED, GRASP, LEFT, OBJECT, RIGHT, OnPoses, OnRobot, World
 from tpgmm_torch import (
     AbsoluteOrientation,
     AbsolutePosition,
@@ -50,7 +41,7 @@ from tpgmm_torch import (
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.operators import Linearization, Operator
 from tpgmm_torch.operators.base import carried_objects, frame_names
-from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
+from tpgmm_torch.regression.fusion_forms import CovarianceFusion
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.training.mixture_settings import check_operators
 
@@ -66,23 +57,6 @@ def test_a_link_is_seen_from_another_like_from_an_object_but_moves_with_it(kind,
     expected = thing.coordinates(state, there)
     torch.testing.assert_close(link.coordinates(state, {}), expected, rtol=0, atol=1e-14)
     assert not torch.allclose(link.linear(state, {}), thing.linear(state, there), atol=1e-2)
-
-
-def test_operators_of_other_parameters_differ():
-    operators = [
-        Canonical(),
-        AbsolutePosition(LEFT),
-        AbsolutePosition(RIGHT),
-        AbsoluteOrientation(LEFT),
-        AbsoluteOrientation(LEFT, gain=1.0),
-        RelativePosition(LEFT, OBJECT),
-        RelativePosition(LEFT, RIGHT),
-        RelativeOrientation(LEFT, OBJECT),
-        Stack(Canonical()),
-        Stack(AbsolutePosition(LEFT), AbsolutePosition(RIGHT)),
-        Stack(AbsolutePosition(RIGHT), AbsolutePosition(LEFT)),
-    ]
-    assert len(set(operators)) == len(operators)
 
 
 LINKED = [
@@ -122,17 +96,6 @@ def test_an_unknown_frame_is_named_with_those_that_exist(operator, world: World)
     for call in (operator.linearize, operator.coordinates):
         with pytest.raises(UnknownNameError, match=r"frame 'cup' is not in .*\['l_hand', 'obj"):
             call(state, frames)
-
-
-def test_links_and_frames_that_exist_pass():
-    world = OnRobot()
-    _, frames = world.scene()
-    for operator in (
-        Canonical(),
-        RelativePosition(LEFT, OBJECT),
-        RelativeOrientation(LEFT, RIGHT),
-    ):
-        operator.check(world.kinematics, frames)
 
 
 @WORLDS
@@ -254,13 +217,6 @@ def test_a_situation_needs_the_objects_that_may_be_carried():
             operator.check(robot, [CARRIED])
 
 
-def test_by_default_an_operator_needs_nothing_and_knows_no_quaternion():
-    operator, arm = PlanarPosition(), PlanarArm()
-    assert operator.links() == operator.references() == operator.quaternion_starts(arm) == ()
-    assert operator.tolerances(arm) == (0.0, 0.0)
-    assert operator.determines_joints is False
-
-
 def test_coordinates_of_another_size_than_announced_are_refused():
     class Liar(AbsolutePosition):
         def dimension(self, kinematics):
@@ -311,15 +267,6 @@ class Problem:
         return oracles.regress(float(NOW), q, rows, self.mixtures, self.weights, **how)
 
 
-def test_the_arm_moves_as_its_jacobian_says():
-    arm, step = PlanarArm(), 1e-6
-    state = arm.state(Q)
-    for joint, unit in enumerate(torch.eye(3, dtype=torch.float64)):
-        ahead, behind = arm.state(Q + step * unit), arm.state(Q - step * unit)
-        change = (ahead.position("tip") - behind.position("tip")) / (2 * step)
-        assert_close(state.linear_jacobian("tip")[:, joint], change)
-
-
 @pytest.mark.parametrize("operator", [NullSpace(), NullSpaceRows()], ids=repr)
 def test_the_null_space_operator_is_the_printed_one(operator):
     state = PlanarArm().state(Q.expand(4, 3) + 0.1 * torch.arange(4.0)[:, None])
@@ -351,25 +298,6 @@ def test_a_null_space_operator_fuses_in_covariance_form(activation, batch):
     assert_close(printed.covariance, expected.covariance + np.zeros((*batch, 3, 3)))
     by_rows = problem.step([PlanarPosition(), NullSpaceRows(), Canonical()], joints, **options)
     assert_equal_estimates(by_rows, printed, 1e-8)
-
-
-def test_a_null_space_operator_of_full_row_rank_fuses_in_information_form():
-    problem = Problem.of(PlanarPosition(), NullSpaceRows(), n_components=1)
-    state = PlanarArm().state(Q)
-    jacobian = planar_jacobian(state)
-    basis = torch.linalg.svd(jacobian).Vh[2:]  # of either sign
-    tip, posture = (conditionals_of(local).at(NOW)[0] for local in problem.mixtures)
-    asked = torch.cat((tip - state.position("tip")[:2], basis @ (posture - Q)))
-    expected = Q + torch.linalg.solve(torch.cat((jacobian, basis)), asked)
-    assert_close(problem.step(fusion=InformationFusion(1e5)).joints, expected)
-
-
-def test_both_forms_agree_on_task_and_null_space_together():
-    whole = Stack(PlanarPosition(), NullSpaceRows())  # a square Jacobian
-    problem = Problem.of(whole)
-    information = problem.step(fusion=InformationFusion(1e5))
-    covariance = problem.step(fusion=CovarianceFusion(0.0))
-    assert_equal_estimates(information, covariance, 1e-7)
 
 
 def test_a_singular_linear_map_is_refused_in_information_form_with_advice():

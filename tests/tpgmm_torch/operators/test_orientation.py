@@ -1,69 +1,18 @@
 """Orientation operators against eqs (14) and (15), exact and as printed."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from tests.support import oracles
-from tests.support.operator_battery import OrientationLaws, RelativeLaws
-from tests.support.worlds import (
-    CARRIED,
-    LEFT,
-    OBJECT,
-    RIGHT,
-    CarryingOnPoses,
-    CarryingOnRobot,
-    OnPoses,
-    OnRobot,
-)
-from tpgmm_torch import (
-    AbsoluteOrientation,
-    RelativeOrientation,
-)
+from tests.support.operator_battery import OrientationLaws, laws_in_places
+from tests.support.worlds import LEFT, OBJECT, RIGHT, OnPoses, OnRobot
+from tpgmm_torch import AbsoluteOrientation, RelativeOrientation
 
-
-class AbsoluteOrientationLaws(OrientationLaws):
-    operator = AbsoluteOrientation(LEFT)
-
-    def row(self, at):
-        return oracles.absolute_orientation(at, LEFT)
-
-
-class TestAbsoluteOrientationOnRobot(OnRobot, AbsoluteOrientationLaws):
-    pass
-
-
-class TestAbsoluteOrientationOnPoses(OnPoses, AbsoluteOrientationLaws):
-    pass
-
-
-class RelativeOrientationLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(RIGHT, OBJECT)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, RIGHT, OBJECT)
-
-
-class TestRelativeOrientationOnRobot(OnRobot, RelativeOrientationLaws):
-    pass
-
-
-class TestRelativeOrientationOnPoses(OnPoses, RelativeOrientationLaws):
-    pass
-
-
-class HandToHandOrientationLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(RIGHT, LEFT)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, RIGHT, LEFT)
-
-
-class TestHandToHandOrientationOnRobot(OnRobot, HandToHandOrientationLaws):
-    pass
-
-
-class TestHandToHandOrientationOnPoses(OnPoses, HandToHandOrientationLaws):
-    pass
+KINDS = AbsoluteOrientation, RelativeOrientation
+ROWS = oracles.absolute_orientation, oracles.relative_orientation
+globals().update(laws_in_places(KINDS, ROWS, OrientationLaws))
 
 
 class AsPrinted(OrientationLaws):
@@ -80,25 +29,13 @@ class AsPrinted(OrientationLaws):
         assert finer == pytest.approx(after / 2, rel=0.02)
 
 
-class TestAbsoluteOrientationAsPrinted(OnRobot, AsPrinted):
-    operator = AbsoluteOrientation(RIGHT, gain=1.0)
-
-    def row(self, at):
-        return oracles.absolute_orientation(at, RIGHT, gain=1.0)
-
-
-class TestRelativeOrientationAsPrinted(OnRobot, AsPrinted, RelativeLaws):
-    operator = RelativeOrientation(LEFT, OBJECT, gain=1.0)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, LEFT, OBJECT, gain=1.0)
-
-
-class TestHandToHandOrientationAsPrinted(OnRobot, AsPrinted, RelativeLaws):
-    operator = RelativeOrientation(LEFT, RIGHT, gain=1.0)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, LEFT, RIGHT, gain=1.0)
+PRINTED = {
+    "PrintedAbsolute": ([OnRobot], RIGHT),
+    "PrintedRelative": ([OnRobot], LEFT, OBJECT),
+    "PrintedHandToHand": ([OnRobot], LEFT, RIGHT),
+}
+HALF = [partial(row, gain=1.0) for row in ROWS]
+globals().update(laws_in_places(KINDS, HALF, AsPrinted, PRINTED, gain=1.0))
 
 
 def test_the_gain_is_without_effect_where_nothing_is_linearised():
@@ -106,52 +43,3 @@ def test_the_gain_is_without_effect_where_nothing_is_linearised():
     for kind, names in ((AbsoluteOrientation, [LEFT]), (RelativeOrientation, [LEFT, OBJECT])):
         exact, printed = kind(*names), kind(*names, gain=1.0)
         assert torch.equal(exact.linear(state, frames), printed.linear(state, frames))
-
-
-class CarriedOrientationLaws(OrientationLaws):
-    operator = AbsoluteOrientation(CARRIED)
-
-    def row(self, at):
-        return oracles.absolute_orientation(at, CARRIED)
-
-
-class TestCarriedOrientationOnRobot(CarryingOnRobot, CarriedOrientationLaws):
-    pass
-
-
-class TestCarriedOrientationOnPoses(CarryingOnPoses, CarriedOrientationLaws):
-    pass
-
-
-class CarriedToPlaceOrientationLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(CARRIED, OBJECT)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, CARRIED, OBJECT)
-
-
-class TestCarriedToPlaceOrientationOnRobot(CarryingOnRobot, CarriedToPlaceOrientationLaws):
-    pass
-
-
-class TestCarriedToPlaceOrientationOnPoses(CarryingOnPoses, CarriedToPlaceOrientationLaws):
-    pass
-
-
-class OtherHandToCarriedOrientationLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(LEFT, CARRIED, held=True)
-
-    def row(self, at):
-        return oracles.relative_orientation(at, LEFT, CARRIED)
-
-
-class TestOtherHandToCarriedOrientationOnRobot(
-    CarryingOnRobot, OtherHandToCarriedOrientationLaws
-):
-    pass
-
-
-class TestOtherHandToCarriedOrientationOnPoses(
-    CarryingOnPoses, OtherHandToCarriedOrientationLaws
-):
-    pass

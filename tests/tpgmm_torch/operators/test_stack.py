@@ -48,12 +48,6 @@ class TestBothHandsOnRobot(OnRobot, BothHandsLaws):
         np.testing.assert_allclose(linear.numpy(), expected[0], rtol=1e-11, atol=1e-11)
         np.testing.assert_allclose(offset.numpy(), expected[1], rtol=1e-11, atol=1e-11)
 
-    def test_differs_from_its_members_projected_alone_as_they_share_the_waist(self):
-        state, frames = self.scene()
-        together = self.operator.linear(state, frames)
-        alone = [operator.linear(state, frames) for operator in self.operator.operators]
-        assert (together - torch.cat(alone, dim=-1)).abs().max() > 0.1
-
 
 class TestBothHandsOnPoses(OnPoses, BothHandsLaws):
     pass
@@ -85,17 +79,6 @@ class TestMixedStackOnRobot(OnRobot, MixedStackLaws):
 
 class TestMixedStackOnPoses(OnPoses, MixedStackLaws):
     pass
-
-
-def test_poses_reach_a_pose_seen_from_an_object_in_one_step_however_far():
-    operator = TestBothHandsOnPoses()
-    state, frames = operator.scene(3)
-    far, _ = operator.scene(3, seed=7)
-    wanted = operator.operator.coordinates(far, frames)
-    answer = operator.kinematics.state(operator.candidate(wanted, state, frames))
-    torch.testing.assert_close(answer.positions, far.positions)
-    inner = (answer.orientations * far.orientations).sum(-1)
-    torch.testing.assert_close(inner.abs(), torch.ones_like(inner))
 
 
 def test_a_stack_needs_operators():

@@ -8,16 +8,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.support import oracles
-from tests.support.operator_battery import OrientationLaws, RelativeLaws
-from tests.support.worlds import (
-    CARRIED,
-    LEFT,
-    OBJECT,
-    RIGHT,
-    CarryingOnRobot,
-    OnPoses,
-    OnRobot,
-)
+from tests.support.operator_battery import OrientationLaws, RelativeLaws, laws_in_places
+from tests.support.worlds import CARRIED, LEFT, OBJECT, RIGHT, CarryingOnRobot, OnPoses, OnRobot
 from tpgmm_torch import AbsoluteOrientation, Frame, RelativeOrientation, Stack, quaternions
 from tpgmm_torch.exceptions import DataError
 
@@ -38,52 +30,14 @@ def row(at, link, frame=None):
     return oracles.Row(np.linalg.inv(jacobian) @ origin.T @ turning, np.eye(3), -y)
 
 
-class AbsoluteLaws(OrientationLaws):
-    operator = AbsoluteOrientation(LEFT, geometry="tangent")
-
-    def row(self, at):
-        return row(at, LEFT)
-
-
-class TestAbsoluteOnRobot(OnRobot, AbsoluteLaws):
-    pass
-
-
-class TestAbsoluteOnPoses(OnPoses, AbsoluteLaws):
-    pass
-
-
-class RelativeOrientationLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(RIGHT, OBJECT, geometry="tangent")
-
-    def row(self, at):
-        return row(at, RIGHT, OBJECT)
-
-
-class TestRelativeOnRobot(OnRobot, RelativeOrientationLaws):
-    pass
-
-
-class TestRelativeOnPoses(OnPoses, RelativeOrientationLaws):
-    pass
-
-
-class HandToHandLaws(RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(RIGHT, LEFT, geometry="tangent")
-
-    def row(self, at):
-        return row(at, RIGHT, LEFT)
-
-
-class TestHandToHandOnRobot(OnRobot, HandToHandLaws):
-    pass
-
-
-class TestCarriedToPlaceOnRobot(CarryingOnRobot, RelativeLaws, OrientationLaws):
-    operator = RelativeOrientation(CARRIED, OBJECT, geometry="tangent")
-
-    def row(self, at):
-        return row(at, CARRIED, OBJECT)
+PLACES = {
+    "Absolute": ([OnRobot, OnPoses], LEFT),
+    "Relative": ([OnRobot, OnPoses], RIGHT, OBJECT),
+    "HandToHand": ([OnRobot], RIGHT, LEFT),
+    "CarriedToPlace": ([CarryingOnRobot], CARRIED, OBJECT),
+}
+KINDS = AbsoluteOrientation, RelativeOrientation
+globals().update(laws_in_places(KINDS, (row, row), OrientationLaws, PLACES, geometry="tangent"))
 
 
 class TestInAStackOnRobot(OnRobot, RelativeLaws, OrientationLaws):

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.robot_zoo import (
-    g1,
-    random_joints,
-    upper_body,
-    written_out,
-    zoo,
-)
+from tests.support.robot_zoo import g1, random_joints, upper_body, written_out, zoo
 from tpgmm_torch import quaternions
 
 ROBOTS = {

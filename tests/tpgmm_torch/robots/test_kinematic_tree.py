@@ -4,10 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.support.robot_zoo import (
-    ZOO,
-    ZOO_JOINTS,
-)
+from tests.support.robot_zoo import ZOO, ZOO_JOINTS
 from tpgmm_torch.robots.kinematic_tree import Body, reduce
 from tpgmm_torch.robots.urdf import placement, read_urdf
 

@@ -11,13 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.robot_zoo import ZOO
 from tpgmm_datasets.robots import upper_body_urdf
-from tpgmm_torch.robots.urdf import (
-    free_name,
-    placement,
-    read_urdf,
-    roll_pitch_yaw,
-    write_urdf,
-)
+from tpgmm_torch.robots.urdf import free_name, placement, read_urdf, roll_pitch_yaw, write_urdf
 
 angles = st.floats(-4, 4) | st.sampled_from([0.0, math.pi / 2, -math.pi / 2, math.pi])
 

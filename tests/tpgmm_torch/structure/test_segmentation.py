@@ -6,7 +6,6 @@ from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 
 from tests.support.errands import HAND, motion
-from tests.support.skills import generator
 from tpgmm_torch import Demonstration, Frame, Situation
 from tpgmm_torch.alignment import EventAlignment
 from tpgmm_torch.data.arrays import as_array
@@ -154,30 +153,6 @@ def test_other_events_stay_and_new_demonstrations_are_served():
     assert list(named[7].events) == ["here", "part 2", "part 3", "part 4"]
     times = [[one.events[f"part {k}"] for k in (2, 3, 4)] for one in named[:5]]
     np.testing.assert_allclose(times, found.boundaries_, atol=0.02)
-
-
-def test_the_generated_skill_has_four_parts():
-    """Reaching, closing in, bringing and shaking: the generator knows when each ends."""
-    skill = generator()
-    shown = skill.demonstrations(4, seed=3)
-    rng = np.random.default_rng(3)
-    skill.bottle_poses(4, rng), skill.start_postures(4, rng)
-    ends = dict(zip(skill.phases, skill._phase_ends(4, rng).numpy().T, strict=True))
-    found = Segmentation(skill.robot).fit(shown)
-    assert found.reasons_ == ("stop",) * 3
-    middles = [
-        ends["reach"], (ends["close"] + ends["hold"]) / 2, (ends["bring"] + ends["pause"]) / 2
-    ]  # fmt: skip
-    duration = np.array([one.duration for one in shown])
-    assert (abs(found.boundaries_ - np.transpose(middles)) / duration[:, None]).max() < 0.03
-
-
-def test_the_report_says_why():
-    shown, _ = pick_and_place()
-    lines = Segmentation().fit(shown).report().splitlines()
-    assert len(lines) == 5
-    assert lines[2].endswith("100%      gripper closes, stop")
-    assert lines[1].split()[:2] == ["1", "0%"]
 
 
 def test_clones_and_what_is_refused():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from tests.support.skills import handlings, hands_model
 from tpgmm_torch import Demonstration, SelectComponents, TaskParameterizedGMM
 from tpgmm_torch.exceptions import ConvergenceWarning, DataError
 
@@ -57,12 +56,6 @@ def test_a_rhythm_asks_for_more_than_a_reach():
         for path in (0.5 * time, np.sin(2 * np.pi * time))
     ]
     assert found[0] <= 3 < 10 <= found[1]
-
-
-@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.ConvergenceWarning")
-def test_frames_and_quaternions_are_served():
-    found = SelectComponents(hands_model(), (2, 4, 6)).fit(handlings(5))
-    assert np.isfinite(found.scores_).all() and found.best_model_.frame_names_ == ("cup",)
 
 
 def test_the_end_of_the_range_is_reported():

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sklearn.pipeline import make_pipeline
 
 from tests.support.carrying import carries
 from tests.support.planted import HAND, PlantedTask, told
-from tests.support.skills import handlings, hands_model, waves
+from tests.support.skills import waves
 from tests.support.worlds import upper_body
 from tpgmm_torch import (
     AbsolutePosition,
@@ -20,8 +19,7 @@ from tpgmm_torch import (
     SelectOperators,
     Stack,
 )
-from tpgmm_torch.alignment import LinearTimeNormalization
-from tpgmm_torch.exceptions import DataError, NotFittedError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.structure.select_operators import candidate_operators
@@ -144,14 +142,6 @@ def test_of_two_frames_that_are_one_only_one_is_kept():
     assert all(one.alone > found.threshold > one.gain for one in spare)
 
 
-def test_one_hand_seen_from_the_other_is_found():
-    found = SelectOperators(robot=hands_model().robot).fit(handlings(5))
-    assert "position:right@left" in relative(found) or "position:left@cup" in relative(found)
-    assert not found.support_[
-        [format_operator(one) for one in found.candidates_].index("position:left")
-    ]
-
-
 def test_what_a_hand_carries_is_found_as_a_thing():
     """However it was grasped, the bottle stands in the same place on the tray."""
     found = SelectOperators(robot=upper_body()).fit(attach_holds(carries(6), upper_body()))
@@ -206,13 +196,3 @@ def test_candidates_that_do_not_fit_are_refused(task):
     candidates = [Canonical(), RelativePosition("hand", "lid")]
     with pytest.raises(UnknownNameError, match="frame 'lid' is not in the demonstration"):
         SelectOperators(candidates, HAND).fit(task.demonstrations(3))
-
-
-def test_before_fit_there_is_nothing_to_report():
-    with pytest.raises(NotFittedError, match="this SelectOperators is not fitted yet"):
-        SelectOperators().report()
-
-
-def test_it_is_a_step_of_a_pipeline(task):
-    pipeline = make_pipeline(LinearTimeNormalization(), SelectOperators(robot=HAND))
-    assert relative(pipeline.fit(task.demonstrations(5))[-1]) == told(task)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from sklearn.base import clone
 
 from tests.support.planted import HAND, PlantedTask
 from tests.support.skills import few_bottles
@@ -12,7 +11,7 @@ from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import upper_body
 from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, TaskParameterizedGMM
 from tpgmm_torch.alignment import LinearTimeNormalization
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.structure.select_ways import SelectWays
 
@@ -56,12 +55,6 @@ def test_one_way_is_one_mode_for_any_number_of_demonstrations(task):
         members = [one for one, s in zip(demonstrations, sides, strict=True) if s == side]
         for n in range(2, len(members) + 1):
             assert SelectWays(task().model()).fit(members[:n]).n_ways_ == 1
-
-
-def test_candidates_see_both_ways_where_no_operators_are_named():
-    demonstrations, sides = shown(Obstacle)
-    selection = SelectWays(Obstacle().model()).fit(demonstrations)
-    assert same_partition(selection.labels_, sides)
 
 
 def test_the_order_of_demonstrations_does_not_matter():
@@ -129,18 +122,6 @@ def test_a_number_of_modes_may_be_given():
         DataError, match="3 modes of at least 2 demonstrations each need 6, got 4"
     ):
         SelectWays(learner(), n_ways=3).fit(demonstrations[:4])
-
-
-def test_the_report_says_who_where_and_when():
-    selection = SelectWays(learner()).fit(paths([0.5, -0.5] * 4))
-    lines = selection.report().splitlines()
-    assert lines[0] == "2 ways:"
-    assert lines[1] == "  0  4 of 8 demonstrations: 0, 2, 4, 6"
-    assert lines[3].startswith("  seen by canonical, plainest from 1.")
-    assert "standard deviations apart" in lines[3]
-    assert SelectWays(learner()).fit(paths([0.5] * 4)).report().startswith("1 way: nowhere")
-    with pytest.raises(NotFittedError):
-        clone(selection).report()
 
 
 def test_units_do_not_matter():

@@ -77,14 +77,6 @@ def test_quaternions_lie_on_the_side_that_a_model_expects(sign):
     assert all(torch.equal(time, motion.time) for _, time in asked)
 
 
-def test_at_equal_phase_the_ends_belong_together():
-    motion = turning(TIME, TIME / 2)
-    expected = expected_of(motion)
-    local = local_coordinates(OPERATORS[0], motion, HAND)
-    torch.testing.assert_close(expected(0, TIME[:14]), local[::3], rtol=0, atol=0)
-    assert torch.equal(expected(1, TIME[:1])[0, :3], motion.joints[0, :3])
-
-
 def test_what_varies_by_rounding_alone_is_made_constant():
     rng = np.random.default_rng(0)
     time = np.arange(30.0)

@@ -9,11 +9,10 @@ import torch
 
 from tests.support.local_coordinates import local_coordinates
 from tests.support.skills import few_bottles
-from tests.support.worlds import LEFT, OBJECT, moved, upper_body
+from tests.support.worlds import OBJECT, moved, upper_body
 from tpgmm_torch import (
     AbsoluteOrientation,
     Canonical,
-    Controller,
     Demonstration,
     Frame,
     RelativeOrientation,
@@ -28,7 +27,6 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
-from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
@@ -116,33 +114,6 @@ def test_a_demonstration_that_is_over_counts_with_its_last_orientation():
     assert float(angles(row, quaternions.mean(last))) < 1e-9
 
 
-def test_signs_of_recorded_quaternions_mean_nothing():
-    plain, seen = recordings(signs=False), recordings(signs=True)
-    # signs were drawn after each motion: make them of the same motions
-    rng = np.random.default_rng(5)
-    seen = [
-        Demonstration(
-            TIME,
-            torch.cat(
-                (
-                    one.joints[:, :3],
-                    one.joints[:, 3:] * torch.from_numpy(rng.choice([-1.0, 1.0], (60, 1))),
-                ),
-                1,
-            ),
-            {OBJECT: Frame(one.frames[OBJECT].position, -one.frames[OBJECT].orientation)},
-        )
-        for one in plain
-    ]
-    first, second = (fitted(shown, ABSOLUTE, RELATIVE) for shown in (plain, seen))
-    for one, other in zip(
-        (*first.means_, *first.covariances_),
-        (*second.means_, *second.covariances_),
-        strict=True,
-    ):
-        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-12)
-
-
 def test_turning_the_world_turns_what_is_reproduced():
     shown = recordings()
     turned = [
@@ -183,74 +154,6 @@ def test_orientations_far_apart_are_reproduced_better_than_in_four_coordinates(s
         for operator in (AbsoluteOrientation("hand"), ABSOLUTE)
     )
     assert float(tangent) <= 0.5 * float(plain)
-
-
-def one_gaussian(operator, mean, covariance, q0, precise):
-    """A model of one component about a posture, on the upper body."""
-    n = len(q0)
-    means = [torch.cat((torch.zeros(1), m))[None].double() for m in (mean, q0)]
-    covariances = [
-        torch.block_diag(torch.ones(1, 1).double(), c)[None]
-        for c in (covariance, precise * torch.eye(n).double())
-    ]
-    return TaskParameterizedGMM.from_parameters(
-        [1.0], means, covariances, [0.0, 1.0], operators=[operator, Canonical()],
-        robot=upper_body(),
-    )  # fmt: skip
-
-
-def test_for_small_spread_it_agrees_with_the_quaternion_form():
-    """The fused joints differ by the square of how far the mean is, as exp does from 1 + y."""
-    robot = upper_body()
-    q0 = ((robot.lower + robot.upper) / 2).double()
-    state = robot.state(q0)
-    frame = Frame(torch.ones(3).double(), torch.tensor([0.5, 0.5, -0.5, 0.5]).double())
-    turn = quaternions.conjugate(frame.orientation)
-    base = quaternions.product(turn, state.orientation(LEFT))
-    rng = np.random.default_rng(2)
-    direction = torch.from_numpy(rng.standard_normal(3))
-    factor = torch.from_numpy(rng.standard_normal((3, 3)))
-    covariance = factor @ factor.T + 0.1 * torch.eye(3)
-    differences, step = [], 0.0
-    for size in (0.02, 0.01):
-        y = size * direction
-        path = ((0.0, *base.tolist()),)
-        tangent = RelativeOrientation(LEFT, OBJECT, geometry="tangent", path=path)
-        small = size**2 * covariance
-        wanted = quaternions.product(base, quaternions.exp(y))
-        # an orientation's turn is twice what its quaternion moves, none along the radius
-        embedding = 0.5 * quaternions.left_matrix(wanted)[:, 1:]
-        four = embedding @ small @ embedding.T + size**2 * wanted[:, None] * wanted
-        models = (
-            one_gaussian(tangent, y, small, q0, size**2),
-            one_gaussian(RelativeOrientation(LEFT, OBJECT), wanted, four, q0, size**2),
-        )
-        one, other = (m.step(0.5, q0, {OBJECT: frame}) for m in models)
-        step = float((one.joints - q0).norm())
-        differences.append(float((one.joints - other.joints).norm()))
-        spread = (one.covariance - other.covariance).norm() / one.covariance.norm()
-        assert float(spread) < 3 * size
-    assert 0 < differences[0] < 0.05 * step * 2
-    assert differences[1] < 0.3 * differences[0]
-
-
-def test_the_density_is_normalised_over_rotations():
-    """``N(y) / |J_l(y)|`` is a density on SO(3), whose volume is 8 pi^2 [rad^3]."""
-    regression = model(ABSOLUTE).skill
-    rng = np.random.default_rng(0)
-    q = quaternions.normalize(torch.from_numpy(rng.standard_normal((60_000, 4))))
-    state = HAND.state(torch.cat((torch.zeros(60_000, 3), q), 1))
-    time = torch.full((60_000,), 1.3, dtype=torch.float64)
-    [operator] = regression.operators
-    local = operator.at(time[0]).coordinates(state, {})
-    volume = torch.linalg.det(quaternions.left_jacobian(local))
-    when = regression.log_density(time[:1], [local[:1]])  # of time alone, without the rotation
-    marginals = regression.marginals.log_activation(time[:1, None]).logsumexp(-1)
-    log_time = marginals - 0.5 * math.log(2 * math.pi)
-    assert bool(when.isfinite())
-    density = (regression.log_density(time, [local]) - log_time).exp() / volume
-    # what lies beyond half a turn from the base has no coordinates: little at this spread
-    assert float(density.mean()) * 8 * math.pi**2 == pytest.approx(1.0, abs=0.05)
 
 
 def test_gradients_are_finite_where_nothing_is_left_to_turn_and_elsewhere():
@@ -309,13 +212,6 @@ def test_the_time_of_a_product_is_refused():
         fitted(recordings(), ABSOLUTE, fusion=CovarianceFusion(activation="product"))
 
 
-def test_the_printed_fusion_agrees():
-    start = torch.cat((torch.zeros(3).double(), mean_of(recordings())[0]))
-    printed = fitted(recordings(), ABSOLUTE, fusion=CovarianceFusion(1e-9))
-    one, other = (reproduced(m, start, {}) for m in (printed, model(ABSOLUTE)))
-    assert float(angles(one, other).max()) < 1e-3
-
-
 @cache
 def handling():
     """Where the whole of a skill is in tangent space: two arms, and a bottle that is new."""
@@ -328,15 +224,6 @@ def handling():
     ]
     skill = TaskParameterizedGMM(8, [Stack(*hands), Canonical()], upper_body())
     return skill.fit(few_bottles())
-
-
-def test_the_time_of_a_posture_is_found():
-    skill, demonstration = handling().skill, few_bottles()[0]
-    times = torch.linspace(*demonstration.time[[0, -1]].tolist(), 341, dtype=torch.float64)
-    state = skill.kinematics.state(demonstration.joints)
-    found = times[skill.log_likelihood(times, state, dict(demonstration.frames)).argmax(1)]
-    before = demonstration.time < 8  # then it shakes, and places are alike
-    assert float((found - demonstration.time)[before].abs().median()) < 0.11
 
 
 def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
@@ -358,39 +245,6 @@ def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
             weights = marginals.log_activation(time[:, None]).logsumexp(-1)
             expected = (joint - weights).numpy()
             np.testing.assert_allclose(row - row.max(), expected - expected.max(), atol=1e-6)
-
-
-def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
-    """Finite differences, far from what is wanted: the linearisation's Jacobian is exact."""
-    skill = handling()
-    regression, time = skill.skill, torch.tensor(4.4, dtype=torch.float64)
-    frame = few_bottles()[0].frames["bottle"]
-    generator = torch.Generator().manual_seed(0)
-    joints = few_bottles()[0].joints[:1].to(torch.float64)
-    joints = joints + 0.3 * torch.randn(1, 17, generator=generator, dtype=torch.float64)
-    index = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
-    cost = PostureCost(
-        regression.posture_search(), index.expand(1, 1), time, joints,
-        {"bottle": frame.expand((1,))}, regression.kinematics.state,
-    )  # fmt: skip
-    _, downhill, _ = cost(joints[None])
-    steps = 1e-6 * torch.eye(17, dtype=torch.float64)
-    slope = torch.stack(
-        [(cost((joints + s)[None])[0] - cost((joints - s)[None])[0]).squeeze() for s in steps]
-    )
-    assert float((slope / 2e-6 + downhill[0, 0]).abs().max() / downhill.abs().max()) < 1e-6
-
-
-def test_a_controller_and_a_batch_run_it():
-    skill, shown = handling(), few_bottles()[0]
-    frames = {"bottle": shown.frames["bottle"]}
-    one = Controller(skill.skill, shown.joints[0], frames, clock="even")
-    many = Controller(skill.skill, shown.joints[0].expand(3, -1), frames, clock="even")
-    for _ in range(30):
-        alone, together = one.step(0.04), many.step(0.04)
-        torch.testing.assert_close(together.reference[1], alone.reference, rtol=0, atol=1e-9)
-    estimate = skill.step(4.0, shown.joints[10], frames, candidates=True)
-    assert [c.mean.shape for c in estimate.candidates] == [(17,), (17,)]
 
 
 def test_what_compiles_no_logarithms_says_so():

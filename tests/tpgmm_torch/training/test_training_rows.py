@@ -56,13 +56,6 @@ def test_uneven_demonstrations_are_learned_point_by_point_in_batches():
     assert_same(parts, hands_model().fit(uneven()))
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_joints_alone_and_float32_in_batches(dtype):
-    settings = {"dtype": dtype, "responsibilities": "point"}
-    whole, parts = canonical(**settings).fit(waves()), canonical(**settings)
-    assert_same(parts.fit(Batches(waves(), 1)), whole, 1e-9 if dtype == "float64" else 1e-4)
-
-
 @pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
 def test_signs_of_quaternions_follow_the_first_demonstration_of_all():
     flipped = [
