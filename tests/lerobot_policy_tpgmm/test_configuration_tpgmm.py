@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+from dataclasses import fields
 
 import draccus
 import pytest
@@ -75,8 +76,9 @@ def test_what_a_model_holds_and_how_it_moves_goes_along(tmp_path):
     assert again.config == policy.config
     back = again.to_estimator()
     assert back.holds_ == model.holds_
-    for name, bound in vars(model.skill.motion_bounds).items():
-        assert torch.equal(getattr(back.skill.motion_bounds, name), bound)
+    for bound in fields(bounds := model.skill.motion_bounds):
+        one, other = (getattr(b, bound.name) for b in (bounds, back.skill.motion_bounds))
+        assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(

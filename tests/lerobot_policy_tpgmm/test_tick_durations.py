@@ -62,13 +62,6 @@ def test_a_time_that_did_not_increase_is_told_and_forgotten(wrong):
     assert second == pytest.approx(USUAL, rel=1e-6)
 
 
-@pytest.mark.parametrize("wrong", [math.inf, -math.inf])
-def test_a_time_without_end_is_told_and_forgotten(wrong):
-    *_, refused, first, second = told(*times(*[USUAL] * 29), wrong, 0.30, 0.31)
-    assert refused == wrong  # which a controller refuses
-    assert (first, second) == pytest.approx((USUAL, USUAL), rel=1e-6)
-
-
 def test_robots_of_a_batch_do_not_know_of_each_other():
     steps = USUAL * (0.5 + torch.rand(50, 3, generator=torch.manual_seed(0))).double()
     steps[20, 1] = -1.0

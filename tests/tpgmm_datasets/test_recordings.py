@@ -22,6 +22,9 @@ ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
 needs_recordings = pytest.mark.skipif(not DATA.is_dir(), reason="the recordings are not here")
 MILLIMETRES, DEGREES, PATH, BEFORE = 0, 1, slice(2, 5), 5
+ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
+SO101 = dict.fromkeys((f"{name}.pos" for name in ARM), "deg")
+SO101["gripper.pos"] = Scale.between((0, 100), (0.0, 1.0))
 PARTS = ("ShoulderPitch", "ShoulderRoll", "ShoulderYaw", "Elbow")
 PARTS += ("WristRoll", "WristPitch", "WristYaw")
 
@@ -69,10 +72,7 @@ def test_so101_says_that_it_is_not_in_radians():
     assert found.robot_type == "so101_follower"
     with pytest.raises(DatasetError, match=r"not radians: .*shoulder_pan\.pos"):
         load_lerobot(DATA / "so101_record")
-    arm = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
-    units = dict.fromkeys((f"{name}.pos" for name in arm), "deg")
-    units["gripper.pos"] = Scale.between((0, 100), (0.0, 1.0))
-    demonstrations = load_lerobot(DATA / "so101_record", units=units)
+    demonstrations = load_lerobot(DATA / "so101_record", units=SO101)
     raw = load_lerobot(DATA / "so101_record", units="raw")
     assert len(demonstrations) == 4
     for found, stored in zip(demonstrations, raw, strict=True):
@@ -165,10 +165,7 @@ def test_intervals_of_the_median_end_at_the_episodes_that_the_sign_test_says(exa
 
 @needs_recordings
 def test_so101_in_degrees_is_read_aligned_and_reproduced():
-    arm = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
-    units = dict.fromkeys((f"{name}.pos" for name in arm), "deg")
-    units["gripper.pos"] = Scale.between((0, 100), (0.0, 1.0))
-    demonstrations = load_lerobot(DATA / "so101_record", units=units)
+    demonstrations = load_lerobot(DATA / "so101_record", units=SO101)
     assert [d.joint_names[0] for d in demonstrations] == ["shoulder_pan.pos"] * 4
     assert max(float(d.joints.abs().max()) for d in demonstrations) < np.pi
     aligned = DynamicTimeWarping(features=["directions"]).fit_transform(demonstrations)

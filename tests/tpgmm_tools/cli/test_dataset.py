@@ -74,15 +74,6 @@ def test_generated_demonstrations_are_those_of_the_skill_with_that_seed(tmp_path
     assert found.problems == ()
 
 
-def test_appended_episodes_follow_those_that_were_there(tmp_path):
-    root = tmp_path / "set"
-    for seed in (0, 1):
-        output(*generate(root, "--append", seed=seed))
-    skill = BottleShaking(rate=RATE)
-    expected = skill.demonstrations(2, seed=0) + skill.demonstrations(2, seed=1)
-    assert_same(load_lerobot(root), expected, 1e-6)
-
-
 @pytest.mark.parametrize("command", ["generate", "convert"])
 def test_a_set_that_exists_is_left_alone_without_append(command, generated, arm, tmp_path):
     root, written = arm

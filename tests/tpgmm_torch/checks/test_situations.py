@@ -39,12 +39,6 @@ def test_a_batch_names_the_most_unlike_robot():
     assert "situation 1, bottle: " in finding.message
 
 
-def test_only_limits_and_clock_count_without_a_summary():
-    [one] = given()
-    assert report(one.joints, ODD, summarised=False).findings == ()
-    assert [f.check for f in report(one.joints, ODD, 4000.0, False)] == ["time"]
-
-
 def test_only_the_first_tick_is_checked_and_a_posture_only_at_the_start():
     model, [one] = learned(), given()
     bent = one.joints.clone()

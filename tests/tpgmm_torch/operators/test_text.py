@@ -53,23 +53,10 @@ def test_a_pose_is_position_and_orientation():
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "",
-        "canonical +",
-        "pos:l_hand",
-        "position:",
-        "position:a@",
-        "position:a@b@c",
-        "pose:a@held:",
-        "parameters",
-        "parameters@a[0]",
-        "canonical~",
-        "canonical:",
-        "canonical:a,",
-        "canonical~-1",
-        "canonical~0.1~0.2",
-    ],
-)
+    ["", "canonical +", "pos:l_hand", "position:", "position:a@", "position:a@b@c",
+     "pose:a@held:", "parameters", "parameters@a[0]", "canonical~", "canonical:",
+     "canonical:a,", "canonical~-1", "canonical~0.1~0.2"],
+)  # fmt: skip
 def test_what_is_no_operator_is_refused_and_explained(text):
     with pytest.raises(DataError, match="A term is 'canonical', or"):
         parse_operator(text)

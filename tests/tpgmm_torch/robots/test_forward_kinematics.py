@@ -51,17 +51,6 @@ def test_a_turn_beyond_a_half_comes_back_with_a_real_part_that_is_not_negative()
             assert angle_seen == pytest.approx(abs((angle + np.pi) % (2 * np.pi) - np.pi))
 
 
-def test_one_robot_has_any_shape():
-    robot = zoo()
-    joints = random_joints(robot, 3)[1]
-    alone = robot.state(joints)
-    for batch in ((1,), (1, 1)):
-        state = robot.state(joints.expand(*batch, -1))
-        for name in ("positions", "orientations", "jacobians"):
-            part, whole = getattr(alone, name), getattr(state, name)
-            assert torch.equal(whole, part.expand(*batch, *part.shape))
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_second_derivatives_are_those_of_finite_differences(count):
     robot = zoo()
