@@ -55,6 +55,14 @@ def test_planted_boundaries_are_found(seed, noise):
     )
 
 
+def test_boundaries_are_one_within_a_shift_and_events_happen_at_stops_within_a_margin():
+    shown, _ = pick_and_place(seed=1)
+    assert Segmentation(shift=1e-4, agreement=1.0).fit(shown).n_parts_ == 1
+    near, exact = (find_boundaries(shown[0], margin=margin) for margin in (0.2, 0.0))
+    assert len(near) <= len(exact)
+    assert len(find_stops(shown[0], rest=0.01)) <= len(find_stops(shown[0])) == 3
+
+
 def test_a_rhythm_has_no_parts_whatever_its_period():
     time = np.arange(0, 10, 0.04)
     for period in (0.8, 2.0, 4.0):

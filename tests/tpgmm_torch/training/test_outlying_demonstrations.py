@@ -53,6 +53,20 @@ def test_a_fifth_of_wrong_frames_is_found(n, wrong):
         assert shown[0].time[0] <= one.time <= shown[0].time[-1]
 
 
+def test_how_far_and_how_long_is_the_caller_s_choice():
+    shown = some_misplaced(8, [5])
+    [ratio] = [one.ratio for one in outlying_demonstrations(shown, HANDLING, HANDS)]
+    for threshold, kept in ((0.99 * ratio, 7), (1.01 * ratio, 8)):
+        with warnings.catch_warnings(action="ignore"):
+            assert len(drop_outliers(shown, HANDLING, HANDS, threshold=threshold)) == kept
+    lasts = float(shown[0].time[-1] - shown[0].time[0])
+    short, long = (
+        outlying_demonstrations(shown, HANDLING, HANDS, duration=share * lasts)
+        for share in (0.05, 0.5)
+    )
+    assert short[0].ratio > (long[0].ratio if long else 0.0)
+
+
 def test_one_turned_frame_is_found():
     shown = handlings(6)
     cup = shown[2].frames["cup"]
