@@ -18,63 +18,50 @@ from torch import Tensor
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import Rows
 
-__all__ = ["Instants", "equivalent_points"]
+__all__ = ["equivalent_points", "equivalent_rows"]
 
 Array = NDArray[np.float64]
 
 
-class Instants:
-    """Mean and scatter of all demonstrations at each instant, gathered one by one.
+def equivalent_rows(
+    rows: Rows, reference: Array, widths: Sequence[int], processes: Processes = ALONE
+) -> tuple[Array, int]:
+    """Rows that stand for the demonstrations of all processes, and how many per instant.
 
     Parameters
     ----------
+    rows : array of shape (M T, sum D_j), or RowFile
+        Demonstrations of T rows each, one after the other.
     reference : array of shape (T, sum D_j)
         Rows near all others, the same in all processes: deviations are taken from it.
     widths : sequence of int
         D_j of each block.
+    processes : Processes
+
+    Returns
+    -------
+    array of shape (T * n, sum D_j)
+        The n points of each instant together.
+    int
+        n.
     """
-
-    def __init__(self, reference: Array, widths: Sequence[int]) -> None:
-        self._reference = torch.from_numpy(np.asarray(reference, dtype=np.float64))
-        self._widths = list(widths)
-        self._count = 0
-        self._sum = torch.zeros_like(self._reference)
-        self._squares = [
-            self._sum.new_zeros(len(self._sum), width, width) for width in self._widths
-        ]
-
-    def add(self, rows: Rows) -> None:
-        """Add demonstrations of T rows each, one after the other in ``rows``."""
-        length = len(self._reference)
-        for start in range(0, len(rows), length):
-            demonstration = np.asarray(rows[start : start + length], dtype=np.float64)
-            self._add(torch.from_numpy(demonstration) - self._reference)
-
-    def _add(self, deviation: Tensor) -> None:
-        self._count += 1
-        self._sum += deviation
-        for square, block in zip(self._squares, deviation.split(self._widths, 1), strict=True):
+    origin = torch.from_numpy(np.asarray(reference, dtype=np.float64))
+    own_total = torch.zeros_like(origin)
+    own_squares = [origin.new_zeros(len(origin), width, width) for width in widths]
+    for start in range(0, len(rows), len(origin)):
+        one = np.asarray(rows[start : start + len(origin)], dtype=np.float64)
+        deviation = torch.from_numpy(one) - origin
+        own_total += deviation
+        for square, block in zip(own_squares, deviation.split(list(widths), 1), strict=True):
             square += block[:, :, None] * block[:, None, :]
-
-    def points(self, processes: Processes = ALONE) -> tuple[Array, int]:
-        """Rows that stand for the demonstrations of all processes, and how many per instant.
-
-        Returns
-        -------
-        array of shape (T * n, sum D_j)
-            The n points of each instant together.
-        int
-            How many points stand for an instant, n.
-        """
-        counted = torch.tensor(float(self._count), dtype=torch.float64)
-        count, total, *squares = processes.sum(counted, self._sum, *self._squares)
-        size = max(self._widths) + 1
-        blocks = []
-        for mean, square in zip((total / count).split(self._widths, 1), squares, strict=True):
-            scatter = square / count - mean[:, :, None] * mean[:, None, :]
-            blocks.append(equivalent_points(mean, scatter, size))
-        points = self._reference[:, None] + torch.cat(blocks, -1)
-        return points.flatten(0, 1).numpy(), size
+    own_count = origin.new_tensor(len(rows) / len(origin))
+    count, total, *squares = processes.sum(own_count, own_total, *own_squares)
+    size, blocks = max(widths) + 1, []
+    for mean, square in zip((total / count).split(list(widths), 1), squares, strict=True):
+        scatter = square / count - mean[:, :, None] * mean[:, None, :]
+        blocks.append(equivalent_points(mean, scatter, size))
+    points = origin[:, None] + torch.cat(blocks, -1)
+    return points.flatten(0, 1).numpy(), size
 
 
 def equivalent_points(mean: Tensor, scatter: Tensor, size: int) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -14,6 +14,7 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.held_objects import held_objects
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -22,12 +23,10 @@ __all__ = [
     "Expected",
     "Motion",
     "at_phases",
-    "columns_of",
     "constant_columns",
     "like",
     "local_data",
-    "local_rows",
-    "one_constant",
+    "rows_of",
 ]
 
 #: The local coordinates (T, D_j) of operator j that are expected at times (T,).
@@ -111,80 +110,54 @@ def local_data(
         If a demonstration has not the robot's joints.
     """
     motions = [Motion.of(one, kinematics, holds) for one in demonstrations]
-    local = [[motion.coordinates(one, kinematics) for one in operators] for motion in motions]
-    sides = expected or like(local[0])
-    rows = [
-        local_rows(motion.time, x, operators, kinematics, sides)
-        for motion, x in zip(motions, local, strict=True)
-    ]
-    return rows if expected is not None else one_constant(rows, operators, kinematics)
-
-
-def local_rows(
-    time: Tensor,
-    local: Sequence[Tensor],
-    operators: Sequence[Operator],
-    kinematics: Kinematics,
-    expected: Expected,
-) -> Tensor:
-    """Rows of time and local coordinates.
-
-    Parameters
-    ----------
-    time : Tensor of shape (T,)
-    local : sequence of Tensor of shape (T, D_j)
-        Of each operator.
-    operators : sequence of Operator
-    kinematics : Kinematics
-    expected : callable
-        Quaternions come to the side of what it says.
-
-    Returns
-    -------
-    Tensor of shape (T, sum_j (1 + D_j))
-    """
-    blocks: list[Tensor] = []
-    for j, (operator, coordinates) in enumerate(zip(operators, local, strict=True)):
-        for start in operator.quaternion_starts(kinematics):
-            block, template = slice(start, start + 4), expected(j, time)
-            sign = torch.ones_like(coordinates[0])
-            agreement = (coordinates[:, block] * template[:, block]).sum()
-            sign[block] = quaternions.hemisphere_sign(agreement)
-            coordinates = coordinates * sign
-        blocks += [time[:, None], coordinates]
-    return torch.cat(blocks, dim=1)
-
-
-def one_constant(
-    rows: Sequence[Tensor], operators: Sequence[Operator], kinematics: Kinematics
-) -> list[Tensor]:
-    """Rows of demonstrations, with what varies by rounding alone as in the first row.
-
-    Parameters
-    ----------
-    rows : sequence of Tensor of shape (T_m, sum_j (1 + D_j))
-    operators : sequence of Operator
-    kinematics : Kinematics
-    """
-    together = torch.cat(list(rows))
-    columns = columns_of(operators, kinematics)
-    mask = constant_columns(together.amin(0), together.amax(0), *columns)
+    rows = list(rows_of(motions, operators, kinematics, expected))
+    if expected is not None:
+        return rows
+    together = torch.cat(rows)
+    low, high = together.aminmax(dim=0)
+    mask = constant_columns(low, high, operators, kinematics)
     together = torch.where(mask, together[0], together)
     return list(together.split([len(row) for row in rows]))
 
 
-def columns_of(
-    operators: Sequence[Operator], kinematics: Kinematics
-) -> tuple[list[int], list[bool]]:
-    """1 + D_j of each operator, and whether it has rotation vectors.
+def rows_of(
+    motions: Iterable[Motion],
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    expected: Expected | None = None,
+    processes: Processes = ALONE,
+) -> Iterator[Tensor]:
+    """Rows of time and local coordinates of motions, one after the other.
 
     Parameters
     ----------
+    motions : iterable of Motion
+        At least one.
     operators : sequence of Operator
     kinematics : Kinematics
+    expected : callable, optional
+        Quaternions come to the side of what it says; by default to that of the first motion.
+    processes : Processes
+        Of which the first has the first motion.
+
+    Yields
+    ------
+    Tensor of shape (T_m, sum_j (1 + D_j))
     """
-    turns = [bool(one.rotation_vector_starts(kinematics)) for one in operators]
-    return [1 + one.dimension(kinematics) for one in operators], turns
+    for motion in motions:
+        local = [motion.coordinates(one, kinematics) for one in operators]
+        if expected is None:
+            first = processes.gather([block.cpu() for block in local])[0]
+            expected = like([block.to(kinematics.lower) for block in first])
+        blocks: list[Tensor] = []
+        for j, (operator, block) in enumerate(zip(operators, local, strict=True)):
+            template, sign = expected(j, motion.time), torch.ones_like(block[0])
+            for start in operator.quaternion_starts(kinematics):
+                columns = slice(start, start + 4)
+                agreement = (block[:, columns] * template[:, columns]).sum()
+                sign[columns] = quaternions.hemisphere_sign(agreement)
+            blocks += [motion.time[:, None], block * sign]
+        yield torch.cat(blocks, dim=1)
 
 
 def like(templates: Sequence[Tensor]) -> Expected:
@@ -218,7 +191,7 @@ def at_phases(rows: Tensor, count: int) -> Tensor:
 
 
 def constant_columns(
-    smallest: Tensor, largest: Tensor, widths: Sequence[int], turns: Sequence[bool]
+    smallest: Tensor, largest: Tensor, operators: Sequence[Operator], kinematics: Kinematics
 ) -> Tensor:
     """Columns that vary by rounding alone, to be made constant.
 
@@ -226,10 +199,8 @@ def constant_columns(
     ----------
     smallest, largest : Tensor of shape (sum_j (1 + D_j),)
         Of each column.
-    widths : sequence of int
-        1 + D_j of each operator.
-    turns : sequence of bool
-        Whether it has rotation vectors, whose rounding is that of numbers of the order of 1.
+    operators : sequence of Operator
+    kinematics : Kinematics
 
     Returns
     -------
@@ -237,10 +208,12 @@ def constant_columns(
     """
     # recorded poses went through more than our own rounding
     rounding = max(100 * torch.finfo(smallest.dtype).eps, 1e-10)
+    widths = [1 + one.dimension(kinematics) for one in operators]
+    blocks = zip(operators, smallest.split(widths), largest.split(widths), strict=True)
     masks = []
-    for low, high, turn in zip(
-        smallest.split(list(widths)), largest.split(list(widths)), turns, strict=True
-    ):
-        size = torch.maximum(low.abs(), high.abs())[1:].max().clamp(min=float(turn))
+    for operator, low, high in blocks:
+        # rotation vectors are logarithms of numbers of the order of 1
+        least = float(bool(operator.rotation_vector_starts(kinematics)))
+        size = torch.maximum(low.abs(), high.abs())[1:].max().clamp(min=least)
         masks.append(high - low <= rounding * size)
     return torch.cat(masks)

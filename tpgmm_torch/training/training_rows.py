@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any, Self
 
 import numpy as np
@@ -20,29 +20,13 @@ from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.mixture.row_file import RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
-from tpgmm_torch.training.equivalent_points import Instants
+from tpgmm_torch.training.equivalent_points import equivalent_rows
 from tpgmm_torch.training.hold_detection import demonstrated_holds
-from tpgmm_torch.training.local_data import (
-    Motion,
-    at_phases,
-    columns_of,
-    constant_columns,
-    like,
-    local_rows,
-)
+from tpgmm_torch.training.local_data import Motion, at_phases, constant_columns, rows_of
 from tpgmm_torch.training.mean_orientations import with_mean_orientations
+from tpgmm_torch.training.mixture_settings import block_widths
 
 __all__ = ["TrainingRows", "batches_of", "read_rows", "typical"]
-
-
-@dataclass(frozen=True)
-class Span:
-    """Begin and duration [s] of a demonstration, and its rows among all of its process."""
-
-    begin: float
-    duration: float
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +51,8 @@ class TrainingRows:
         Among which the rows are spread.
     stored : array of shape (sum_m T_m, sum_j (1 + D_j)), or RowFile
         Rows of the demonstrations of this process, one after the other.
-    spans : tuple of Span
-        Where each demonstration is in them.
+    edges : array of int, of shape (M + 1,)
+        Where the demonstrations of this process begin in them, and the last ends.
     """
 
     rows: Rows
@@ -79,7 +63,7 @@ class TrainingRows:
     holds: tuple[Hold, ...]
     processes: Processes
     stored: Rows
-    spans: tuple[Span, ...]
+    edges: NDArray[np.intp]
 
     def at_phases(self, count: int) -> Tensor:
         """Rows of all demonstrations of all processes at equal phase.
@@ -93,8 +77,8 @@ class TrainingRows:
         -------
         Tensor of shape (M, count, sum_j (1 + D_j))
         """
-        each = (torch.from_numpy(self.stored[one.start : one.stop]) for one in self.spans)
-        thinned = torch.stack([at_phases(rows, count) for rows in each])
+        each = (self.stored[start:stop] for start, stop in pairwise(self.edges))
+        thinned = torch.stack([at_phases(torch.from_numpy(rows), count) for rows in each])
         return torch.cat(self.processes.gather(thinned.double()))
 
     def within(self, begin: float, end: float) -> Self:
@@ -110,13 +94,9 @@ class TrainingRows:
         own, kept = ((x[:, 0] >= begin) & (x[:, 0] < end) for x in (rows, stored))
         if int(inside.sum()) < 2 or not own.any():
             raise DataError(f"there are no two instants between {begin:.4g} and {end:.4g} s")
-        before = np.concatenate(([0], np.cumsum(kept)))
-        spans = tuple(
-            replace(one, start=int(before[one.start]), stop=int(before[one.stop]))
-            for one in self.spans
-        )
+        edges = np.append(0, np.cumsum(kept))[self.edges]
         return replace(
-            self, rows=rows[own], time=self.time[inside], stored=stored[kept], spans=spans
+            self, rows=rows[own], time=self.time[inside], stored=stored[kept], edges=edges
         )
 
 
@@ -141,13 +121,11 @@ def batches_of(X: Any, processes: Processes = ALONE) -> Iterator[list[Demonstrat
         says in which batch.
     """
     first: list[Demonstration] = []
-    several = False
     for number, batch in enumerate(_split(X)):
-        several = several or number > 0
         try:
             checked = check_demonstrations([*first, *batch])[len(first) :]
         except (ValueError, TypeError) as error:
-            if not several:
+            if number == 0:
                 raise
             kind = type(error) if isinstance(error, DataError) else DataError
             raise kind(f"batch {number} of demonstrations: {error}") from error
@@ -220,110 +198,91 @@ def read_rows(
         If ``responsibilities="instant"`` and the demonstrations have different time grids.
     """
     walk = iter(batches)
-    head = next(walk)
+    head, later = next(walk), next(walk, None)
+    alone = later is None and processes.count == 1
     holds = processes.gather(demonstrated_holds(head, operators, kinematics))[0]
     motions = [Motion.of(one, kinematics, holds) for one in head]
-    operators = with_mean_orientations(operators, motions, kinematics)
-    operators = processes.gather(operators)[0]
-
-    def coordinates(motion: Motion) -> list[Tensor]:
-        return [motion.coordinates(one, kinematics) for one in operators]
-
-    local = list(map(coordinates, motions))
-    templates = processes.gather([x.cpu() for x in local[0]])[0]
-    expected = like([template.to(kinematics.lower) for template in templates])
-    known = operators, kinematics, expected
-    later = next(walk, None)
-    alone = later is None and processes.count == 1
-
-    following = (
-        Motion.of(one, kinematics, holds)
-        for one in chain.from_iterable(chain([later or ()], walk))
-    )
-    each = chain(zip(motions, local, strict=True), ((m, coordinates(m)) for m in following))
-    rows = (local_rows(motion.time, x, *known) for motion, x in each)
-    stored, spans, aligned = _stored(rows, alone, processes)
-    first = _made_constant(stored, spans[0], operators, kinematics, processes)
-    n_demonstrations = sum(processes.gather(len(spans)))
+    operators = processes.gather(with_mean_orientations(operators, motions, kinematics))[0]
+    following = chain.from_iterable(chain([later or ()], walk))
+    all_motions = chain(motions, (Motion.of(one, kinematics, holds) for one in following))
+    each = rows_of(all_motions, operators, kinematics, processes=processes)
+    stored, edges = _stored((rows.cpu().numpy() for rows in each), alone)
+    first = _made_constant(stored, edges[1], operators, kinematics, processes)
+    grid = (np.array_equal(stored[i:j, 0], first[:, 0]) for i, j in pairwise(edges))
+    aligned = all(processes.gather(all(grid)))
     if responsibilities == "instant" and not aligned:
         raise DataError(
             "responsibilities='instant' needs demonstrations of one common time grid: "
             "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
         )
-    if not aligned or responsibilities == "point" or n_demonstrations == 1:
-        learned, size = stored, 1
-    elif alone:
-        learned, size = _instants_together(stored[:], n_demonstrations), n_demonstrations
-    else:
-        learned, size = _equivalent(stored, first, columns_of(*known[:2])[0], processes)
-    time = _typical_time(stored, spans, processes).to(kinematics.lower)
+    time, number = _typical_time(stored, edges, processes)
+    learned, size = stored, 1
+    if aligned and responsibilities != "point" and number > 1:
+        learned, size = _by_instant(stored, first, number, operators, kinematics, processes)
+    time = time.to(kinematics.lower)
     return TrainingRows(
-        learned, size, time, n_demonstrations, tuple(operators), holds, processes, stored,
-        tuple(spans),
-    )  # fmt: skip
+        learned, size, time, number, tuple(operators), holds, processes, stored, edges
+    )
 
 
-def _instants_together(rows: NDArray[Any], number: int) -> NDArray[Any]:
-    """Rows of some demonstrations of equal length, those of one instant one after the other."""
-    width = rows.shape[1]
-    return rows.reshape(number, -1, width).swapaxes(0, 1).reshape(-1, width)
-
-
-def _stored(
-    each: Iterator[Tensor], alone: bool, processes: Processes
-) -> tuple[Rows, list[Span], bool]:
-    """All rows, where each demonstration is in them, and whether all have one time grid."""
+def _stored(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
+    """Rows of all demonstrations, in a file unless in one batch, and where each begins."""
     kept: Any = [] if alone else RowFile()
-    spans, count, aligned, grid = list[Span](), 0, True, None
+    lengths = [0]
     for rows in each:
-        values = rows.cpu().numpy()
-        time = values[:, 0]
-        grid = processes.gather(time)[0] if grid is None else grid
-        aligned = aligned and np.array_equal(time, grid)
-        begin, end = float(time[0]), float(time[-1])
-        spans.append(Span(begin, end - begin, count, count + len(values)))
-        count += len(values)
-        kept.append(values)
-    return np.concatenate(kept) if alone else kept, spans, all(processes.gather(aligned))
+        lengths.append(len(rows))
+        kept.append(rows)
+    return np.concatenate(kept) if alone else kept, np.cumsum(lengths)
 
 
 def _made_constant(
     stored: Rows,
-    span: Span,
+    length: int,
     operators: Sequence[Operator],
     kinematics: Kinematics,
     processes: Processes,
 ) -> NDArray[Any]:
     """Rows of the first demonstration of all; what varies by rounding alone is as in it."""
     moments = ColumnMoments.of(stored, processes)
-    first = processes.gather(stored[span.start : span.stop])[0]
+    first = processes.gather(stored[:length])[0]
     low, high = (
         torch.from_numpy(x.astype(first.dtype)) for x in (moments.smallest, moments.largest)
     )
-    constant = constant_columns(low, high, *columns_of(operators, kinematics)).numpy()
+    constant = constant_columns(low, high, operators, kinematics).numpy()
     stored[:, constant] = first[0, constant]
     return np.where(constant, first[0], first)
 
 
-def _equivalent(
-    stored: Rows, reference: NDArray[Any], widths: Sequence[int], processes: Processes
+def _by_instant(
+    stored: Rows,
+    first: NDArray[Any],
+    number: int,
+    operators: Sequence[Operator],
+    kinematics: Kinematics,
+    processes: Processes,
 ) -> tuple[Rows, int]:
-    """The share of a process of points that stand for all demonstrations at each instant."""
-    instants = Instants(reference, widths)
-    instants.add(stored)
-    points, size = instants.points(processes)
+    """Share of a process of the rows that stand for all demonstrations at each instant."""
+    if isinstance(stored, np.ndarray):
+        instants = stored.reshape(number, *first.shape).swapaxes(0, 1)
+        return instants.reshape(stored.shape), number
+    widths = block_widths(operators, kinematics)
+    points, size = equivalent_rows(stored, first, widths, processes)
     own = processes.share(range(len(points) // size))
     return points[own[0] * size : (own[-1] + 1) * size], size
 
 
-def _typical_time(stored: Rows, spans: Sequence[Span], processes: Processes) -> Tensor:
-    everyone = [
-        (rank, one) for rank, each in enumerate(processes.gather(spans)) for one in each
-    ]
-    begins, durations = zip(*((one.begin, one.duration) for _, one in everyone), strict=True)
-    owner, one = everyone[typical(begins, durations)]
-    time = stored[one.start : one.stop, 0].copy() if processes.rank == owner else None
-    return torch.from_numpy(processes.gather(time)[owner])
+def _typical_time(
+    stored: Rows, edges: NDArray[np.intp], processes: Processes
+) -> tuple[Tensor, int]:
+    """Time grid of the demonstration of median duration of all processes, and their number."""
+    spans = [(float(stored[i, 0]), float(stored[j - 1, 0])) for i, j in pairwise(edges)]
+    own = [(begin, end - begin, processes.rank, i) for i, (begin, end) in enumerate(spans)]
+    everyone = list(chain.from_iterable(processes.gather(own)))
+    begins, durations, owners, places = zip(*everyone, strict=True)
+    chosen = typical(begins, durations)
+    place = places[chosen] if owners[chosen] == processes.rank else 0
+    times = processes.gather(stored[edges[place] : edges[place + 1], 0])
+    return torch.from_numpy(times[owners[chosen]].copy()), len(everyone)
 
 
 def typical(begins: Sequence[float], durations: Sequence[float]) -> int:

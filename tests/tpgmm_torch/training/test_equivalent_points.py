@@ -6,7 +6,7 @@ import torch
 
 from tests.support.skills import HANDLING, HANDS, handlings
 from tpgmm_torch.mixture.row_file import RowFile
-from tpgmm_torch.training.equivalent_points import Instants, equivalent_points
+from tpgmm_torch.training.equivalent_points import equivalent_points, equivalent_rows
 from tpgmm_torch.training.local_data import local_data
 
 
@@ -32,10 +32,9 @@ def test_instants_have_the_moments_of_all_demonstrations_block_by_block(in_file)
     """However far the reference."""
     rng, widths, length = np.random.RandomState(0), (2, 3), 20
     many = rng.standard_normal((7, length, 5)) + 1e3
-    instants = Instants(many[0] + 0.5, widths)
     rows = many.reshape(-1, 5)
-    instants.add(RowFile.of([rows]) if in_file else rows)
-    points, size = instants.points()
+    given = RowFile.of([rows]) if in_file else rows
+    points, size = equivalent_rows(given, many[0] + 0.5, widths)
     assert size == 4
     points = points.reshape(length, size, 5)
     np.testing.assert_allclose(points.mean(1), many.mean(0), rtol=1e-12)

@@ -8,6 +8,7 @@ from tests.support.local_coordinates import local_coordinates
 from tests.support.motions import turning
 from tpgmm_torch import AbsoluteOrientation, AbsolutePosition, Canonical, Demonstration, Stack
 from tpgmm_torch.exceptions import ShapeError
+from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.tracked_poses import Poses
 from tpgmm_torch.training.local_data import constant_columns, like, local_data
 
@@ -100,15 +101,17 @@ def test_rounding_is_measured_by_the_largest_coordinate_of_the_operator():
     eps = np.finfo(np.float64).eps
     low = torch.tensor([0.0, -1000.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
     spread = torch.tensor([9.0, 9.0, 0.99e-7, 1.01e-7, 9.0, 1e3 * eps])
-    mask = constant_columns(low, low + spread, [4, 2], [False, False])
+    two = [AbsolutePosition("hand"), Canonical()], JointSpace(["a"])
+    mask = constant_columns(low, low + spread, *two)
     assert mask.tolist() == [False, False, True, False, False, False]
     # rotation vectors are logarithms of quaternions, which are of size 1
     tiny = torch.tensor([0.0, 1e-16, 2e-16, 3e-16], dtype=torch.float64)
-    assert constant_columns(0 * tiny, tiny, [4], [False]).tolist() == [True] + [False] * 3
-    assert constant_columns(0 * tiny, tiny, [4], [True]).tolist() == [True] * 4
+    turn = AbsoluteOrientation("hand", geometry="tangent")
+    assert constant_columns(0 * tiny, tiny, [two[0][0]], HAND).tolist() == [True] + [False] * 3
+    assert constant_columns(0 * tiny, tiny, [turn], HAND).tolist() == [True] * 4
     eps = np.finfo(np.float32).eps
     spread = torch.tensor([9.0, 9.0, 99e3 * eps, 101e3 * eps, 9.0, 1e3 * eps])
-    mask = constant_columns(low.float(), low.float() + spread, [4, 2], [False, False])
+    mask = constant_columns(low.float(), low.float() + spread, *two)
     assert mask.tolist() == [False, False, True, False, False, False]
 
 
