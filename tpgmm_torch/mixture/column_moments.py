@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.mixture.row_file import FILE_ROWS, Rows
+from tpgmm_torch.mixture.row_file import Rows, pieces
 
 __all__ = ["ColumnMoments"]
 
@@ -53,22 +53,18 @@ class ColumnMoments:
         if len(set(widths)) > 1:
             raise DataError(f"the processes' rows have {widths} columns: all need the same")
 
-        def parts() -> Iterator[Array]:
-            for start in range(0, len(rows), FILE_ROWS):
-                yield np.asarray(rows[start : start + FILE_ROWS], dtype=np.float64)
-
         def everywhere(own: list[Array], joined: np.ufunc = np.add) -> Array:
             return np.asarray(joined.reduce(processes.gather(joined.reduce(own))))
 
         count, first = sum(counts), processes.gather(np.asarray(rows[:1], np.float64)[0])[0]
         with np.errstate(over="ignore", invalid="ignore"):
             # seen from the first row, so that a constant column varies by nothing at all
-            mean = first + everywhere([(part - first).sum(0) for part in parts()]) / count
-            scatter = everywhere([np.square(part - mean).sum(0) for part in parts()])
+            mean = first + everywhere([(part - first).sum(0) for part in pieces(rows)]) / count
+            scatter = everywhere([np.square(part - mean).sum(0) for part in pieces(rows)])
         if not np.isfinite(scatter).all():
             raise DataError("the variance of the data overflows; divide the data by a constant")
-        low = everywhere([part.min(0) for part in parts()], np.minimum)
-        high = everywhere([part.max(0) for part in parts()], np.maximum)
+        low = everywhere([part.min(0) for part in pieces(rows)], np.minimum)
+        high = everywhere([part.max(0) for part in pieces(rows)], np.maximum)
         return cls(count, mean, scatter, low, high)
 
     def scales(self, widths: Sequence[int], *, isotropic: bool) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tpgmm_torch.exceptions import DataError, ShapeError
 
-__all__ = ["FILE_ROWS", "RowFile", "Rows"]
+__all__ = ["FILE_ROWS", "RowFile", "Rows", "pieces"]
 
 #: Rows that are read, drawn or kept at once: memory holds no more of a file.
 FILE_ROWS = 2**16
@@ -98,3 +98,14 @@ class RowFile:
 
 #: Rows (n, n_features) in memory, or in a file.
 Rows = NDArray[np.floating[Any]] | RowFile
+
+
+def pieces(rows: Rows) -> Iterator[NDArray[np.float64]]:
+    """All rows in float64, so many at a time as are read from a file at once.
+
+    Parameters
+    ----------
+    rows : array of shape (n, n_features), or RowFile
+    """
+    for start in range(0, len(rows), FILE_ROWS):
+        yield np.asarray(rows[start : start + FILE_ROWS], dtype=np.float64)

@@ -95,31 +95,27 @@ def follow_poses(
     >>> (robot.state(joints).position("l_hand") - wanted.position).norm(dim=-1).max() < 1e-3
     tensor(True)
     """
-    lengths = {frame.batch_shape for frame in poses.values()}
-    if len(lengths) != 1 or len(next(iter(lengths))) != 1:
-        raise ShapeError(
-            f"each link needs the same number of poses, got {[tuple(n) for n in lengths]}"
-        )
-    length = int(next(iter(lengths))[0])
+    shapes = {tuple(frame.batch_shape) for frame in poses.values()}
+    if [len(shape) for shape in shapes] != [1]:
+        raise ShapeError(f"each link needs the same number of poses, got {sorted(shapes)}")
+    [(length,)] = shapes
+    solver = _Solver(robot, poses, start, 1 / rate, orientations)
     postures = robot.joint_tensor(start if posture is None else posture)
-    each = posture is not None and postures.ndim > 1
-    if each and len(postures) != length:
+    if postures.ndim == 1:
+        postures = postures.expand(length, -1)
+    else:
+        solver.posture.gain = 1.0  # each is sought at once
+    if len(postures) != length:
         raise ShapeError(f"{length} poses need as many postures, or one; got {len(postures)}")
-    # a gain of one period: one posture is sought slowly, not within one step
-    gain = 1.0 if each else min(1 / rate, 1.0)
-    solver = _Solver(robot, poses, start, 1 / rate, orientations, gain)
-    postures = postures if each else postures.expand(length, -1)
     joints = [solver.joints]
     for step in range(1, length):
         wanted = {link: frame[step] for link, frame in poses.items()}
         joints.append(solver.step(wanted, postures[step]))
     found = torch.stack(joints)
-    errors = _errors(robot, found, poses, orientations)
-    missed = {link: error for link, error in errors.items() if error.max() > tolerance}
-    if missed:
+    if missed := _missed(robot, found, poses, orientations, tolerance):
         warnings.warn(
-            f"the poses are missed: {_described(missed)}. They are out of reach, faster than "
-            "the joints may move, or far from the start",
+            f"the poses are missed: {missed}. They are out of reach, faster than the joints "
+            "may move, or far from the start",
             PlausibilityWarning,
             stacklevel=2,
         )
@@ -162,42 +158,41 @@ def reach(
         if frame.batch_shape:
             raise ShapeError(f"{link!r} needs one pose, got {tuple(frame.batch_shape)} of them")
     rest = robot.joint_tensor(start if posture is None else posture)
-    solver = _Solver(robot, poses, start, STEP, orientations, STEP)
+    solver = _Solver(robot, poses, start, STEP, orientations)
     for _ in range(MOST_STEPS):
-        errors = _errors(robot, solver.joints, poses, orientations)
-        if all(bool(error.max() <= tolerance) for error in errors.values()):
+        missed = _missed(robot, solver.joints, poses, orientations, tolerance)
+        if not missed:
             return solver.joints
         solver.step(poses, rest)
     raise DataError(
-        f"the poses are not reached from this start: {_described(errors)}. Start nearer, ask "
-        "for positions alone (orientations=False), or for poses within reach"
+        f"the poses are not reached from this start: {missed}. Start nearer, ask for positions "
+        "alone (orientations=False), or for poses within reach"
     )
 
 
-def _errors(
-    robot: Robot, joints: Tensor, poses: Mapping[str, Frame], orientations: bool
-) -> dict[str, Tensor]:
-    """Distance of each link from its poses: (N, 2), in metres and radians."""
-    state, errors = robot.state(joints), {}
+def _missed(
+    robot: Robot,
+    joints: Tensor,
+    poses: Mapping[str, Frame],
+    orientations: bool,
+    tolerance: float,
+) -> str:
+    """Largest distance of links from their poses, of those farther than a tolerance."""
+    state, texts = robot.state(joints), []
     for link, pose in poses.items():
         away = (pose.position.to(joints) - state.position(link)).norm(dim=-1)
         turn = quaternions.product(
             pose.orientation.to(joints), quaternions.conjugate(state.orientation(link))
         )
         angle = quaternions.log(turn).norm(dim=-1) * float(orientations)
-        errors[link] = torch.stack((away, angle), -1).reshape(-1, 2)
-    return errors
-
-
-def _described(errors: Mapping[str, Tensor]) -> str:
-    """Largest distance of each link from its poses."""
-    texts = []
-    for link, error in errors.items():
-        worst = int(error.amax(-1).argmax())
-        which = f" from pose {worst} of {len(error)}" if len(error) > 1 else ""
-        away, angle = error[worst].tolist()
-        degrees = math.degrees(angle)
-        texts.append(f"{link!r} is {1e3 * away:.1f} mm, {degrees:.1f} deg away{which}")
+        errors = torch.stack((away, angle), -1).reshape(-1, 2)
+        if bool(errors.max() <= tolerance):
+            continue
+        worst = int(errors.amax(-1).argmax())
+        which = f" from pose {worst} of {len(errors)}" if len(errors) > 1 else ""
+        metres, radians = errors[worst].tolist()
+        degrees = math.degrees(radians)
+        texts.append(f"{link!r} is {1e3 * metres:.1f} mm, {degrees:.1f} deg away{which}")
     return ", ".join(texts)
 
 
@@ -211,7 +206,6 @@ class _Solver:
         start: Any,
         period: float,
         orientations: bool,
-        gain: float,
     ) -> None:
         try:
             import mink
@@ -230,7 +224,8 @@ class _Solver:
         self.configuration = mink.Configuration(model, self.joints[self.columns].numpy())
         cost = 1.0 if orientations else 0.0
         self.tasks = {link: mink.FrameTask(link, "body", 1.0, cost) for link in poses}
-        self.posture = mink.PostureTask(model, POSTURE_COST, gain=gain)
+        # a gain of one period: the posture is sought slowly, not within one step
+        self.posture = mink.PostureTask(model, POSTURE_COST, gain=min(period, 1.0))
         speeds = zip(self.columns, robot.velocity[self.columns].tolist(), strict=True)
         limited = {robot.joint_names[i]: v for i, v in speeds if math.isfinite(v)}
         self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, limited)]

@@ -51,6 +51,17 @@ class _View:
     values: Array
     near: float
 
+    def of(self, members: NDArray[np.intp]) -> _View:
+        """The same of some of the demonstrations."""
+        return replace(self, values=self.values[members])
+
+    @property
+    def stretches(self) -> Array:
+        """Means (N, S, D) over stretches."""
+        edges = _edges(self.values.shape[1])
+        sums = np.add.reduceat(self.values, edges[:-1], axis=1)
+        return np.asarray(sums / np.diff(edges)[:, None])
+
 
 @dataclass(frozen=True)
 class _Split:
@@ -172,28 +183,27 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
         """
         check_parameters(self)
         known = check_demonstrations(X)
-        count, wanted = len(known), self.n_ways
-        if isinstance(wanted, Integral) and wanted > 1 and count < FEWEST * wanted:
+        count = len(known)
+        self._given = None if isinstance(self.n_ways, str) else int(self.n_ways)
+        if self._given and count < FEWEST * self._given > FEWEST:
             raise DataError(
-                f"{wanted} modes of at least {FEWEST} demonstrations each need "
-                f"{FEWEST * wanted}, got {count}"
+                f"{self._given} modes of at least {FEWEST} demonstrations each need "
+                f"{FEWEST * self._given}, got {count}"
             )
         self.labels_: NDArray[np.intp] = np.zeros(count, dtype=np.intp)
         self.bic_: Array = np.full(self.max_ways, np.inf)
         self._found: list[_Split] = []
-        if count >= 2 * FEWEST and wanted != 1:
-            self._divide(self._views(known))
+        self._divide(self._views(known))
         self.n_ways_ = int(self.labels_.max()) + 1
-        shown: list[list[Demonstration]] = [[] for _ in range(self.n_ways_)]
-        for label, one in zip(self.labels_, known, strict=True):
-            shown[label].append(one)
+        pairs = list(zip(self.labels_, known, strict=True))
+        shown = [[one for k, one in pairs if k == way] for way in range(self.n_ways_)]
         self.models_ = [clone(self.model).fit(own) for own in shown]
         self.skill_: Ways | Regression = self.models_[0].skill
         self.best_model_: Any = self.models_[0]
         if self.n_ways_ > 1:
             skills = tuple(model.skill for model in self.models_)
             limits = tuple(map(_largest_surprise, skills, shown))
-            self.skill_ = Ways(skills, tuple(len(own) / count for own in shown), limits)
+            self.skill_ = Ways(skills, tuple(np.bincount(self.labels_) / count), limits)
             self.best_model_ = self.skill_
         return self
 
@@ -240,12 +250,10 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
 
     def _divide(self, views: Sequence[_View]) -> None:
         """Divide all demonstrations, and the parts again until none falls apart."""
-        given = None if isinstance(self.n_ways, str) else int(self.n_ways)
         parts, whole = [np.arange(len(self.labels_))], []
         while parts:
             members = parts.pop(0)
-            here = [replace(view, values=view.values[members]) for view in views]
-            split = self._split(here, given)
+            split = self._split([view.of(members) for view in views])
             if split is None:
                 whole.append(members)
                 continue
@@ -253,29 +261,31 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
                 self.bic_[: len(split.bic)] = split.bic
             self._found.append(split)
             new = [members[split.labels == k] for k in range(split.labels.max() + 1)]
-            (whole if given else parts).extend(new)
+            (whole if self._given else parts).extend(new)
         for mode, members in enumerate(sorted(whole, key=lambda part: int(part[0]))):
             self.labels_[members] = mode
 
-    def _split(self, views: Sequence[_View], given: int | None) -> _Split | None:
+    def _split(self, views: Sequence[_View]) -> _Split | None:
         """The best division of some demonstrations; None if BIC says that they are one mode."""
-        most = min(given or self.max_ways, len(views[0].values) // FEWEST)
+        most = min(self._given or self.max_ways, len(views[0].values) // FEWEST)
         if most < 2:
             return None
-        shown = [(view, _stretches(view.values)) for view in views]
         places = [
             (view, stretch, along)
-            for view, values in shown
-            for stretch in range(values.shape[1])
-            for along in _axes(values[:, stretch])
+            for view in views
+            for stretch, means in enumerate(view.stretches.swapaxes(0, 1))
+            for along in _axes(means)
         ]
         cost = math.log(max(len(places), 1))
-        splits = [_divided(*place, cost, most, given) for place in places]
-        best = sorted((one for one in splits if one), key=lambda split: split.worth)
-        for split in best:
-            if given or not (self._late(split) or _situational(split, shown)):
-                return split
-        return None
+        splits = [_divided(*place, cost, most, self._given) for place in places]
+        best = sorted(filter(None, splits), key=lambda split: split.worth)
+        if self._given:
+            return next(iter(best), None)
+        return next((one for one in best if not self._explained(one, views)), None)
+
+    def _explained(self, split: _Split, views: Sequence[_View]) -> bool:
+        """Whether a shift in time explains a division, or what is seen at the start."""
+        return self._late(split) or _situational(split, views)
 
     def _late(self, split: _Split) -> bool:
         """Whether there is no gap between modes, or none but for who is a little earlier."""
@@ -313,13 +323,6 @@ def _edges(count: int) -> NDArray[np.intp]:
     """Where stretches of T instants begin and end."""
     number = min(STRETCHES, count)
     return np.linspace(0, count, number + 1).round().astype(np.intp)
-
-
-def _stretches(values: Array) -> Array:
-    """Means (N, S, D) over stretches of values (N, T, D)."""
-    edges = _edges(values.shape[1])
-    sums = np.add.reduceat(values, edges[:-1], axis=1)
-    return np.asarray(sums / np.diff(edges)[:, None])
 
 
 def _axes(values: Array) -> Array:
@@ -387,12 +390,12 @@ def _separation(values: Array, labels: NDArray[np.intp], near: float) -> float:
     return float(np.diff(np.sort(means)).min() / within)
 
 
-def _situational(split: _Split, shown: Sequence[tuple[_View, Array]]) -> bool:
+def _situational(split: _Split, views: Sequence[_View]) -> bool:
     """Whether where demonstrations begin, as some operator sees it, shows the modes too."""
     one = np.zeros_like(split.labels)
     gains = [
         _log_likelihood(along, split.labels, view.near) - _log_likelihood(along, one, view.near)
-        for view, _ in shown
+        for view in views
         for along in _axes(view.values[:, 0])
     ]
     return max(gains) > SITUATION * split.gain

@@ -326,10 +326,13 @@ def _agreed(shown: Sequence[list[Hold]], agreement: float) -> list[Hold]:
     if count < max(agreement * len(shown), 1):
         return []
     alike = [holds for holds, own in zip(shown, orders, strict=True) if own == order]
-    found: list[Hold] = []
-    for holds in zip(*alike, strict=True):
-        begin, end = (median(getattr(h, name) for h in holds) for name in ("begin", "end"))
-        if found and begin - found[-1].end < SMOOTHING:  # as in one demonstration: handed on
-            found[-1] = replace(found[-1], end=begin)
-        found.append(replace(holds[0], begin=begin, end=end))
-    return found
+    return _in_order(
+        [
+            replace(
+                holds[0],
+                begin=median(hold.begin for hold in holds),
+                end=median(hold.end for hold in holds),
+            )
+            for holds in zip(*alike, strict=True)
+        ]
+    )

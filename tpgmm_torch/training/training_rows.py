@@ -208,21 +208,10 @@ def read_rows(
     each = rows_of(all_motions, operators, kinematics, processes=processes)
     stored, edges = _stored((rows.cpu().numpy() for rows in each), alone)
     first = _made_constant(stored, edges[1], operators, kinematics, processes)
-    grid = (np.array_equal(stored[i:j, 0], first[:, 0]) for i, j in pairwise(edges))
-    aligned = all(processes.gather(all(grid)))
-    if responsibilities == "instant" and not aligned:
-        raise DataError(
-            "responsibilities='instant' needs demonstrations of one common time grid: "
-            "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
-        )
     time, number = _typical_time(stored, edges, processes)
-    learned, size = stored, 1
-    if aligned and responsibilities != "point" and number > 1:
-        learned, size = _by_instant(stored, first, number, operators, kinematics, processes)
-    time = time.to(kinematics.lower)
-    return TrainingRows(
-        learned, size, time, number, tuple(operators), holds, processes, stored, edges
-    )
+    time, own = time.to(kinematics.lower), tuple(operators)
+    rows = TrainingRows(stored, 1, time, number, own, holds, processes, stored, edges)
+    return _grouped(rows, first, responsibilities, block_widths(operators, kinematics))
 
 
 def _stored(each: Iterable[NDArray[Any]], alone: bool) -> tuple[Rows, NDArray[np.intp]]:
@@ -253,22 +242,32 @@ def _made_constant(
     return np.where(constant, first[0], first)
 
 
-def _by_instant(
-    stored: Rows,
-    first: NDArray[Any],
-    number: int,
-    operators: Sequence[Operator],
-    kinematics: Kinematics,
-    processes: Processes,
-) -> tuple[Rows, int]:
-    """Share of a process of the rows that stand for all demonstrations at each instant."""
+def _grouped(
+    rows: TrainingRows, first: NDArray[Any], responsibilities: str, widths: Sequence[int]
+) -> TrainingRows:
+    """Rows of one instant together where the demonstrations have one time grid.
+
+    Parameters
+    ----------
+    first : array of shape (T, sum_j (1 + D_j))
+        Of the first demonstration of all.
+    """
+    stored, processes, number = rows.stored, rows.processes, rows.n_demonstrations
+    grid = (np.array_equal(stored[i:j, 0], first[:, 0]) for i, j in pairwise(rows.edges))
+    aligned = all(processes.gather(all(grid)))
+    if responsibilities == "instant" and not aligned:
+        raise DataError(
+            "responsibilities='instant' needs demonstrations of one common time grid: "
+            "align them (tpgmm_torch.alignment), or use 'auto' or 'point'"
+        )
+    if not aligned or responsibilities == "point" or number == 1:
+        return rows
     if isinstance(stored, np.ndarray):
         instants = stored.reshape(number, *first.shape).swapaxes(0, 1)
-        return instants.reshape(stored.shape), number
-    widths = block_widths(operators, kinematics)
+        return replace(rows, rows=instants.reshape(stored.shape), group_size=number)
     points, size = equivalent_rows(stored, first, widths, processes)
     own = processes.share(range(len(points) // size))
-    return points[own[0] * size : (own[-1] + 1) * size], size
+    return replace(rows, rows=points[own[0] * size : (own[-1] + 1) * size], group_size=size)
 
 
 def _typical_time(

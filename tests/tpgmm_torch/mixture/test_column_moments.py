@@ -11,7 +11,7 @@ from tpgmm_torch.mixture.row_file import RowFile
 @pytest.mark.parametrize("part", [2**16, 40, 1])
 @pytest.mark.parametrize("in_file", [False, True])
 def test_moments_are_those_of_numpy(part, in_file, monkeypatch):
-    monkeypatch.setattr("tpgmm_torch.mixture.column_moments.FILE_ROWS", part)
+    monkeypatch.setattr("tpgmm_torch.mixture.row_file.FILE_ROWS", part)
     X = np.random.RandomState(0).randn(101, 4) * [1e-3, 1.0, 1e3, 2.0] + [0, 1e5, 0, -3]
     X[:, 3] = 0.1
     found = ColumnMoments.of(RowFile.of([X]) if in_file else X)

@@ -1,5 +1,6 @@
 """Demonstrations in batches: the same model as from a list of them."""
 
+from collections import Counter
 from dataclasses import replace
 from itertools import batched
 
@@ -7,10 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from tests.support.skills import canonical, handlings, hands_model, waves
+from tests.support.skills import (
+    bottle_model,
+    canonical,
+    few_bottles,
+    handlings,
+    hands_model,
+    waves,
+)
 from tpgmm_datasets import EpisodeBatches, save_lerobot
 from tpgmm_torch import Demonstration, Frame
+from tpgmm_torch.alignment import LinearTimeNormalization
 from tpgmm_torch.exceptions import DataError, ShapeError
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.training.local_data import Motion
 
 
 class Batches:
@@ -104,6 +115,27 @@ def test_a_batch_unlike_those_before_is_named(spoil, error, message):
 def test_uneven_batches_have_no_instants():
     with pytest.raises(DataError, match="one common time grid"):
         hands_model(responsibilities="instant").fit(Batches(uneven()))
+
+
+def test_a_fit_computes_kinematics_and_local_coordinates_once_per_demonstration(monkeypatch):
+    counts = Counter()
+
+    def counted(kind, name):
+        method = getattr(kind, name)
+
+        def counting(self, *given):
+            counts[name] += 1
+            return method(self, *given)
+
+        monkeypatch.setattr(kind, name, counting)
+
+    demonstrations = LinearTimeNormalization().fit_transform(few_bottles())
+    counted(Robot, "state")
+    counted(Motion, "coordinates")
+    model = bottle_model(8, tol=1e-1).fit(demonstrations)
+    number = len(demonstrations)
+    assert counts["coordinates"] == number * len(model.operators_)
+    assert counts["state"] == number + 1  # once more for all start postures together
 
 
 def test_no_demonstrations_are_refused():
