@@ -49,12 +49,11 @@ BUDGETS = {
 #: PRESENT CEILINGS of what is above its budget still. Lower them with the code; an entry goes
 #: when its budget is reached.
 CEILINGS = {
-    "lines of tpgmm_torch": 15300,
+    "lines of tpgmm_torch": 13700,
     "lines of lerobot_policy_tpgmm": 1900,
-    "lines of tpgmm_tools": 2755,
+    "lines of tpgmm_tools": 2750,
     "lines of environments and evaluation": 8285,
     "lines of tests of core, data sets, policy and tools": 18500,
-    "functions of the core above complexity 10": 62,
     "longest function of the core": 110,
     "named numeric constants of the core": 117,
 }
