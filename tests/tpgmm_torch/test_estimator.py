@@ -121,7 +121,7 @@ def test_a_bottle_never_seen_is_grasped():
 
 
 def test_instants_are_learned_by_the_mixture_of_groups():
-    model = hands_model().fit(handlings(3))
+    model = hands_model(covariance_shrinkage=0).fit(handlings(3))
     rows = local_data(handlings(3), HANDLING, HANDS)
     interleaved = torch.stack([row[t] for t in range(30) for row in rows]).numpy()
     given, units = model.mixture_.get_params(), (None, *["m"] * 3, *[None] * 4)

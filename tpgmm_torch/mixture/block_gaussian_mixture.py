@@ -27,7 +27,6 @@ from tpgmm_torch.exceptions import (
     ShapeError,
 )
 from tpgmm_torch.mixture.column_moments import ColumnMoments
-from tpgmm_torch.mixture.covariance_shrinkage import shrink
 from tpgmm_torch.mixture.expectation_maximization import (
     CovarianceFamily,
     Fit,
@@ -75,21 +74,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Regularisation of the covariances' diagonals, as a share of each column's variance (of
         its block's mean variance where a column is constant, or ``covariance_type`` is
         "spherical"). It is never less than 1e-12 (float64), 2e-6 (float32).
-    covariance_shrinkage : float or "auto", default=0
-        How far the full or tied covariances that EM found go towards their diagonals, from 0
-        to 1. "auto" follows from the number of samples and of columns, component by component
-        (:func:`~tpgmm_torch.mixture.covariance_shrinkage.shrinkage_intensity`); it also
-        moderates the variances of columns of one unit by each other
-        (:func:`~tpgmm_torch.mixture.covariance_shrinkage.moderated_variances`).
-    column_units : sequence of str or None, of shape (n_features,), optional
-        The unit of each column, for "auto": those of one unit in one block are alike. None is
-        for columns that are like no other; by default all are.
-    n_demonstrations : float, optional
-        How many samples there are for "auto", where the rows are those of so many
-        demonstrations that each visit every component; None counts each row.
-    timed_blocks : bool, default=False
-        Whether every block begins with time: the covariances *given time* shrink then, and
-        slopes over time stay as they are.
     max_iter : int, default=100
         Most EM iterations per start.
     n_init : int, default=1
@@ -119,8 +103,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         Iterations of the best start.
     lower_bound_ : float
         Mean log-likelihood of the training data under the mixture before the last M step,
-        as in scikit-learn; ``score`` of the result is not below it, unless the covariances
-        were shrunk thereafter.
+        as in scikit-learn; ``score`` of the result is not below it.
     lower_bounds_ : list of float
         Its history, which never falls. Where reseeding a component lowers it, the history
         begins again at that point.
@@ -150,10 +133,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         "covariance_type": [Options("full", "tied", "diag", "spherical")],
         "tol": [Interval(Real, 0.0, None, closed="left")],
         "reg_covar": [Interval(Real, 0.0, None, closed="left"), "array-like"],
-        "covariance_shrinkage": [Interval(Real, 0, 1, closed="both"), Options("auto")],
-        "column_units": ["array-like", None],
-        "n_demonstrations": [Interval(Real, 0, None, closed="neither"), None],
-        "timed_blocks": ["boolean"],
         "max_iter": [Interval(Integral, 1, None, closed="left")],
         "n_init": [Interval(Integral, 1, None, closed="left")],
         "init_params": [Options("time", "kmeans", "random")],
@@ -171,10 +150,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         covariance_type: str = "full",
         tol: float = 1e-3,
         reg_covar: float | Sequence[float] | NDArray[np.float64] = 1e-6,
-        covariance_shrinkage: float | str = 0.0,
-        column_units: Sequence[str | None] | None = None,
-        n_demonstrations: float | None = None,
-        timed_blocks: bool = False,
         max_iter: int = 100,
         n_init: int = 1,
         init_params: str = "time",
@@ -188,10 +163,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.covariance_type = covariance_type
         self.tol = tol
         self.reg_covar = reg_covar
-        self.covariance_shrinkage = covariance_shrinkage
-        self.column_units = column_units
-        self.n_demonstrations = n_demonstrations
-        self.timed_blocks = timed_blocks
         self.max_iter = max_iter
         self.n_init = n_init
         self.init_params = init_params
@@ -291,17 +262,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         if processes.count > 1 and not isinstance(seed, Integral):
             seed = processes.gather(check_random_state(seed).randint(2**31))[0]
         rng = check_random_state(seed)
-        if start is None:
-            method, k = self.init_params, self.n_components
-            starts = draw_starts(method, self.n_init, k, points, family, rng)
-        else:
-            given = len(start.weights_), [*map(_width, start.means_)]
-            if given != (self.n_components, widths):
-                raise ShapeError(
-                    f"the start has {given[0]} components in blocks of {given[1]} columns, "
-                    f"asked for are {self.n_components} in blocks of {widths}"
-                )
-            starts = [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
+        starts = self._starts(start, points, family, shift, scale, rng)
         fits = [
             expectation_maximization(
                 begin, points, family, RandomState(rng.randint(2**31 - 1)),
@@ -314,7 +275,28 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         self.lower_bounds_ = [bound - float(scale.log().sum()) for bound in best.bounds]
         self.lower_bound_ = self.lower_bounds_[-1]
         _warn(best)
-        return self._set(self._shrunk(best.parameters.affine(scale, shift), moments.count))
+        return self._set(best.parameters.affine(scale, shift))
+
+    def _starts(
+        self,
+        start: BlockGaussianMixture | None,
+        points: Points,
+        family: CovarianceFamily,
+        shift: Tensor,
+        scale: Tensor,
+        rng: RandomState,
+    ) -> list[Parameters]:
+        """Where EM begins, in standardised units."""
+        if start is None:
+            own = self.init_params, self.n_init, self.n_components
+            return draw_starts(*own, points, family, rng)
+        given = len(start.weights_), [*map(_width, start.means_)]
+        if given != (self.n_components, points.widths):
+            raise ShapeError(
+                f"the start has {given[0]} components in blocks of {given[1]} columns, "
+                f"asked for are {self.n_components} in blocks of {points.widths}"
+            )
+        return [family.admit(start._fitted().affine(1 / scale, -shift / scale))]
 
     def _rows(self, X: Any) -> Rows:
         """The rows of X, checked."""
@@ -355,28 +337,6 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
         smallest = SMALLEST_SHARE[getattr(torch, self.dtype)]
         diagonal = torch.from_numpy(np.broadcast_to(shares, sum(widths)).clip(min=smallest))
         return CovarianceFamily(self.covariance_type, diagonal.to(self.device).split(widths))
-
-    def _shrunk(self, parameters: Parameters, n_rows: int) -> Parameters:
-        """The mixture with full or tied covariances shrunk."""
-        if self.covariance_type not in ("full", "tied") or self.covariance_shrinkage == 0:
-            return parameters
-        n_samples: Any = self.n_demonstrations
-        if n_samples is None:
-            n_samples = n_rows * (parameters.weights if self.covariance_type == "full" else 1)
-        n_features = sum(map(_width, parameters.means))
-        units: list[str | None] = [None] * n_features
-        if self.column_units is not None and self.covariance_shrinkage == "auto":
-            units = list(self.column_units)
-        if len(units) != n_features:
-            raise ShapeError(
-                f"column_units has {len(units)} units, but the data have {n_features} columns"
-            )
-        given, covariances = int(self.timed_blocks), []
-        for covariance in parameters.covariances:
-            own, units = units[: _width(covariance)], units[_width(covariance) :]
-            shrunk = shrink(covariance, self.covariance_shrinkage, n_samples, own, given=given)
-            covariances.append(shrunk)
-        return Parameters(parameters.weights, parameters.means, tuple(covariances))
 
     def _set(self, parameters: Parameters) -> Self:
         """Set the mixture in units of the data."""

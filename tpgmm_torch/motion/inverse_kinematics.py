@@ -59,9 +59,8 @@ def follow_poses(
     rate : float
         Poses per second; joints keep within their limits of position and speed.
     posture : array-like of shape (n_joints,) or (T, n_joints), optional
-        What joints seek where the poses leave them free, at one radian per second and radian
-        from it; by default the start. Of T postures each goes with a pose, and is sought at
-        once.
+        What joints seek where the poses leave them free, slowly; by default the start. Of T
+        postures each goes with a pose, and is sought at once.
     orientations : bool, default=True
         False lets links turn as they like.
     tolerance : float, default=0.01
@@ -70,13 +69,9 @@ def follow_poses(
 
     Raises
     ------
-    DependencyError
-        Without mink, of the extra ``ik``.
-    UnknownNameError
-        If the robot has no such link.
-    DataError, ShapeError
-        If the robot cannot be given to mink (joints that follow others), or poses and postures
-        are not T each.
+    DependencyError, UnknownNameError, DataError, ShapeError
+        Without mink (of the extra ``ik``) or such a link, for joints that follow others, or if
+        poses and postures are not T each.
 
     Warns
     -----

@@ -18,6 +18,7 @@ from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
 from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.covariance_shrinkage import shrink
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
 from tpgmm_torch.operators import Operator
@@ -25,7 +26,6 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.mixture_settings import (
     block_widths,
     check_operators,
-    column_units,
     kinematics_for,
     regularization,
 )
@@ -36,8 +36,8 @@ __all__ = ["Learned", "known", "learn"]
 
 #: Parameters of the estimator that are the mixture's too.
 SHARED = (
-    "n_components", "covariance_type", "covariance_shrinkage", "tol", "max_iter", "n_init",
-    "init_params", "random_state", "dtype", "device",
+    "n_components", "covariance_type", "tol", "max_iter", "n_init", "init_params",
+    "random_state", "dtype", "device",
 )  # fmt: skip
 
 
@@ -124,11 +124,11 @@ def learn(
     mixture = BlockGaussianMixture(
         **_of_mixture(settings, rows.operators, kinematics),
         group_size=rows.group_size,
-        n_demonstrations=rows.n_demonstrations,
         reg_covar=regularization(moments, rows.operators, kinematics, **shape),
-    )
+    ).fit(rows.rows, processes=processes)
+    _shrink(mixture, rows, kinematics, settings)
     return Learned(
-        mixture.fit(rows.rows, processes=processes),
+        mixture,
         rows.operators,
         kinematics,
         rows.time,
@@ -191,9 +191,25 @@ def _of_mixture(
     """Parameters of the mixture of the local data of all operators."""
     return {name: settings[name] for name in SHARED} | {
         "blocks": block_widths(operators, kinematics),
-        "column_units": column_units(operators, kinematics),
-        "timed_blocks": True,
     }
+
+
+def _shrink(
+    mixture: BlockGaussianMixture,
+    rows: TrainingRows,
+    kinematics: Kinematics,
+    settings: Mapping[str, Any],
+) -> None:
+    """Move full or tied covariances, given time, towards their diagonals."""
+    intensity = settings["covariance_shrinkage"]
+    if settings["covariance_type"] not in ("full", "tied") or intensity == 0:
+        return
+    shrunk = []
+    for operator, covariance in zip(rows.operators, mixture.covariances_, strict=True):
+        units = (None, *operator.units(kinematics)) if intensity == "auto" else ()
+        found = shrink(covariance.double(), intensity, rows.n_demonstrations, units, given=1)
+        shrunk.append(found.to(covariance))
+    mixture.covariances_ = shrunk
 
 
 def _report(

@@ -22,7 +22,6 @@ from tpgmm_torch.robots.kinematics import Kinematics
 __all__ = [
     "block_widths",
     "check_operators",
-    "column_units",
     "kinematics_for",
     "regularization",
 ]
@@ -97,13 +96,6 @@ def kinematics_for(
 def block_widths(operators: Sequence[Operator], kinematics: Kinematics) -> tuple[int, ...]:
     """1 + D_j of each of the operators on the kinematics: time, and its local coordinates."""
     return tuple(1 + operator.dimension(kinematics) for operator in operators)
-
-
-def column_units(
-    operators: Sequence[Operator], kinematics: Kinematics
-) -> tuple[str | None, ...]:
-    """Units of all columns of ``operators`` on ``kinematics``, None for the times between."""
-    return tuple(unit for one in operators for unit in (None, *one.units(kinematics)))
 
 
 def regularization(

@@ -21,7 +21,7 @@ from sklearn.exceptions import ConvergenceWarning as ScikitLearnWarning
 from sklearn.mixture import GaussianMixture
 
 from tests.support.blocks import COVARIANCE_TYPES, WIDTHS, fitted, split
-from tests.support.em_reference import movements, nearly_singular
+from tests.support.em_reference import nearly_singular
 from tpgmm_torch.exceptions import (
     ConvergenceWarning,
     DataError,
@@ -29,7 +29,6 @@ from tpgmm_torch.exceptions import (
     ShapeError,
 )
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.mixture.covariance_shrinkage import shrink
 
 BATTERY = """
 import json, warnings
@@ -278,35 +277,6 @@ def test_float32_stands_nearly_singular_data():
     assert model.score(X) == pytest.approx(reference.score(X), abs=0.05)
 
 
-UNITS = [None, "m", "m", None, "rad", "rad", "m"]
-
-
-@pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
-@pytest.mark.parametrize("timed", [False, True])
-@pytest.mark.parametrize("n_demonstrations", [None, 3])
-@pytest.mark.parametrize(
-    ("intensity", "units"), [(0.5, UNITS), ("auto", None), ("auto", UNITS)]
-)
-def test_shrinkage_comes_after_em(covariance_type, timed, n_demonstrations, intensity, units):
-    X = movements(600)
-    settings = {"n_components": 3, "blocks": (3, 4), "covariance_type": covariance_type}
-    plain = fitted(BlockGaussianMixture(**settings), X)
-    settings |= {"covariance_shrinkage": intensity, "column_units": units}
-    settings |= {"timed_blocks": timed, "n_demonstrations": n_demonstrations}
-    shrunk = fitted(BlockGaussianMixture(**settings), X)
-    assert shrunk.lower_bounds_ == plain.lower_bounds_
-    n_samples = n_demonstrations or len(X) * (
-        plain.weights_ if covariance_type == "full" else 1
-    )
-    alike = units if intensity == "auto" and units else [None] * 7
-    for one, other, own in zip(
-        plain.covariances_, shrunk.covariances_, (alike[:3], alike[3:]), strict=True
-    ):
-        if covariance_type in ("full", "tied"):
-            one = shrink(one, intensity, n_samples, own, given=int(timed))
-        torch.testing.assert_close(other, one)
-
-
 @pytest.mark.parametrize("covariance_type", COVARIANCE_TYPES)
 def test_samples_have_the_moments_of_the_mixture(clusters, covariance_type):
     model = BlockGaussianMixture(
@@ -370,7 +340,6 @@ def test_a_gpu_gives_the_same_mixture(clusters):
         ({"n_components": 301}, DataError, "n_components=301.*300 distinct.*n_samples = 300"),
         ({"reg_covar": [1.0, 2.0]}, ShapeError, r"one for each of the 5 .*shape \(2,\)"),
         ({"reg_covar": [0.0, 0.0, -1e-9, 0.0, 0.0]}, DataError, "finite and not negative"),
-        ({"covariance_shrinkage": "auto", "column_units": ["m"]}, ShapeError, "1 units.* 5 c"),
         ({"covariance_type": "band"}, ValueError, "covariance_type"),
         ({"init_params": "guess"}, ValueError, "init_params"),
         ({"reg_covar": -1.0}, ValueError, "reg_covar"),
