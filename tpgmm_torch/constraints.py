@@ -26,10 +26,11 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.random import RandomState
+from sklearn.base import BaseEstimator
 
-from tpgmm_torch.exceptions import InvalidParameterError
+from tpgmm_torch.exceptions import InvalidParameterError, NotFittedError
 
-__all__ = ["ANYTHING", "Interval", "Options", "check_parameters"]
+__all__ = ["ANYTHING", "DemonstrationEstimator", "Interval", "Options", "check_parameters"]
 
 #: Entry of a parameter that is checked elsewhere.
 ANYTHING: tuple[Any, ...] = (object,)
@@ -161,3 +162,23 @@ def _in_words(constraint: Any) -> str:
     if isinstance(constraint, Interval | Options):
         return str(constraint)
     return f"a {constraint.__name__}" if isinstance(constraint, type) else NAMED[constraint][1]
+
+
+class DemonstrationEstimator(BaseEstimator):  # type: ignore[misc]
+    """Estimator of scikit-learn's interface whose samples are demonstrations."""
+
+    def _check_fitted(self, attribute: str) -> None:
+        """Refuse what needs an attribute that ``fit`` sets.
+
+        Raises
+        ------
+        NotFittedError
+        """
+        if not hasattr(self, attribute):
+            name = type(self).__name__
+            raise NotFittedError(f"this {name} is not fitted yet: call fit(demonstrations)")
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array = False  # X is a list of demonstrations
+        return tags

@@ -9,18 +9,16 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.constraints import Interval, Options, check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
 from tpgmm_torch.control.rollout import rollout, sample
 from tpgmm_torch.control.situations import report_start, tick_inputs
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.data.trajectories import Trajectory
-from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
@@ -32,7 +30,7 @@ from tpgmm_torch.training.local_data import local_data
 __all__ = ["TaskParameterizedGMM"]
 
 
-class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
+class TaskParameterizedGMM(DemonstrationEstimator):
     """Task-parameterised Gaussian mixture model over joint space and task space.
 
     One sample is one demonstration: ``X`` is a list of :class:`Demonstration`, so that
@@ -372,11 +370,7 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
     @property
     def skill(self) -> Regression:
         """The mixture conditioned on time (eqs 1 to 3), which controllers run."""
-        if not hasattr(self, "_skill"):
-            raise NotFittedError(
-                "this TaskParameterizedGMM is not fitted yet: call fit(demonstrations), or "
-                "tpgmm_torch.load(path)"
-            )
+        self._check_fitted("_skill")
         return self._skill
 
     @classmethod
@@ -445,8 +439,3 @@ class TaskParameterizedGMM(BaseEstimator):  # type: ignore[misc]
         self._skill = Regression.of(learned, own, moderated=self.covariance_shrinkage == "auto")
         self.frame_names_ = self._skill.frame_names
         return self
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False  # X is a list of demonstrations
-        return tags

@@ -8,12 +8,12 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import TransformerMixin
 from torch import Tensor
 
 from tpgmm_torch import quaternions
 from tpgmm_torch.alignment.features import quaternion_columns
-from tpgmm_torch.constraints import check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import (
     Demonstration,
@@ -21,7 +21,7 @@ from tpgmm_torch.data.demonstrations import (
     check_demonstrations,
     check_robot,
 )
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError
 
 __all__ = ["Alignment", "retime"]
 
@@ -85,7 +85,7 @@ def retime(
     return Demonstration(time, moved, frames, demonstration.joint_names, events, holds)
 
 
-class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
+class Alignment(TransformerMixin, DemonstrationEstimator, abc.ABC):
     """Transformer of demonstrations onto one time grid; a subclass finds the paths.
 
     Attributes
@@ -132,9 +132,7 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
         DataError, ShapeError, UnknownNameError
             If the demonstrations are not like those of ``fit``.
         """
-        if not hasattr(self, "time_"):
-            name = type(self).__name__
-            raise NotFittedError(f"this {name} is not fitted: call fit(demonstrations) first")
+        self._check_fitted("time_")
         if isinstance(X, Sequence) and X and all(isinstance(item, Situation) for item in X):
             return list(X)
         return [self._retimed(one, self._path(one)) for one in self._checked(X)]
@@ -169,8 +167,3 @@ class Alignment(TransformerMixin, BaseEstimator, abc.ABC):  # type: ignore[misc]
     def _retimed(self, demonstration: Demonstration, path: Array) -> Demonstration:
         blocks = quaternion_columns(demonstration, self.robot)
         return retime(demonstration, path, self.time_, blocks)
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False  # X is a list of demonstrations
-        return tags

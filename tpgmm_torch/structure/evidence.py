@@ -10,7 +10,7 @@ operators are compared by one number in the units of the joints, whatever their 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,12 +18,10 @@ from torch import Tensor
 
 from tpgmm_torch import gaussians
 from tpgmm_torch.data.demonstrations import Demonstration
-from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.operators import Canonical, Operator
-from tpgmm_torch.robots.held_objects import held_objects
-from tpgmm_torch.robots.kinematics import Kinematics, RobotState
-from tpgmm_torch.training.local_data import local_data
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.training.local_data import Motion, local_data
 from tpgmm_torch.training.training_rows import typical
 
 __all__ = ["Evidence", "gather_evidence"]
@@ -127,10 +125,8 @@ def gather_evidence(
     holds : sequence of Hold, default=()
         Objects that the robot held.
     """
-    begins, durations = (
-        [float(d.time[0]) for d in demonstrations],
-        [d.duration for d in demonstrations],
-    )
+    begins = [float(one.time[0]) for one in demonstrations]
+    durations = [one.duration for one in demonstrations]
     time = demonstrations[typical(begins, durations)].time.to(kinematics.lower)
     phase = torch.linspace(0, 1, min(n_instants, *map(len, demonstrations)))
     seen = [one.at_steps(((len(one) - 1) * phase).round().long()) for one in demonstrations]
@@ -144,9 +140,9 @@ def gather_evidence(
     left_out = torch.linspace(0, number - 1, min(number, n_left_out)).round().long()
     terms = []
     for index in left_out.tolist():
-        known = _situation(seen[index], kinematics, holds)
+        known = Motion.of(seen[index], kinematics, holds, attached=True)
         for operator, local in zip(operators, blocks, strict=True):
-            terms.append(_term(operator, local, index, kinematics, *known))
+            terms.append(_term(operator, local, index, kinematics, known))
     count = len(operators)
     stacked = [
         tuple(map(torch.stack, zip(*terms[j::count], strict=True))) for j in range(count)
@@ -169,26 +165,15 @@ def gather_evidence(
     )
 
 
-def _situation(
-    demonstration: Demonstration, kinematics: Kinematics, holds: Sequence[Hold]
-) -> tuple[RobotState, Mapping[str, Frame]]:
-    """State and frames (T,) of a demonstration, with what the robot holds attached to it."""
-    state = kinematics.state(demonstration.joints)
-    frames = {name: frame.to(state.joints) for name, frame in demonstration.frames.items()}
-    time = demonstration.time.to(state.joints)
-    return held_objects(state, time, frames, holds, attached=True)
-
-
 def _term(
     operator: Operator,
     local: Tensor,
     index: int,
     kinematics: Kinematics,
-    state: RobotState,
-    frames: Mapping[str, Frame],
+    motion: Motion,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Jacobian, residual, precision and vector of an operator, one demonstration left out."""
-    number = len(local)
+    number, state, frames = len(local), motion.state, motion.frames
     others, degrees = torch.arange(number) != index, number - 2.0
     # two that are left of three agree by chance: a prior with the variance of all
     # demonstrations counts as much as one degree of freedom

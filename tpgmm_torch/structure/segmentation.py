@@ -10,20 +10,19 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import TransformerMixin
 
 from tpgmm_torch.checks.report import in_columns
-from tpgmm_torch.constraints import Interval, check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, Interval, check_parameters
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration, Situation, check_demonstrations
 from tpgmm_torch.events import find_boundaries
-from tpgmm_torch.exceptions import NotFittedError
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["Segmentation"]
 
 
-class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
+class Segmentation(TransformerMixin, DemonstrationEstimator):  # type: ignore[misc]
     """Find the parts of a skill.
 
     In each demonstration a part may end where a gripper closes or opens, where an object is
@@ -144,15 +143,13 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
         NotFittedError
             Before ``fit``.
         """
-        self._check_fitted()
+        self._check_fitted("boundaries_")
         if isinstance(X, Sequence) and X and all(isinstance(item, Situation) for item in X):
             return list(X)
         demonstrations = check_demonstrations(X)
         phases, _ = self._candidates(demonstrations)
-        named = []
-        for one, times in zip(
-            demonstrations, self._placed(demonstrations, phases), strict=True
-        ):
+        placed, named = self._placed(demonstrations, phases), []
+        for one, times in zip(demonstrations, placed, strict=True):
             others = {k: at for k, at in one.events.items() if not k.startswith("part ")}
             parts = {f"part {number}": float(at) for number, at in enumerate(times, 2)}
             named.append(replace(one, events=others | parts))
@@ -160,7 +157,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def report(self) -> str:
         """A table of the boundaries: when they are, why, and how many demonstrations say so."""
-        self._check_fitted()
+        self._check_fitted("boundaries_")
         lines = [
             ("part", "begins at", "earliest", "latest", "found in", "because of"),
             ("1", "0%", "", "", "", "the beginning"),
@@ -175,7 +172,7 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
 
     def times(self) -> list[float]:
         """Median times at which parts end, but for the last [s]."""
-        self._check_fitted()
+        self._check_fitted("boundaries_")
         return np.median(self.boundaries_, axis=0).tolist() if self.n_parts_ > 1 else []
 
     def _candidates(
@@ -223,17 +220,6 @@ class Segmentation(TransformerMixin, BaseEstimator):  # type: ignore[misc]
             row[:] = float(one.time[0])
             row += one.duration * np.interp(self.progress_, known, here)
         return rows
-
-    def _check_fitted(self) -> None:
-        if not hasattr(self, "boundaries_"):
-            raise NotFittedError(
-                "this Segmentation is not fitted yet: call fit(demonstrations)"
-            )
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False  # X is a list of demonstrations
-        return tags
 
 
 def _matched(one: Array, other: Array, shift: float) -> NDArray[np.int64]:

@@ -10,10 +10,10 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import clone
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.constraints import Interval, check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, Interval, check_parameters
 from tpgmm_torch.data.demonstrations import (
     FEWEST,
     Demonstration,
@@ -23,7 +23,7 @@ from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import ConvergenceWarning, DataError
 from tpgmm_torch.operators import Canonical
 from tpgmm_torch.regression.regression import Regression
-from tpgmm_torch.robots.held_objects import held_objects
+from tpgmm_torch.training.local_data import Motion
 
 __all__ = ["SelectComponents"]
 
@@ -31,7 +31,7 @@ __all__ = ["SelectComponents"]
 CANDIDATES = (2, 3, 4, 5, 7, 10, 13, 17, 23, 30, 40, 53)
 
 
-class SelectComponents(BaseEstimator):  # type: ignore[misc]
+class SelectComponents(DemonstrationEstimator):
     """Find the number of Gaussians by cross-validation.
 
     Each number of components is learned from all demonstrations but some, fold by fold; at the
@@ -201,17 +201,14 @@ class SelectComponents(BaseEstimator):  # type: ignore[misc]
         kinematics, like = skill.kinematics, skill.kinematics.lower
         count = min(len(demonstration), self.n_instants)
         index = torch.linspace(0, len(demonstration) - 1, count).round().long()
-        motion = demonstration.at_steps(index).reordered(kinematics.joint_names)
-        time = motion.time.to(like)
-        state = kinematics.state(motion.joints.to(like))
-        frames = {name: frame.to(like) for name, frame in motion.frames.items()}
-        if skill.holds:
-            state, frames = held_objects(state, time, frames, skill.holds, attached=True)
+        motion = Motion.of(
+            demonstration.at_steps(index), kinematics, skill.holds, attached=True
+        )
         floor = like.new_tensor(Canonical(self.tolerance).tolerances(kinematics)).square()
         with torch.no_grad():
-            estimate = skill.estimate(time, state, frames)
+            estimate = skill.estimate(motion.time, motion.state, motion.frames)
             density = gaussians.log_density(
-                (estimate.joints - state.joints)[..., None],
+                (estimate.joints - motion.state.joints)[..., None],
                 estimate.covariance + floor.diag(),
                 "the covariance of the estimate",
                 max(n_learned - 1.0, 1.0),

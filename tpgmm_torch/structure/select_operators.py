@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import combinations, permutations
 from numbers import Integral, Real
 from typing import Any, Self
 
 import numpy as np
 import torch
-from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from tpgmm_torch.checks.report import in_columns
-from tpgmm_torch.constraints import Interval, check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, Interval, check_parameters
 from tpgmm_torch.data.demonstrations import (
     FEWEST,
     Demonstration,
     check_demonstrations,
 )
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import (
     AbsoluteOrientation,
     AbsolutePosition,
@@ -76,7 +76,7 @@ class Judgement:
     unit: str
 
 
-class SelectOperators(BaseEstimator):  # type: ignore[misc]
+class SelectOperators(DemonstrationEstimator):
     """Find the operators that matter among candidates, as the demonstrations tell.
 
     A candidate matters if a demonstration that was left out is more likely with it than
@@ -195,7 +195,10 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
                 "which operators matter is seen from demonstrations that differ: it takes at "
                 f"least {FEWEST + 1}, got {len(demonstrations)}; name the operators instead"
             )
-        operators = check_operators(self._given(demonstrations[0]))
+        candidates = self.candidates
+        if candidates is None:
+            candidates = candidate_operators(self.robot, demonstrations[0])
+        operators = check_operators(candidates)
         kinematics = kinematics_for(demonstrations, operators, self.robot, "float64", "cpu")
         holds = demonstrated_holds(demonstrations, operators, kinematics)
         # one frame in a wrong place hides that it matters
@@ -204,37 +207,22 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         unlike = {one.episode for one in outlying}
         demonstrations = [d for i, d in enumerate(demonstrations) if i not in unlike]
         evidence = gather_evidence(
-            demonstrations,
-            operators,
-            kinematics,
-            tolerance=self.tolerance,
-            n_instants=self.n_instants,
-            n_left_out=self.n_left_out,
+            demonstrations, operators, kinematics,
+            tolerance=self.tolerance, n_instants=self.n_instants, n_left_out=self.n_left_out,
             holds=holds,
-        )
-        joints = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
-        free = [j for j, one in enumerate(operators) if not one.determines_joints]
-        chosen = self._dropped(evidence, self._added(evidence, joints), free)
+        )  # fmt: skip
+        chosen = self._chosen(evidence, operators)
         self.candidates_, self.time_ = operators, evidence.time.cpu().numpy()
         self.support_ = np.isin(np.arange(len(operators)), chosen)
         self.operators_ = arranged([operators[j] for j in chosen])
-        judged = [
-            self._judge(evidence, j, chosen, joints, kinematics) for j in range(len(operators))
-        ]
+        judged = [self._judge(evidence, j, chosen, kinematics) for j in range(len(operators))]
         self.judgements_ = tuple(judgement for judgement, _ in judged)
         self.relevance_ = torch.stack([gains for _, gains in judged], -1).cpu().numpy()
         return self
 
-    def _given(self, demonstration: Demonstration) -> Sequence[Operator]:
-        if self.candidates is not None:
-            return self.candidates
-        # what is held is a thing of its own, to be brought to a place
-        held = list(dict.fromkeys(hold.frame for hold in demonstration.holds or ()))
-        return candidate_operators(self.robot, demonstration, held)
-
     def report(self) -> str:
         """A table of the candidates, those that gain most first: which were kept, and why."""
-        self._check_fitted()
+        self._check_fitted("support_")
         order = sorted(self.judgements_, key=lambda one: (not one.kept, -one.gain, -one.alone))
         lines: list[tuple[str, ...]] = [
             ("", "operator", "gain", "alone", "at", "left out is off by", "others by", "why")
@@ -248,52 +236,39 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         return in_columns(lines)
 
     def _why(self, one: Judgement) -> str:
+        matters = (one.gain if one.kept else one.alone) >= self.threshold
         if one.kept:
-            return (
-                "decides there"
-                if one.gain >= self.threshold
-                else "decides what the others leave free"
-            )
-        if one.alone >= self.threshold:
-            return "says what those kept say"
-        return "tells nothing of what was left out"
+            return "decides there" if matters else "decides what the others leave free"
+        return "says what those kept say" if matters else "tells nothing of what was left out"
 
-    def _added(self, evidence: Evidence, joints: Sequence[int]) -> list[int]:
-        """The operators of ``joints``, and what gains most beside them, one after the other."""
-        chosen = list(joints)
-        likely = float(evidence.log_likelihood(chosen).mean())
-        while rest := [j for j in range(len(evidence.vectors)) if j not in chosen]:
-            means = [float(evidence.log_likelihood([*chosen, j]).mean()) for j in rest]
-            best = int(np.argmax(means))
-            if chosen and means[best] - likely <= self.threshold:
-                break
-            chosen.append(rest[best])
-            likely = means[best]
-        return chosen
+    def _chosen(self, evidence: Evidence, operators: Sequence[Operator]) -> list[int]:
+        """Operators of joints, and those that gain most beside them, less what gains little."""
 
-    def _dropped(self, evidence: Evidence, chosen: list[int], free: Sequence[int]) -> list[int]:
-        """What is left of the ``chosen`` when those ``free`` to go that gain too little do."""
-        likely = float(evidence.log_likelihood(chosen).mean())
-        while len(chosen) > 1 and (spare := [j for j in chosen if j in free]):
-            rests = [_without(chosen, j) for j in spare]
-            means = [float(evidence.log_likelihood(rest).mean()) for rest in rests]
-            best = int(np.argmax(means))
-            if likely - means[best] > self.threshold:
+        @cache
+        def mean(*operators: int) -> float:
+            return float(evidence.log_likelihood(operators).mean())
+
+        chosen = [j for j, one in enumerate(operators) if isinstance(one, Canonical)]
+        while rest := [j for j in range(len(operators)) if j not in chosen]:
+            best = max(rest, key=lambda j: mean(*chosen, j))
+            if chosen and mean(*chosen, best) - mean(*chosen) <= self.threshold:
                 break
-            chosen, likely = rests[best], means[best]
+            chosen.append(best)
+        free = [j for j in chosen if not operators[j].determines_joints]
+        while len(chosen) > 1 and free:
+            least = max(free, key=lambda j: mean(*_without(chosen, j)))
+            if mean(*chosen) - mean(*_without(chosen, least)) > self.threshold:
+                break
+            chosen, free = _without(chosen, least), _without(free, least)
         return sorted(chosen)
 
     def _judge(
-        self,
-        evidence: Evidence,
-        j: int,
-        chosen: Sequence[int],
-        joints: Sequence[int],
-        kinematics: Kinematics,
+        self, evidence: Evidence, j: int, chosen: Sequence[int], kinematics: Kinematics
     ) -> tuple[Judgement, Tensor]:
         """What candidate j gains, when, and in its own units; and its gains (T,)."""
         operator, others = self.candidates_[j], _without(chosen, j)
-        base = () if j in joints else joints
+        joints = [i for i, one in enumerate(self.candidates_) if isinstance(one, Canonical)]
+        base = [] if j in joints else joints
 
         def gained(beside: Sequence[int]) -> Tensor:
             with_it = evidence.log_likelihood([*beside, j])
@@ -307,20 +282,9 @@ class SelectOperators(BaseEstimator):  # type: ignore[misc]
         judgement = Judgement(operator, j in chosen, *numbers, error, of_others, unit)
         return judgement, gains
 
-    def _check_fitted(self) -> None:
-        if not hasattr(self, "support_"):
-            raise NotFittedError(
-                "this SelectOperators is not fitted yet: call fit(demonstrations)"
-            )
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False  # X is a list of demonstrations
-        return tags
-
 
 def candidate_operators(
-    kinematics: Kinematics | None, demonstration: Demonstration, held: Sequence[str] = ()
+    kinematics: Kinematics | None, demonstration: Demonstration
 ) -> list[Operator]:
     """What :class:`SelectOperators` chooses from where nothing is named.
 
@@ -329,10 +293,8 @@ def candidate_operators(
     kinematics : Kinematics or None
         Whose links are seen: in the base frame, from every frame, and from one another.
     demonstration : Demonstration
-        Whose frames there are.
-    held : sequence of str, default=()
-        Frames of objects that links hold at times: they are seen from the other frames, too,
-        and from one another as they are held.
+        Whose frames there are. Those of objects that its ``holds`` name are seen from the other
+        frames, too, and from one another as they are held.
 
     Examples
     --------
@@ -351,6 +313,8 @@ def candidate_operators(
     for link in links:
         candidates += [AbsolutePosition(link), AbsoluteOrientation(link)][: 1 + turns]
     frames = list(demonstration.frames)
+    # what is held is a thing of its own, to be brought to a place
+    held = list(dict.fromkeys(hold.frame for hold in demonstration.holds or ()))
     pairs = [(link, frame) for frame in frames for link in links]
     pairs += [(link, other) for other, link in combinations(links, 2)]
     pairs += [(thing, frame) for thing in held for frame in frames if frame != thing]

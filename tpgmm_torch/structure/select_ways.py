@@ -10,9 +10,9 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import clone
 
-from tpgmm_torch.constraints import Interval, Options, check_parameters
+from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.demonstrations import (
     FEWEST,
@@ -20,7 +20,7 @@ from tpgmm_torch.data.demonstrations import (
     check_demonstrations,
 )
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError, NotFittedError
+from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.regression.regression import Regression
@@ -81,7 +81,7 @@ class _Split:
     stretch: int
 
 
-class SelectWays(BaseEstimator):  # type: ignore[misc]
+class SelectWays(DemonstrationEstimator):
     """Find the ways in which demonstrations do a skill, such as left and right of an obstacle.
 
     Two ways are far apart somewhere, in units of how much demonstrations of one way differ
@@ -214,8 +214,7 @@ class SelectWays(BaseEstimator):  # type: ignore[misc]
         ------
         NotFittedError
         """
-        if not hasattr(self, "labels_"):
-            raise NotFittedError("this SelectWays is not fitted yet: call fit(...)")
+        self._check_fitted("labels_")
         count = len(self.labels_)
         if self.n_ways_ == 1:
             return f"1 way: nowhere do the {count} demonstrations differ as several ways would"

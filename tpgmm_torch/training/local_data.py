@@ -52,9 +52,16 @@ class Motion:
 
     @classmethod
     def of(
-        cls, demonstration: Demonstration, kinematics: Kinematics, holds: Sequence[Hold] = ()
+        cls,
+        demonstration: Demonstration,
+        kinematics: Kinematics,
+        holds: Sequence[Hold] = (),
+        *,
+        attached: bool = False,
     ) -> Self:
         """The motion of a ``demonstration`` in which ``holds`` says what the robot holds.
+
+        Where that is ``attached``, the joints move it; else its Jacobians are zero.
 
         Raises
         ------
@@ -72,7 +79,7 @@ class Motion:
         frames = {name: frame.to(state.joints) for name, frame in ordered.frames.items()}
         time = ordered.time.to(kinematics.lower)
         if holds:
-            state, frames = held_objects(state, time, frames, holds)
+            state, frames = held_objects(state, time, frames, holds, attached=attached)
         return cls(time, state, frames)
 
     def coordinates(self, operator: Operator, kinematics: Kinematics) -> Tensor:

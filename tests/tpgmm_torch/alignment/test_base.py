@@ -167,7 +167,7 @@ def test_situations_pass_unchanged_but_not_among_demonstrations():
         alignment.transform([situations[0], moving()])
     with pytest.raises(DataError, match="empty"):
         alignment.transform([])
-    with pytest.raises(NotFittedError, match=r"this Backwards is not fitted: call fit\("):
+    with pytest.raises(NotFittedError, match=r"this Backwards is not fitted yet: call fit\("):
         Backwards().transform(situations)
 
 

@@ -19,6 +19,7 @@ from tpgmm_torch import (
     SelectOperators,
     Stack,
 )
+from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Poses
@@ -177,11 +178,16 @@ def test_candidates_are_all_links_in_all_frames(task):
     kinds = ("position", "orientation")
     places = ("l", "r", "l@a", "r@a", "r@l")
     assert texts == ["canonical", *(f"{kind}:{place}" for place in places for kind in kinds)]
-    held = candidate_operators(Poses(["l", "r"]), shown, ["a", "b"])[len(texts) :]
-    places = ("b@a", "a@held:b", "b@held:a")  # of two that are held, each seen from the other
+    shown = replace(shown, frames={"a": shown.frames["a"], "b": shown.frames["a"]})
+    free = candidate_operators(Poses(["l", "r"]), shown)
+    [carried] = with_holds([shown], [Hold("a", "l"), Hold("b", "r")])
+    held = candidate_operators(Poses(["l", "r"]), carried)[len(free) :]
+    # of two that are held, each seen from the other as it is held
+    places = ("a@b", "b@a", "a@held:b", "b@held:a")
     assert [format_operator(one) for one in held] == [
         f"{k}:{at}" for at in places for k in kinds
     ]
+    shown = replace(shown, frames={"a": shown.frames["a"]})
     points = candidate_operators(Poses(["l"], orientation=False), shown)
     assert points == [Canonical(), AbsolutePosition("l"), RelativePosition("l", "a")]
     assert candidate_operators(None, shown) == [Canonical()]
