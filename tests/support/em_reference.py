@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch.distributions import MultivariateNormal
 
-from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.mixture.expectation_maximization import CovarianceFamily, Parameters
 from tpgmm_torch.mixture.points import Points
 from tpgmm_torch.mixture.processes import ALONE
+from tpgmm_torch.mixture.row_file import ColumnMoments
 
 WIDTHS = (3, 4)
 

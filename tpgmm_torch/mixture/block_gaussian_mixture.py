@@ -26,7 +26,6 @@ from tpgmm_torch.exceptions import (
     NotFittedError,
     ShapeError,
 )
-from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.mixture.expectation_maximization import (
     CovarianceFamily,
     Fit,
@@ -38,7 +37,7 @@ from tpgmm_torch.mixture.expectation_maximization import (
 from tpgmm_torch.mixture.initialization import draw_starts
 from tpgmm_torch.mixture.points import Points
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.mixture.row_file import FILE_ROWS, RowFile, Rows
+from tpgmm_torch.mixture.row_file import FILE_ROWS, ColumnMoments, RowFile, Rows
 
 __all__ = ["BlockGaussianMixture"]
 

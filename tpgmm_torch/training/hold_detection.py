@@ -51,16 +51,15 @@ def find_holds(
     """Find from when to when objects move rigidly with a link, alike in the demonstrations.
 
     A hold begins when the link touches the object: at the instant from which it stands as it
-    does when the object starts to move with it. Meanwhile a hand that closes may shift the
-    object by up to three tolerances. It ends in the middle between the instant at which the
-    object is put down and the one at which the link leaves it. Over demonstrations, which
-    should be aligned in time, the median counts. Where two hands carry an object, the holder is
-    the one in which it is steadier in most demonstrations.
+    does when the object starts to move. A hand that closes may shift the object by up to three
+    tolerances. It ends midway between when the object is put down and when the link leaves it.
+    Over demonstrations the median counts. Of two hands that carry an object, the one in which
+    it is steadier in most demonstrations holds it.
 
     Parameters
     ----------
     demonstrations : sequence of Demonstration
-        With objects recorded over time; what was recorded once is never held.
+        Aligned in time. Objects that were recorded once are never held.
     kinematics : Kinematics
         Whose links may hold.
     frames : sequence of str, optional
@@ -70,8 +69,7 @@ def find_holds(
     angle : float, default=0.1
         How much it may turn [rad].
     agreement : float, default=0.5
-        The share of the demonstrations that must show the same holds of an object in the same
-        order; otherwise it counts as never held.
+        The share of the demonstrations that must show the same holds in the same order.
 
     Returns
     -------
@@ -80,10 +78,8 @@ def find_holds(
 
     Raises
     ------
-    UnknownNameError
-        If there is no such frame.
-    DataError
-        If a tolerance is not positive.
+    UnknownNameError, DataError
+        If there is no such frame, or a tolerance is not positive.
 
     Examples
     --------

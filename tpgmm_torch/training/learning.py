@@ -17,9 +17,9 @@ from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold, check_holds
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.mixture.block_gaussian_mixture import BlockGaussianMixture
-from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.mixture.covariance_shrinkage import shrink
 from tpgmm_torch.mixture.processes import ALONE, Processes
+from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.motion.demonstrated_peaks import DemonstratedPeaks
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics

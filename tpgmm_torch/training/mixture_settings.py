@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Canonical, Operator
 from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
 from tpgmm_torch.robots.joint_space import JointSpace

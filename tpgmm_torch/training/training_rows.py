@@ -15,9 +15,8 @@ from torch import Tensor
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.mixture.column_moments import ColumnMoments
 from tpgmm_torch.mixture.processes import ALONE, Processes
-from tpgmm_torch.mixture.row_file import RowFile, Rows
+from tpgmm_torch.mixture.row_file import ColumnMoments, RowFile, Rows
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.training.equivalent_points import equivalent_rows

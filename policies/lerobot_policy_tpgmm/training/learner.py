@@ -47,7 +47,7 @@ from tpgmm_datasets.lerobot.event_flags import stored_events
 from tpgmm_tools.cli.learning import Choices, aligner, learn, prepared
 from tpgmm_torch import Demonstration, TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError, NotFittedError, PlausibilityWarning
-from tpgmm_torch.mixture.column_moments import ColumnMoments
+from tpgmm_torch.mixture.row_file import ColumnMoments
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.regression.regression import Regression
 from tpgmm_torch.robots import Kinematics
