@@ -255,6 +255,10 @@ class CompositeSkill(Skill):
         """Weights (..., n_skills) of the skills at times of shape (...), or of robots."""
         raise NotImplementedError
 
+    def leading(self, times: Tensor) -> Tensor:
+        """Which skill has the largest share at times (T,), of shape (T,) or (..., 1)."""
+        return self.shares(times).argmax(-1)
+
     def time_of(self, index: int, time: Tensor) -> Tensor:
         """A time of this skill, on the clock of one of its skills."""
         return time
@@ -320,5 +324,5 @@ class CompositeSkill(Skill):
             ],
             -1,
         )
-        own = self.shares(times[window]).argmax(-1).to(each.device)
+        own = self.leading(times[window]).to(each.device)
         return each.gather(-1, own.expand(each.shape[:-1]).unsqueeze(-1)).squeeze(-1)

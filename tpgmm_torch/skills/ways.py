@@ -222,6 +222,10 @@ class Ways(CompositeSkill):
         shares = torch.eye(len(self.skills), dtype=time.dtype, device=time.device)
         return shares[ways.to(time.device)]
 
+    def leading(self, times: Tensor) -> Tensor:
+        """The way of each robot, (..., 1): at all times the same."""
+        return super().leading(times).unsqueeze(-1)
+
     def time_of(self, index: int, time: Tensor) -> Tensor:
         """A time of the skill, on the clock of one of its ways."""
         own = self.skills[index]
