@@ -200,6 +200,8 @@ class TestSettings:
         assert robot.velocity.tolist() == [0.2, math.inf, 2, 1, 1]
         assert robot.acceleration.tolist() == robot.jerk.tolist() == [math.inf] * 5
         assert robot.without_limits == ("swivel",)  # endless, but not endlessly fast
+        fast = ZOO.replace('"continuous">', '"continuous"><limit velocity="3"/>')
+        assert Robot.from_urdf(fast, ("flange",)).without_limits == ()
 
     def test_what_mimics_a_joint_limits_it(self) -> None:
         limit = '<limit lower="0" upper="0.1" effort="1" velocity="1"/>'
