@@ -48,10 +48,15 @@ def test_robots_of_a_batch_each_go_their_own_way():
     assert begun.chosen.tolist() == [one.way for one in choices]
     assert len(set(begun.chosen.tolist())) == 2
     together = begun.estimate(torch.tensor(1.0), starts, frames).joints
+    times, state = begun.time[:9], begun.kinematics.state(starts)
+    likely = begun.log_likelihood(times, state, frames)
     for row, one in enumerate(situations):
         way = selection.models_[begun.chosen[row]].skill
         alone = way.estimate(torch.tensor(1.0), one.joints, one.frames).joints
         torch.testing.assert_close(together[row], alone)
+        own = {name: frame[row : row + 1] for name, frame in frames.items()}
+        alone = way.log_likelihood(times, way.kinematics.state(starts[row : row + 1]), own)
+        torch.testing.assert_close(likely[row], alone[0])
 
 
 def test_a_controller_runs_the_way_that_was_chosen():
