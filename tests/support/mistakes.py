@@ -732,7 +732,7 @@ def a_position_in_the_plane(_):
     Frame([0.3, 0.1])
 
 
-@mistake("shapes", r"has shape \(n_joints,\)")
+@mistake("shapes", r"a number for each joint, got shape")
 def a_path_for_a_start(_):
     Situation(shown()[0].joints)
 
