@@ -286,7 +286,8 @@ class TaskParameterizedGMM(DemonstrationEstimator):
 
         Examples
         --------
-        >>> from tpgmm_torch import TaskParameterizedGMM
+        >>> import torch
+        >>> from tpgmm_torch import Demonstration, TaskParameterizedGMM
         >>> time = torch.linspace(0, 1, 50, dtype=torch.float64)
         >>> shown = [Demonstration(time, (time * end)[:, None]) for end in (0.9, 1.0, 1.1)]
         >>> model = TaskParameterizedGMM(n_components=2).fit(shown)

@@ -897,3 +897,13 @@ def test_batches_know_where_links_start_too(starting):
     shown = [started(one) for one in few_bottles()]
     again = clone(model).fit([shown[:2], shown[2:]])
     assert again.summary_.frames["start"].link == "l_hand"
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.filterwarnings("ignore::tpgmm_torch.exceptions.PlausibilityWarning")
+def test_few_demonstrations_are_not_certain_of_what_comes_next(n):
+    far = [replace(one, joints=one.joints + 1.0) for one in waves(1)]
+    model = canonical().fit(waves(n))
+    wide = model.score(far)
+    model.set_params(covariance_shrinkage=0)  # of the same mixture
+    assert np.isfinite(wide) and wide > model.score(far) + 50

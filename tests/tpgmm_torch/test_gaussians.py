@@ -281,3 +281,21 @@ def test_densities_are_those_of_torch_and_scipy(seed, size, degrees):
         else:
             expected = multivariate_t(shape=one.numpy(), df=degrees).logpdf(columns.mT.numpy())
         assert_close(row, np.atleast_1d(expected), 1e-6)
+
+
+def test_sums_of_information_are_the_product_of_pseudo_inverses():
+    rng = np.random.default_rng(2)
+    identity_target, identity_covariance = normal(rng, 6), spd(rng, 6)
+    jacobian, target, covariance = normal(rng, 3, 6), normal(rng, 3), spd(rng, 3)
+    terms = [
+        gaussians.information(None, identity_target[:, None], identity_covariance),
+        gaussians.information(jacobian, target[:, None], covariance),
+    ]
+    inverse = np.linalg.pinv(jacobian.numpy())
+    singular = np.linalg.pinv(inverse @ covariance.numpy() @ inverse.T, rcond=1e-9)
+    full = np.linalg.inv(identity_covariance.numpy())
+    expected = np.linalg.inv(full + singular)
+    mean, spread = summed(terms)
+    assert_close(spread, expected)
+    weighted = full @ identity_target.numpy() + singular @ inverse @ target.numpy()
+    assert_close(mean, expected @ weighted)

@@ -351,3 +351,12 @@ def test_to_the_mean_the_turns_add_up_to_nothing(directions, turn):
     assert_same_rotation(Q.mean(q * signs), found, 1e-9)
     assert_same_rotation(Q.mean(Q.product(turn, q)), Q.product(turn, found), 1e-7)
     assert_same_rotation(Q.mean(torch.stack((q, q)))[1], found, 1e-9)
+
+
+@given(axes, axes, st.floats(1e-7, 1e-5))
+def test_displacement_of_a_quaternion_is_half_the_rotation_vector(axis, start, angle):
+    """The fact behind the factor 2 of the orientation operators."""
+    before = Q.exp(start)
+    after = Q.product(Q.exp(axis * angle), before)
+    displacement = Q.vector_matrix(Q.conjugate(before)) @ after
+    assert (2 * displacement - axis * angle).norm() <= angle**2

@@ -43,7 +43,7 @@ def equivalent_rows(
     array of shape (T * n, sum D_j)
         The n points of each instant together.
     int
-        n.
+        How many points stand for an instant, n.
     """
     origin = torch.from_numpy(np.asarray(reference, dtype=np.float64))
     own_total = torch.zeros_like(origin)

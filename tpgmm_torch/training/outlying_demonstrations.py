@@ -217,9 +217,9 @@ def drop_outliers(
     robot : Kinematics, optional
         As of the estimator.
     threshold : float, default=8.0
-        So many robust standard deviations from the median are unlike the others,
+        Robust standard deviations from the median beyond which one is unlike the others.
     duration : float, default=0.5
-        where they last for so long in all [s].
+        How long in all it has to be so [s].
 
     Returns
     -------

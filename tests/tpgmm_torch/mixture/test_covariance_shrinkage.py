@@ -122,3 +122,25 @@ def test_the_variances_of_one_sample_stay():
     new = shrink(old, 0.0, n_samples, ["s"] + ["m"] * 4, given=1)
     torch.testing.assert_close(new[:2], old[:2])
     assert not torch.allclose(new[2], old[2])
+
+
+def test_shrunk_covariances_are_closer_to_the_truth():
+    rng = np.random.default_rng(0)
+    truth = np.eye(8) + 0.3 * (np.ones((8, 8)) - np.eye(8))
+    drawn = [rng.multivariate_normal(np.zeros(8), truth, size=6) for _ in range(50)]
+    found = torch.from_numpy(np.stack([np.cov(x.T) + 1e-9 * np.eye(8) for x in drawn]))
+    of_samples, of_shrunk = (
+        np.linalg.norm(c.numpy() - truth, axis=(1, 2)).mean()
+        for c in (found, shrink(found, "auto", 6.0))
+    )
+    assert of_shrunk < 0.9 * of_samples
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 9])
+@pytest.mark.parametrize("prior", [2.0, 6.0, 30.0])
+def test_moderated_variances_are_closer_to_the_truth(n, prior):
+    true, estimated = drawn(prior, n)
+    moderated = moderated_variances(estimated, n)
+    before, after = (((x / true).log() ** 2).mean() for x in (estimated, moderated))
+    assert after < before * (n + 1) / (n + 2)
+    assert (moderated < true / 10).sum() <= (estimated < true / 10).sum()

@@ -27,6 +27,7 @@ from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.conditionals import TimeMarginals
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion
+from tpgmm_torch.regression.posture import PostureCost
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots import Poses
 from tpgmm_torch.skills.compiled import compile_skill
@@ -250,3 +251,24 @@ def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
 def test_what_compiles_no_logarithms_says_so():
     with pytest.raises(DataError, match="geometry='quaternion'"):
         compile_skill(handling().skill, backend="eager")
+
+
+def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
+    """Finite differences, far from what is wanted: the linearisation's Jacobian is exact."""
+    skill = handling()
+    regression, time = skill.skill, torch.tensor(4.4, dtype=torch.float64)
+    frame = few_bottles()[0].frames["bottle"]
+    generator = torch.Generator().manual_seed(0)
+    joints = few_bottles()[0].joints[:1].to(torch.float64)
+    joints = joints + 0.3 * torch.randn(1, 17, generator=generator, dtype=torch.float64)
+    index = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
+    cost = PostureCost(
+        regression.posture_search(), index.expand(1, 1), time, joints,
+        {"bottle": frame.expand((1,))}, regression.kinematics.state,
+    )  # fmt: skip
+    _, downhill, _ = cost(joints[None])
+    steps = 1e-6 * torch.eye(17, dtype=torch.float64)
+    slope = torch.stack(
+        [(cost((joints + s)[None])[0] - cost((joints - s)[None])[0]).squeeze() for s in steps]
+    )
+    assert float((slope / 2e-6 + downhill[0, 0]).abs().max() / downhill.abs().max()) < 1e-6
