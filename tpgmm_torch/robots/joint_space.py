@@ -39,7 +39,7 @@ class JointSpace(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """The inverse of :meth:`config`."""
+        """The inverse of ``config``."""
         return cls(config["joint_names"])
 
     def __repr__(self) -> str:

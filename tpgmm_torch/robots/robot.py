@@ -333,7 +333,7 @@ class Robot(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
-        """The robot that gave this :meth:`config`."""
+        """The robot that gave this ``config``."""
         places = "urdf", "links", "base", "tools"
         cls._check_keys(config, *places, "joints", "locked", "coordinates", "dtype")
         if not isinstance(config["urdf"], str) or not config["urdf"].startswith("<"):

@@ -160,7 +160,7 @@ class Poses(Described):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any], device: torch.device | str = "cpu") -> Self:
-        """The poses that gave this :meth:`config`."""
+        """The poses that gave this ``config``."""
         cls._check_keys(config, "links", "orientation", "dtype")
         dtype = checked_dtype(config["dtype"])
         return cls(config["links"], config["orientation"], dtype, device)
