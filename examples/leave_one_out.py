@@ -67,6 +67,7 @@ from tpgmm_torch import (
     Stack,
     TaskParameterizedGMM,
     quaternions,
+    rollout,
 )
 from tpgmm_torch.alignment import (
     DynamicTimeWarping,
@@ -256,7 +257,8 @@ def one_fold(
         model = TaskParameterizedGMM(recording.n_components, operators, recording.robot)
         model.set_params(random_state=0, **parameters)
         situation = Situation(test.joints[0], test.frames, clock.time_)
-        [trajectory] = model.fit(aligned).predict([situation], candidates=False)
+        skill = model.fit(aligned).skill
+        [trajectory] = rollout(skill, [situation], blend=1.0)  # from where the arm stands
         proposals[name] = trajectory.joints, usual
     closest = nearest(test, train, recording.frame)
     proposals["mean"] = mean_joints(aligned, recording.robot), usual
