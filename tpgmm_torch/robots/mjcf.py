@@ -156,18 +156,29 @@ class _Translation:
             lower, upper = map(float, model.jnt_range[joint])
         direct = [mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT]
         is_servo = np.isin(model.actuator_trntype, direct) & (model.actuator_gear[:, 0] != 0)
-        is_servo &= (model.actuator_trnid[:, 0] == joint) & (model.actuator_ctrllimited != 0)
+        is_servo &= model.actuator_trnid[:, 0] == joint
         is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-        is_servo &= model.actuator_dyntype != mujoco.mjtDyn.mjDYN_INTEGRATOR
         for servo in np.flatnonzero(is_servo):
             constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
             gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
-            ends = -(gain * model.actuator_ctrlrange[servo] + constant) / gear
-            if stiffness:
+            commands, limited = (
+                model.actuator_ctrlrange[servo],
+                model.actuator_ctrllimited[servo],
+            )
+            if model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
+                if stiffness and limited:  # the control is the speed of what is commanded
+                    speeds = gain * commands / (stiffness * gear)
+                    velocity = min(velocity, float(np.abs(speeds).max()))
+                commands, limited = (
+                    model.actuator_actrange[servo],
+                    model.actuator_actlimited[servo],
+                )
+            ends = -(gain * commands + constant) / gear
+            if limited and stiffness:
                 low, high = sorted(map(float, ends / stiffness))
                 if max(low, lower) < min(high, upper):
                     lower, upper = max(low, lower), min(high, upper)
-            elif damping:
+            elif limited and damping:
                 velocity = min(velocity, float(np.abs(ends / damping).max()))
         return lower, upper, velocity
 

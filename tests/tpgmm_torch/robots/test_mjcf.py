@@ -134,7 +134,7 @@ class TestLimits:
         expected = [
             [-1, 0.25, inf],  # a position servo of gear 2
             [-np.deg2rad(40), np.deg2rad(100), 3],  # a velocity servo
-            [0, 0.2, inf],  # a servo of integrated velocity says nothing
+            [0.05, 0.2, 0.1],  # a servo of integrated velocity
             [-inf, inf, inf],
             [0, 0.014, inf],  # a motor says nothing; there its follower is at an end
         ]
