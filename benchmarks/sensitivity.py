@@ -83,7 +83,7 @@ class Fold:
 
 
 def _bottle(n: int, n_operators: int = 2) -> Fold:
-    """The bottle skill: so many demonstrations, and others of seed 1000 to compare with."""
+    """The bottle skill: n demonstrations of seed 0, and ten of seed 1000 to compare with."""
     skill = BottleShaking(rate=20)
     clock = DynamicTimeWarping(features=["directions"]).fit(shown := skill.demonstrations(n, 0))
     # without the operator of the joints the prior decides what the hands leave free

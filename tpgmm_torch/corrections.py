@@ -20,7 +20,7 @@ from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["in_skill_time"]
 
-#: What differs by this [rad], or is twice as fast or slow, is one unit apart.
+#: Difference of joints that costs as much as twice or half the pace [rad].
 JOINTS, SLOPE = 0.1, math.log(2.0)
 
 

@@ -79,7 +79,7 @@ def retime(
         if np.interp(instant, own, steps) <= end_of_path
     }
     holds = demonstration.holds
-    if holds is not None:  # what is shorter than a step is none on the new clock
+    if holds is not None:  # those outside the path shrink to an instant, and are left out
         holds = tuple(h.retimed(clock) for h in holds if clock(h.begin) < clock(h.end))
     time = time.to(demonstration.time)
     return Demonstration(time, moved, frames, demonstration.joint_names, events, holds)

@@ -67,7 +67,7 @@ class DynamicTimeWarping(Alignment):
         default) falls by less than this share. Nothing is checked if it is None, if no feature
         is left over, and of warps within 2 % of linear time.
     max_steps : int, default=2000
-        Warping runs on at most so many time steps; its memory and time grow with their square.
+        Number of time steps that warping runs on at most; memory and time grow with its square.
 
     Attributes
     ----------

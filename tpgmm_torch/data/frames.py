@@ -17,8 +17,8 @@ __all__ = ["LEVER", "STILL", "Frame"]
 
 #: Turning a thing by one radian counts as moving it by this distance, half its size [m].
 LEVER = 0.2
-#: What moves by less stands still [m]: the noise of trackers. What turns, by less than this for
-#: the lever.
+#: Motion below this is the noise of trackers, of things that stand still [m]; for turns
+#: divided by the lever [rad].
 STILL = 0.02
 
 

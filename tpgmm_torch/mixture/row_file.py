@@ -104,7 +104,7 @@ Rows = NDArray[np.floating[Any]] | RowFile
 
 
 def pieces(rows: Rows) -> Iterator[NDArray[np.float64]]:
-    """All rows in float64, so many at a time as are read from a file at once.
+    """All rows in float64, in blocks of as many as are read from a file at once.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def follow_poses(
     rate : float
         Poses per second; joints keep within their limits of position and speed.
     posture : array-like of shape (n_joints,) or (T, n_joints), optional
-        What joints seek where the poses leave them free, slowly; by default the start. Of T
+        Posture that joints seek slowly where poses leave them free; by default the start. Of T
         postures each goes with a pose, and is sought at once.
     orientations : bool, default=True
         False lets links turn as they like.
@@ -128,7 +128,7 @@ def reach(
     start : array-like of shape (n_joints,)
         Where the search begins; it ends in a posture near it.
     posture : array-like of shape (n_joints,), optional
-        What joints seek where the poses leave them free; by default the start.
+        Posture that joints seek where poses leave them free; by default the start.
     orientations : bool, default=True
         False lets links turn as they like.
     tolerance : float, default=1e-4

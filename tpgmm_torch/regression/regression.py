@@ -274,7 +274,7 @@ class Regression:
     def _part(
         self, operator: Operator, one: Conditionals, names: frozenset[str]
     ) -> tuple[Operator, Conditionals] | None:
-        """What of an operator needs no other frames and links than these."""
+        """The part of an operator that needs no other frames and links than these."""
         members = leaves([operator])
         there = [names.issuperset((*leaf.links(), *leaf.references())) for leaf in members]
         if all(there):

@@ -37,7 +37,7 @@ class TreeKinematics:
     Parameters
     ----------
     bodies : sequence of Body
-        What moves the links, the base first; the links are the last.
+        Bodies that move the links, the base first; the links are the last.
     n_links, n_joints : int
         L, and the length of the joint vector.
     dtype, device : torch.dtype, torch.device or str

@@ -197,7 +197,7 @@ class _Translation:
         return mimics
 
     def _visuals(self) -> dict[str, list[ElementTree.Element]]:
-        """What links look like: the solids that URDF knows, without ellipsoids and planes."""
+        """Visual geometry of links: the solids of URDF, without ellipsoids and planes."""
         visuals: dict[str, list[ElementTree.Element]] = {link: [] for link in self.links}
         shown_groups = self.mujoco.MjvOption().geomgroup  # MuJoCo's own; others collide
         for geom in map(self.model.geom, range(self.model.ngeom)):

@@ -279,7 +279,7 @@ class Robot(Described):
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
         self.angles = tuple(i for i in column.values() if i not in self.lengths)
-        #: What moves the links with respect to the base, these last; see ``reduce``.
+        #: Bodies that move the links with respect to the base, these last; see ``reduce``.
         self.tree = reduce(model, *_wanted(model, config), column, config["locked"])
         moving = len(self.tree) - len(self.links) - 1
         if max(self.n_joints, moving) > MOST_JOINTS:
@@ -511,8 +511,8 @@ def _matrix(pose: Frame) -> Array:
 def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
     """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
 
-    What mimics a joint limits it too. Coordinates without kinematics have no limits, and lack
-    none.
+    Joints that mimic another limit it too. Coordinates without kinematics have no limits, and
+    lack none.
     """
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
     without = set()

@@ -219,7 +219,7 @@ class Skill(Protocol):
 class CompositeSkill(Skill):
     """A skill made of others of one robot, and mixed of them by their weights.
 
-    What they remember is handed on: where one of them starts, advances or is of fewer robots,
+    Their state is handed on: where one of them starts, advances or is of fewer robots,
     that of which it is a part does.
 
     Attributes

@@ -105,7 +105,7 @@ class SelectOperators(DemonstrationEstimator):
     n_instants : int, default=50
         At how many instants the demonstrations are looked at.
     n_left_out : int, default=20
-        How many demonstrations are left out in turn; of more, so many are chosen evenly.
+        How many demonstrations are left out in turn, chosen evenly where there are more.
 
     Attributes
     ----------
@@ -265,7 +265,7 @@ class SelectOperators(DemonstrationEstimator):
     def _judge(
         self, evidence: Evidence, j: int, chosen: Sequence[int], kinematics: Kinematics
     ) -> tuple[Judgement, Tensor]:
-        """What candidate j gains, when, and in its own units; and its gains (T,)."""
+        """Gain of candidate j, when it counts, its own units; and its gains (T,)."""
         operator, others = self.candidates_[j], _without(chosen, j)
         joints = [i for i, one in enumerate(self.candidates_) if isinstance(one, Canonical)]
         base = [] if j in joints else joints

@@ -38,7 +38,7 @@ __all__ = [
 
 #: Fewer demonstrations do not show how far they differ.
 FEWEST = 5
-#: What is nearer to the median is like the others: a share of the range of coordinates.
+#: Distance from the median that is usual: a share of the range of coordinates.
 NEAR = 0.005
 #: Demonstrations of more numbers than this (512 MB) are compared at fewer instants.
 LARGEST_TABLE = 2**26

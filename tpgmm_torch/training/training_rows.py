@@ -35,9 +35,9 @@ class TrainingRows:
     Parameters
     ----------
     rows : array of shape (n, sum_j (1 + D_j)), or RowFile
-        What this process learns from.
+        Rows that this process learns from.
     group_size : int
-        So many consecutive rows share one responsibility.
+        Number of consecutive rows that share one responsibility.
     time : Tensor of shape (T,)
         Time grid of the demonstration of median duration [s].
     n_demonstrations : int

@@ -383,7 +383,7 @@ class _Summary:
         yield "![Success in percent, by task and condition](figures/conditions.webp)"
 
     def _described(self, condition: str) -> str:
-        """What goes wrong, in the words of those who make it go wrong."""
+        """Text of a condition: the options of each disturbance, or its first line."""
         options = {k: v for b in self.benchmarks.values() for k, v in b.disturbances.items()}
         texts = [
             f"`{json.dumps(options[name])}`." if name in options
