@@ -19,8 +19,7 @@ nearest posture is more than 100 standard deviations away.
 
 import argparse
 import warnings
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -28,11 +27,9 @@ from torch import Tensor
 
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
-from tpgmm_torch import Controller, Frame, TaskParameterizedGMM
+from tpgmm_torch import Clock, Controller, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.control.clocks import EvenClock, EvenProgress
 from tpgmm_torch.regression.posture import NEGLIGIBLE, PostureCost, descend
-from tpgmm_torch.skills.skill import Skill
 
 #: When the hands are at the bottle, shortly before it is moved [s].
 GRASP = 4.4
@@ -41,24 +38,6 @@ DT = 0.01
 FAST = 1.0
 #: Distances below are those of bottles in reach.
 REACHED = 100.0
-
-
-@dataclass(frozen=True)
-class UpTo(EvenClock):
-    """A clock that stops in the middle of the skill."""
-
-    stop: float = GRASP
-
-    def start(
-        self,
-        skill: Skill,
-        joints: Tensor,
-        frames: Mapping[str, Frame],
-        begin: float | None = None,
-        end: float | None = None,
-    ) -> EvenProgress:
-        """See :class:`EvenClock`."""
-        return super().start(skill, joints, frames, begin, self.stop)
 
 
 def outside(n: int, seed: int, most: float) -> Frame:
@@ -81,12 +60,17 @@ def learned(n_demonstrations: int = 10, n_components: int = 30) -> TaskParameter
     return model.fit(aligned)
 
 
-def played(model: TaskParameterizedGMM, bottles: Frame, clock: EvenClock, ticks: int) -> Tensor:
-    """References of all robots at each tick, (ticks, n, 17)."""
+def played(model: TaskParameterizedGMM, bottles: Frame, ticks: int, stop: bool) -> Tensor:
+    """References of all robots at each tick, (ticks, n, 17).
+
+    Time may stop at the grasp: it is not passed before the joints arrive, and they stay.
+    """
     starts = BottleShaking().neutral_posture().expand(len(bottles.position), -1)
+    clock = Clock("even", arrivals=(GRASP,) if stop else ())
     controller = Controller(model.skill, starts, {"bottle": bottles}, clock=clock)
+    joints = starts if stop else None
     with torch.inference_mode():
-        return torch.stack([controller.step(DT).reference for _ in range(ticks)])
+        return torch.stack([controller.step(DT, joints).reference for _ in range(ticks)])
 
 
 def calm(model: TaskParameterizedGMM, references: Tensor) -> dict[str, float]:
@@ -157,9 +141,9 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore")  # of bottles that nobody has shown
     model = learned()
     bottles = outside(options.bottles, options.seed, options.most)
-    whole = played(model, bottles, EvenClock(), len(model.time_) + round(0.5 / DT))
+    whole = played(model, bottles, len(model.time_) + round(0.5 / DT), False)
     print("whole skill:", calm(model, whole), flush=True)
-    stops = played(model, bottles, UpTo(), round((GRASP + options.rest) / DT))
+    stops = played(model, bottles, round((GRASP + options.rest) / DT), True)
     print("up to the grasp:", calm(model, stops), flush=True)
     moving = float((stops[-1] - stops[-2]).abs().max() / DT)
     here, least = distances(model, bottles, stops[-1], options.starts, options.steps)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 # PyTorch and scikit-learn take seconds to load: what needs them is loaded when it is first
 # asked for (PEP 562), so that `import tpgmm_torch` and `tpgmm --help` are quick.
 if TYPE_CHECKING:
+    from tpgmm_torch.control.clock import Clock
     from tpgmm_torch.control.controller import Controller
-    from tpgmm_torch.control.localizing_clock import LocalizingClock
     from tpgmm_torch.control.rollout import rollout
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.data.frames import Frame
@@ -38,11 +38,11 @@ __all__ = [
     "AbsoluteOrientation",
     "AbsolutePosition",
     "Canonical",
+    "Clock",
     "Controller",
     "Demonstration",
     "Frame",
     "Hold",
-    "LocalizingClock",
     "RelativeOrientation",
     "RelativePosition",
     "Robot",
@@ -63,7 +63,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "control.localizing_clock": ("LocalizingClock",),
+    "control.clock": ("Clock",),
     "control.controller": ("Controller",),
     "data.demonstrations": ("Demonstration", "Situation"),
     "estimator": ("TaskParameterizedGMM",),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tpgmm_torch.alignment.text import METHODS
-from tpgmm_torch.control.clock_text import parse_clock
+from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.sensing.pose_filter import OneEuro
@@ -107,7 +107,7 @@ class ControlConfig:
     Parameters
     ----------
     clock : str, default="localizing:initial=anywhere"
-        How time goes on, as :func:`tpgmm_torch.control.clock_text.parse_clock` takes it:
+        How time goes on, as :meth:`tpgmm_torch.Clock.parse` takes it:
         ``"even"``, ``"waiting"`` or ``"localizing"``, with options. By default an episode may
         begin in the middle of the skill.
     smoothing : float or None, default=0.5
@@ -158,7 +158,7 @@ class ControlConfig:
         limits = {name: getattr(self, name) for name in ("velocity", "acceleration", "jerk")}
         bounds = {name: limit for name, limit in limits.items() if limit is not None}
         return {
-            "clock": parse_clock(self.clock),
+            "clock": Clock.parse(self.clock),
             "trust": Trust(joint_timeout=self.joint_timeout, frame_timeout=self.frame_timeout),
             "smoothing": None if self.smoothing is None else OneEuro(cutoff=self.smoothing),
             "feedback": "measured" if self.feedback == "observation" else "reference",

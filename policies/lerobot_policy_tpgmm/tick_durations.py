@@ -13,7 +13,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from tpgmm_torch.sensing.trust import Trust
+from tpgmm_torch.control.locate import LONGEST_TICK
 
 __all__ = ["TickDurations"]
 
@@ -56,5 +56,5 @@ class TickDurations:
         increased = (passed > 0) & now.isfinite()
         self._last = torch.where(now.isfinite(), now, last)
         # a loop that stood for longer goes on as if it had stood for that long
-        self._known.append(passed.clamp(max=Trust.longest_step).where(increased, torch.nan))
+        self._known.append(passed.clamp(max=LONGEST_TICK).where(increased, torch.nan))
         return torch.stack(list(self._known)).nanmean(0).where(increased, passed)

@@ -106,7 +106,7 @@ def test_a_value_that_is_none_is_refused(field, value):
 def test_what_lerobots_parser_drops_is_told_before(caplog):
     with pytest.raises(ParsingError):
         draccus.parse(TPGMMConfig, args=["--control.clock=foo"])
-    assert "clock 'foo': there is no 'foo'; there are ['even', 'waiting'" in caplog.text
+    assert "one of ['localizing', 'waiting', 'even'], got 'foo'" in caplog.text
 
 
 def test_a_policy_without_anything_to_learn_from_is_refused():

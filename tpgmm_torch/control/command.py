@@ -1,29 +1,35 @@
-"""What a running skill sends to its robots at one tick, and how each of them fares."""
+"""Stage *command*: what is sent to robots at one tick, and the status of each of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from tpgmm_torch.control.locate import HELD, Flags, Progress
+from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.regression.estimate import Estimate
+from tpgmm_torch.sensing.inputs import Inputs
 
-__all__ = ["Command", "Status"]
+__all__ = ["Command", "Status", "refused", "statuses"]
 
 
 class Status(StrEnum):
-    """How a robot fares with its skill; in tensors by its ``code``."""
+    """Whether a robot follows its skill; in tensors by its ``code``."""
 
     RUNNING = "running"  #: the skill goes on
-    WAITING = "waiting"  #: its clock waits for the robot, or for something to happen
+    WAITING = "waiting"  #: a joint does not follow its reference
+    DISPLACED = "displaced"  #: somebody else has moved it
     HOLDING = "holding"  #: it stands, because what came in cannot be trusted
     FINISHED = "finished"  #: it stands at the end of the skill
 
@@ -33,6 +39,8 @@ class Status(StrEnum):
         return _CODES[self]
 
 
+#: Why a robot is waited for, of which the readings are the same to the last bit.
+FROZEN = "its readings do not change: it stands, or they are dead"
 _STATUSES = tuple(Status)
 _CODES = {status: code for code, status in enumerate(_STATUSES)}
 _NO_REASONS: Mapping[tuple[int, ...], str] = MappingProxyType({})
@@ -63,6 +71,11 @@ class Command:
         What stiffness and damping are made with.
     compute_novelty : callable, optional
         What gives :attr:`novelty`.
+    relocalized : Tensor of bool of shape (...), optional
+        Whether its time was set to another one of the skill at this tick.
+    offset : Tensor of shape (..., n_joints), optional
+        What readings exceed positions by, as it is estimated: sag, payload, an encoder that
+        slipped [rad or m].
     """
 
     reference: Tensor
@@ -73,6 +86,8 @@ class Command:
     reasons: Mapping[tuple[int, ...], str] = _NO_REASONS
     impedance: Impedance | None = None
     compute_novelty: Callable[[], Tensor] | None = None
+    relocalized: Tensor | None = None
+    offset: Tensor | None = None
 
     def __repr__(self) -> str:
         return (
@@ -176,3 +191,90 @@ class Command:
 def _statuses(codes: Any) -> Any:
     """In nested lists as the codes are."""
     return _STATUSES[codes] if isinstance(codes, int) else [_statuses(part) for part in codes]
+
+
+def refused(last: Command, reason: str) -> Command:
+    """The last command, while nothing moves.
+
+    Parameters
+    ----------
+    last : Command
+    reason : str
+        Why that is so.
+    """
+    codes = torch.full_like(last.codes, Status.HOLDING.code)
+    reasons = dict.fromkeys(np.ndindex(*codes.shape), reason)
+    return replace(last, codes=codes, reasons=reasons)
+
+
+def statuses(
+    batch: Sequence[int],
+    names: Sequence[str],
+    progress: Progress,
+    wanted: Tensor,
+    ended: Flags | None,
+    held: Sequence[tuple[Flags | None, str]],
+    halted: Flags | None,
+    inputs: Inputs | None,
+) -> tuple[NDArray[np.int8], Mapping[tuple[int, ...], str]]:
+    """The status of each robot, and why one does not simply run.
+
+    Parameters
+    ----------
+    batch : sequence of int
+        Shape of the batch; robots are (B,) in what follows.
+    names : sequence of str
+        Of the joints.
+    progress : Progress
+    wanted : Tensor of shape (..., n_joints)
+        Where robots should be.
+    ended : bool array of shape (B,), optional
+        Robots that have been at the end for a tick.
+    held : sequence of (bool array of shape (B,), str)
+        Robots that stand for a reason; the last one counts.
+    halted : bool array of shape (B,), optional
+        Robots without accepted inputs.
+    inputs : Inputs, optional
+        Why that is so.
+    """
+    codes, texts = np.zeros(len(progress.time), np.int8), dict[int, str]()
+    if progress.waits.any():
+        texts = _waiting(progress, names, wanted, inputs)
+        codes[progress.waits] = Status.WAITING.code
+        codes[progress.waits & progress.displaced] = Status.DISPLACED.code
+    if ended is not None:
+        codes[ended] = Status.FINISHED.code
+    for robots, reason in held:
+        if robots is not None:
+            codes[robots] = Status.HOLDING.code
+            texts |= dict.fromkeys(np.flatnonzero(robots).tolist(), reason)
+    indices = list(np.ndindex(*batch)) if texts else []
+    reasons = {indices[row]: text for row, text in texts.items()}
+    if halted is not None and inputs is not None:
+        codes[halted] = Status.HOLDING.code
+        reasons |= inputs.reasons(halted.reshape(tuple(batch)))
+    return codes, reasons or _NO_REASONS
+
+
+def _waiting(
+    progress: Progress, names: Sequence[str], wanted: Tensor, inputs: Inputs | None
+) -> dict[int, str]:
+    """For which joint each robot is waited."""
+    to = wanted.numpy(force=True).reshape(len(progress.time), -1)
+    rows = np.flatnonzero(progress.waits).tolist()
+    texts = {row: _gap(progress, row, names, to) for row in rows}
+    if inputs is not None:
+        frozen = np.flatnonzero(progress.waits & inputs.frozen.reshape(-1)).tolist()
+        texts |= {row: f"{texts[row]}; {FROZEN}" for row in frozen}
+    return texts
+
+
+def _gap(progress: Progress, row: int, names: Sequence[str], wanted: Array) -> str:
+    """For which joint a robot is waited, and how far it is off."""
+    servo = progress.servo
+    gap = servo.gap[row]
+    if progress.mode[row] == HELD:
+        gap = servo.corrected[row] - wanted[row]
+    joint = int(np.abs(gap).argmax())
+    offset = servo.offset[row, joint]
+    return f"joint {names[joint]!r} is {gap[joint]:+.3f} off, beside an offset of {offset:+.3f}"

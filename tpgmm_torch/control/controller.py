@@ -1,11 +1,42 @@
-"""A running skill: Algorithm 1's synthesis, one control tick at a time."""
+"""A running skill: Algorithm 1's synthesis, one control tick at a time.
+
+A tick is a list of stages. Each is a file with an immutable state of its own and a function
+from that state and from what the stages before gave to the next state:
+
+sense
+    accepted readings, and who is held without (:mod:`~tpgmm_torch.sensing.inputs`)
+locate
+    each robot's time in the skill, and whether it follows (:mod:`~tpgmm_torch.control.locate`,
+    :mod:`~tpgmm_torch.sensing.servo`, :mod:`~tpgmm_torch.control.places`)
+hold
+    objects that move with a hand (:mod:`~tpgmm_torch.control.hold`)
+estimate
+    the Gaussian of the joints (:mod:`~tpgmm_torch.control.estimate`)
+reach
+    the posture that is wanted (:mod:`~tpgmm_torch.control.reach`)
+follow
+    the next reference, within bounds (:mod:`~tpgmm_torch.motion.follow`)
+command
+    what is sent, and the status in words (:mod:`~tpgmm_torch.control.command`)
+
+Three rules hold whatever the stages are made of.
+
+1. References are continuous: *follow* alone writes them, within the bounds of position, speed,
+acceleration and
+   jerk in the time that has passed.
+2. What the controller does itself is no evidence: only the gap that lag and offset of the
+servos do not explain
+   is (:mod:`~tpgmm_torch.sensing.servo`).
+3. The status tells the truth: running, waiting (for which joint, how far off), displaced,
+holding (why), finished.
+"""
 
 from __future__ import annotations
 
 import copy
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -14,34 +45,32 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.checks.situations import START
-from tpgmm_torch.checks.summary import TrainingSummary
-from tpgmm_torch.control.clock_text import parse_clock
-from tpgmm_torch.control.clocks import Clock
-from tpgmm_torch.control.command import Command, Status
-from tpgmm_torch.control.displacement import Displacement
-from tpgmm_torch.control.hold_watch import HoldWatch
+from tpgmm_torch.control import command as commands
+from tpgmm_torch.control.clock import Clock
+from tpgmm_torch.control.command import Command
+from tpgmm_torch.control.estimate import choose, estimate
+from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.localizing_clock import LocalizingClock
+from tpgmm_torch.control.locate import LONGEST_TICK, Flags, Progress, Seen
+from tpgmm_torch.control.places import Places
+from tpgmm_torch.control.reach import Fade, nearest
 from tpgmm_torch.control.situations import completed_frames, report_start
+from tpgmm_torch.data.arrays import Array, as_array
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError
+from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.impedance.stiffness import Impedance
+from tpgmm_torch.motion.follow import Following
 from tpgmm_torch.motion.follower import Follower, Seconds
-from tpgmm_torch.motion.minimum_jerk import fading_time, minimum_jerk
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
 from tpgmm_torch.sensing.trust import Trust
-from tpgmm_torch.skills.skill import Observation, Skill
+from tpgmm_torch.skills.skill import Skill
 
 __all__ = ["Controller"]
 
-#: Below that share of the clock's speed a robot waits, and is led.
-WAITING_RATE = 0.05
-#: Share of the usual lead of waiting robots that hold something.
-HOLDING_LEAD = 1 / 3
 #: Wanted postures are multiples of ``1 / GRID`` [rad or m]: the rounding of a batch, which is
 #: another one for each size, ends there, before the follower enlarges it.
 GRID = 2.0**32
@@ -51,43 +80,38 @@ INSTANT = 1e-6
 
 @dataclass
 class _Tick:
-    """What is known of one tick: durations, measurements, progress.
+    """What is known of one tick.
 
     Parameters
     ----------
     seconds : float or array of shape (...)
-        Duration of the tick, at most the longest step that is trusted.
-    passed : float or Tensor of shape (...)
-        The same, 0 for robots that are held.
-    measured : Tensor of shape (..., n_joints), optional
-        NaN where nothing was accepted.
-    halted, late : Tensor of bool of shape (...), optional
-        Robots without accepted inputs, and those whose time did not increase.
+        Duration of the tick, at most the longest that is trusted [s].
+    late : bool array of shape (B,), optional
+        Robots whose time did not increase.
+    first : bool
+    joints : Tensor of shape (..., n_joints), optional
+        Accepted readings, NaN elsewhere.
+    halted : bool array of shape (B,), optional
+        Robots without accepted inputs.
     ended : Tensor of bool of shape (...), optional
         Robots that have been at the end of the skill for a tick.
-    waits : Tensor of bool of shape (...), optional
-        Robots whose clock stands.
-    following : Follower, optional
-        At the wanted posture, where all robots can follow it.
     """
 
     seconds: Seconds
-    passed: float | Tensor
-    measured: Tensor | None
-    halted: Tensor | None
-    late: Tensor | None
+    late: Flags | None
+    first: bool
+    joints: Tensor | None = None
+    halted: Flags | None = None
     ended: Tensor | None = None
-    waits: Tensor | None = None
-    following: Follower | None = None
 
 
 class Controller:
     """A batch of robots that run a skill, each at its own pace, from its beginning to its end.
 
-    At each step a clock says how far each robot is, from what is measured; the skill gives the
-    estimate there; a follower goes there within the bounds of motion. Inputs that cannot be
-    right are rejected, and a robot without accepted inputs is held until there are some. After
-    the end the last reference is held. Robots of a batch do not influence each other.
+    At each step the clock says how far each robot is, from what is measured; the skill gives
+    the estimate there; the reference goes there within the bounds of motion. Inputs that cannot
+    be right are rejected, and a robot without accepted inputs is held until there are some.
+    After the end the last reference is held. Robots of a batch do not influence each other.
 
     Parameters
     ----------
@@ -99,10 +123,11 @@ class Controller:
         Poses of the objects until a step is given others, of shapes that broadcast with the
         batch.
     clock : Clock or str
-        How the time of the skill goes on; text is for :func:`parse_clock`. Without measured
+        How the time of the skill goes on; text is for :meth:`Clock.parse`. Without measured
         joints, every clock runs evenly.
     trust : Trust, optional
-        Which measurements are accepted; None accepts everything, and raises on what is wrong.
+        Which measurements are accepted; None accepts everything, raises on what is wrong, and
+        follows every ``dt`` to the letter.
     smoothing : OneEuro, optional
         Filter of poses that come at each step; only with ``trust``.
     bounds : MotionBounds, mapping of str to bounds, "robot" or None
@@ -123,16 +148,8 @@ class Controller:
 
     Attributes
     ----------
-    holding : Holding
-        What the robots hold, and where objects were last free.
-    reference : Tensor of shape (..., n_joints)
-        The last reference; the start posture before the first step.
-    time : Tensor of shape () or (...)
-        Progress at the last step [s]; the beginning before the first one.
     command : Command or None
         What the last step returned.
-    measured : Tensor of shape (..., n_joints) or None
-        Measured joints at the last step, NaN where they were rejected; None if there were none.
 
     Raises
     ------
@@ -147,7 +164,7 @@ class Controller:
         joints: Any,
         frames: Mapping[str, Frame] | None = None,
         *,
-        clock: Clock | str = LocalizingClock(),  # noqa: B008  (frozen)
+        clock: Clock | str = Clock(),  # noqa: B008  (frozen)
         trust: Trust | None = Trust(),  # noqa: B008  (frozen)
         smoothing: OneEuro | None = OneEuro(),  # noqa: B008  (frozen)
         bounds: MotionBounds | Mapping[str, Any] | str | None = "robot",
@@ -161,70 +178,68 @@ class Controller:
         if feedback not in ("reference", "measured"):
             raise DataError(f"feedback is 'reference' or 'measured', got {feedback!r}")
         kinematics = skill.kinematics
-        self.reference = kinematics.joint_tensor(joints)
+        start = kinematics.joint_tensor(joints)
         frames = completed_frames(skill, joints, frames or {})
         if trust is not None:
             report_start(skill, joints, frames)
-        self._frames = self._first_frames = self._converted(kinematics, frames)
-        self._skill = skill = skill.start(self.reference, self._frames)
-        self._end = skill.end if end is None else end
-        self.command: Command | None = None
-        self.measured: Tensor | None = None
-        self._measured_feedback, self._blend = feedback == "measured", blend
-        self._impedance = impedance or Impedance(kinematics)
-        self._gripping = kinematics.gripping()
-        self._bounds = _motion_bounds(skill, bounds)
-        self._progress = parse_clock(clock).start(
-            skill, self.reference, self._frames, begin, end
+        self._frames = self._first_frames = _converted(kinematics, frames)
+        self._skill = skill = skill.start(start, self._frames)
+        self._trusts, self._feedback = trust is not None, feedback
+        self._impedance, self._gripping = (
+            impedance or Impedance(kinematics),
+            kinematics.gripping(),
         )
-        self._start_sensing(trust, smoothing)
-        self._start_motion(at_rest)
-
-    def _start_sensing(self, trust: Trust | None, smoothing: OneEuro | None) -> None:
-        kinematics, progress = self._skill.kinematics, self._progress
-        self.holding = Holding.start(
-            kinematics, self._skill.carried_names, self._skill.holds, self._frames
-        )
-        self._watch = HoldWatch(kinematics)
-        self._first_holds: dict[str, float] = {}  # start of the first hold of each object
-        for hold in self.holding.holds:
-            earlier = self._first_holds.get(hold.frame, math.inf)
-            self._first_holds[hold.frame] = min(hold.begin, earlier)
-        self._given_holds: frozenset[str] = frozenset()  # objects whose holds were given
-        self._trust, self._inputs = trust, None
+        self._inputs = None
         if trust is not None:
-            self._inputs = Inputs(kinematics, self.reference, self._frames, trust, smoothing)
-        # robots that begin in the middle of the skill stand where no demonstration starts
-        midway = progress.time > progress.begin + START * (progress.end - progress.begin)
-        self._start = torch.where(midway.unsqueeze(-1), torch.nan, self.reference)
-        none = torch.zeros(self.reference.shape[:-1], dtype=torch.bool).to(midway.device)
-        self._waiting, self._displaced = none, none
-        self._displacement = Displacement()
-
-    def _start_motion(self, at_rest: bool) -> None:
-        self._follower: Follower | None = None
-        self._position_bounds = None
-        if (bounds := self._bounds) is not None:
-            self._follower = Follower.at(bounds, self.reference) if at_rest else None
-            # rounded postures stay within these
+            grips = None if self._gripping is None else self._gripping.numpy(force=True)
+            self._inputs = Inputs(kinematics, start, self._frames, trust, smoothing, grips)
+        self._holds = Holds.start(skill, self._frames)
+        begin, end = _span(skill, begin, end)
+        self._begin_at(Clock.parse(clock), start, begin, end)
+        self._fade, self._search = Fade.start(start, blend), skill.posture_search()
+        bounds = _motion_bounds(skill, bounds)
+        self._following = Following.start(bounds, start, at_rest)
+        self._limits = None
+        if bounds is not None:  # rounded postures stay within these
             low, high = (bounds.lower * GRID).ceil(), (bounds.upper * GRID).floor()
-            self._position_bounds = low / GRID, high / GRID
-        self._search = self._skill.posture_search()
-        self._velocity = torch.zeros_like(self.reference)
-        self._wanted = self._target = self.reference  # of estimates, and for clocks
-        self._fading = self._blend > 0
-        self._gap, self._fade_time = self._velocity, torch.full_like(self._start[..., 0], -1.0)
-        self._fade_duration = torch.full_like(self._fade_time, self._blend)
+            self._limits = low / GRID, high / GRID
+        self.command: Command | None = None
+
+    def _begin_at(self, clock: Clock, start: Tensor, begin: float, end: float) -> None:
+        self._places, rows = Places(self._skill, begin, end), _rows(as_array(start))
+        time = np.full(len(rows), begin, np.float64)
+        if clock.kind == "localizing" and clock.initial == "anywhere":
+            for row in range(len(rows)):
+                time[row] = self._places.first(row, self.holding, start)
+        self._progress = Progress.start(clock, time, end, rows)
+        # robots that begin in the middle of the skill stand where no demonstration starts
+        midway = torch.from_numpy(time > begin + START * (end - begin))
+        midway = midway.view(start.shape[:-1]).to(start.device)
+        self._start = torch.where(midway.unsqueeze(-1), torch.nan, start)
+
+    @property
+    def reference(self) -> Tensor:
+        """The last reference (..., n_joints); the start posture before the first step."""
+        return self._following.reference
+
+    @property
+    def holding(self) -> Holding:
+        """What the robots hold, and where objects were last free."""
+        return self._holds.holding
 
     @property
     def time(self) -> Tensor:
-        """Progress at the last step [s], the same for all robots or of each one."""
-        return self._progress.time
+        """Progress at the last step [s], the same () for all robots or of each one (...)."""
+        time, even = self._progress.time, self._progress.clock.kind == "even"
+        if even and (time == time[0]).all():
+            return torch.as_tensor(time[0]).to(self.reference)
+        return self._tensor(time)
 
     @property
     def finished(self) -> bool:
         """Whether all robots are at the end: further steps hold the last reference."""
-        return self.command is not None and bool((self.time >= self._end).all())
+        progress = self._progress
+        return self.command is not None and bool((progress.time >= progress.end).all())
 
     def step(
         self,
@@ -263,23 +278,24 @@ class Controller:
         ShapeError
             If there are more or fewer robots than at the start. Nothing has moved then.
         """
-        seconds, late = _durations(dt)
-        first = self.command is None
-        if not first and not isinstance(seconds, np.ndarray) and not 0 < seconds < math.inf:
-            return self._refused(f"time did not increase: dt = {seconds} s")
-        tick = self._sensed(seconds, None if first else late, joints, frames, ages)
-        if not first:
-            self._locate(tick)
-            if tick.ended is not None and bool(tick.ended.all()):
-                assert self.command is not None
-                return self._sent(tick, self.command.estimate, self._wanted)
-        self._update_holds(tick, None if frames is None else dict(self._frames), holds)
-        estimate, wanted = self._estimated(tick)
-        return self._sent(tick, estimate, wanted, self._lead(tick, estimate, wanted))
+        tick = self._timed(dt)
+        if tick is None:
+            assert self.command is not None
+            self.command = commands.refused(self.command, f"{NOT_INCREASED}: dt = {dt!r}")
+            return self.command
+        self._sense(tick, joints, frames, ages)
+        self._locate(tick)
+        if tick.ended is None or not bool(tick.ended.all()):
+            self._hold(tick, frames, holds)
+            self._follow(tick, *self._reach(tick, self._estimate(tick)))
+        else:
+            assert self.command is not None
+            self._follow(tick, self.command.estimate, self._following.wanted, None)
+        return self._send(tick)
 
     def copy(self) -> Self:
         """The same moment, to look ahead from."""
-        return copy.copy(self)  # its tensors are replaced, never changed
+        return copy.copy(self)  # its states are replaced, never changed
 
     def ahead(self) -> Self:
         """The same moment, to look ahead from: robots will follow, and objects will stay."""
@@ -308,50 +324,193 @@ class Controller:
             other._frames = other._inputs.frames
         return other
 
-    # Sensing
+    # Stages
 
-    def _sensed(
-        self,
-        seconds: Seconds,
-        late: Tensor | None,
-        joints: Any,
-        frames: Mapping[str, Any] | None,
-        ages: Mapping[str, float] | None,
-    ) -> _Tick:
-        """Accepted measurements, and how long this tick is for each robot."""
-        measured, halted = self._accepted(seconds, joints, frames, ages)
+    def _timed(self, dt: Any) -> _Tick | None:
+        """How long this tick is for each robot; None if no time has passed."""
+        seconds, late = _durations(dt)
+        first = self.command is None
+        if first:
+            return _Tick(np.maximum(np.nan_to_num(seconds, posinf=1e-3), 1e-3), None, True)
+        if not np.all(np.asarray(seconds) > 0) and late is None:
+            return None
+        if self._trusts:
+            seconds = np.minimum(seconds, LONGEST_TICK)
+        return _Tick(seconds, late, False)
+
+    def _sense(self, tick: _Tick, joints: Any, frames: Any, ages: Any) -> None:
+        """Accepted readings, and robots that are held without them."""
+        if self._inputs is None:
+            if frames is not None:
+                self._frames = _converted(self._skill.kinematics, frames)
+            measured = self._checked(joints)
+        else:
+            self._inputs = self._inputs.update(tick.seconds, joints, frames, ages)
+            self._accept_places(tick)
+            self._frames, measured = self._inputs.frames, self._inputs.measured
+            halted = self._inputs.untrusted(self._holds.known(self.reference))
+            tick.halted = halted.reshape(-1) if halted.any() else None
         if measured is not None and self._gripping is not None:
             # the objects that they hold keep gripping joints from their references
             measured = torch.where(self._gripping, torch.nan, measured)
-        self.measured = measured
-        if self.command is not None and self._trust is not None:
-            seconds = np.minimum(seconds, self._trust.longest_step)
-        passed = _each(seconds, torch.float64)
-        still = [robots for robots in (halted, late) if robots is not None]
-        if still:
-            going = torch.as_tensor(passed, dtype=torch.float64)
-            passed = torch.where(torch.stack(still).any(0), 0.0, going)
-        return _Tick(seconds, passed, measured, halted, late)
+        tick.joints = measured
 
-    def _accepted(
-        self,
-        seconds: Seconds,
-        joints: Any,
-        frames: Mapping[str, Any] | None,
-        ages: Mapping[str, float] | None,
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """Measured joints, and robots without accepted inputs; frames are kept."""
-        if self._inputs is None:
-            if frames is not None:
-                self._frames = self._converted(self._skill.kinematics, frames)
-            return self._validated(joints), None
-        known = seconds if self.command else np.maximum(seconds, 1e-3)
-        self._inputs = self._inputs.update(known, joints, frames, ages)
-        self._frames, untrusted = self._inputs.frames, self._inputs.untrusted()
-        halted = None if untrusted is None else torch.as_tensor(untrusted)
-        return self._inputs.measured, halted
+    def _accept_places(self, tick: _Tick) -> None:
+        """Readings that have jumped far, to the reference or to where the skill leads."""
+        assert self._inputs is not None
+        reading, progress = self._inputs.joints, self._progress
+        if reading is None or not reading.pending.any():
+            return
+        servo = progress.servo
+        postures = _rows(reading.rival) - servo.offset
+        away = np.abs(postures - servo.expected) - servo.usual
+        explained = away.max(-1) <= reading.trust.joint_jump
+        pending = reading.pending.reshape(-1)
+        if progress.clock.kind == "localizing":
+            for row in np.flatnonzero(pending & ~explained):
+                explained[row] = self._find(int(row), postures[row]) is not None
+        explained &= pending
+        accepted = reading.accept(explained.reshape(reading.pending.shape))
+        self._inputs = replace(self._inputs, joints=accepted)
 
-    def _validated(self, joints: Any) -> Tensor | None:
+    def _locate(self, tick: _Tick) -> None:
+        """Progress of each robot."""
+        if tick.first:
+            return
+        before = self._progress
+        passed = np.broadcast_to(tick.seconds, self.reference.shape[:-1]).reshape(-1)
+        none = np.zeros(len(passed), bool)
+        still = np.any([r for r in (none, tick.halted, tick.late) if r is not None], axis=0)
+        if not self._trusts and tick.joints is None:
+            self._progress = before.even(np.where(still, 0.0, passed))
+        else:
+            reference = _rows(as_array(self.reference))
+            readings = np.full_like(reference, np.nan)
+            if tick.joints is not None:
+                readings = _rows(as_array(tick.joints))
+            jumped = none if self._inputs is None else self._inputs.jumped.reshape(-1)
+            seen = Seen(passed, readings, jumped, still)
+            self._progress = before.advance(reference, seen, self._find)
+            self._resume((before.mode != 0) & (self._progress.mode == 0))
+        over = (self._progress.time >= before.end) & (before.time >= before.end)
+        tick.ended = self._tensor(over) if over.any() else None
+
+    def _resume(self, robots: Flags) -> None:
+        """Robots go on from where they are: those given, and those at another time."""
+        robots = robots | self._progress.relocalized
+        if robots.any():
+            self._fade = self._fade.again(self._tensor(robots))
+            if self._search is not None:
+                self._search = self._search.ended(self._tensor(robots))
+
+    def _find(self, row: int, posture: Array) -> float | None:
+        """A time of the skill that explains a robot's posture."""
+        now = float(self._progress.time[row])
+        return self._places.find(row, posture, now, self.holding, self.reference.detach())
+
+    def _hold(self, tick: _Tick, frames: Any, holds: Any) -> None:
+        """What the robots hold."""
+        seen = None if frames is None else dict(self._frames)
+        stands, seconds = self._postures(tick, measured=True), _each(tick.seconds)
+        self._holds = self._holds.advance(self.time, stands, seen, holds, seconds, self._inputs)
+
+    def _estimate(self, tick: _Tick) -> Estimate:
+        """What the skill says."""
+        at = self._postures(tick, self._feedback == "measured")
+        last = self.command.estimate if self.command is not None and self._trusts else None
+        found = estimate(self._skill, self.time, at, self.holding, self._limits, last)
+        self._skill = self._skill.advance(found)
+        return found
+
+    def _reach(self, tick: _Tick, found: Estimate) -> tuple[Estimate, Tensor, Follower | None]:
+        """The posture that is wanted, and the follower there, where all robots can follow."""
+        seconds = 0.0 if tick.first else _each(tick.seconds)
+        shift, self._fade = self._fade.advance(
+            self.reference, found.joints, seconds, tick.first
+        )
+        wanted, fitting = self._rounded(found.joints, shift), None
+        if not tick.first:
+            wanted, fitting = self._nearest(tick, found, wanted, shift)
+        if tick.ended is not None:  # for them it is as if all had come to the end
+            assert self.command is not None
+            last = self._following.wanted
+            wanted = torch.where(tick.ended.unsqueeze(-1), last, wanted)
+            found = choose(tick.ended, self.command.estimate, found)
+        return found, wanted, fitting
+
+    def _nearest(
+        self, tick: _Tick, found: Estimate, wanted: Tensor, shift: Tensor | None
+    ) -> tuple[Tensor, Follower | None]:
+        """The same where an estimate cannot be followed."""
+        search, follower = self._skill.posture_search(), self._following.follower
+        if follower is None or search is None or self._limits is None:
+            return wanted, None
+        search = self._search or search
+        fitting = follower.take(wanted, tick.seconds) if search.active is None else None
+        if fitting is not None:
+            return wanted, fitting
+        joints, self._search = nearest(
+            search, follower, wanted, tick.seconds, self.time,
+            self._postures(tick, self._feedback == "measured"), self.holding.frames,
+            found, self._limits, self._state if self.holding.carries else None,
+            not self._trusts,
+        )  # fmt: skip
+        return self._rounded(joints, shift), None
+
+    def _follow(
+        self, tick: _Tick, found: Estimate, wanted: Tensor, fitting: Follower | None
+    ) -> None:
+        """The next references, within the bounds."""
+        self._found, goal, progress = found, wanted, self._progress
+        if progress.mode.any() and tick.joints is not None:
+            led = progress.goal(_rows(as_array(wanted)), self._holds.busy(wanted))
+            alone = self._tensor(progress.mode == 0).unsqueeze(-1)
+            alone = alone | tick.joints.isnan()
+            goal = torch.where(alone, wanted, self._tensor(led).to(wanted))
+        halted, late = (
+            None if robots is None else self._tensor(robots)
+            for robots in (None if tick.first else tick.halted, tick.late)
+        )
+        self._following = self._following.advance(
+            wanted, goal, tick.seconds, halted, late, tick.first, fitting
+        )
+
+    def _send(self, tick: _Tick) -> Command:
+        """The command, with the status of each robot."""
+        following, progress = self._following, self._progress
+        lost = None if following.lost is None else following.lost.numpy(force=True).reshape(-1)
+        ended = None if tick.ended is None else tick.ended.numpy(force=True).reshape(-1)
+        codes, reasons = commands.statuses(
+            self.reference.shape[:-1], self._skill.kinematics.joint_names, progress,
+            following.wanted, ended,
+            ((lost, NO_ANSWER), (tick.late, NOT_INCREASED)),
+            tick.halted, self._inputs,
+        )  # fmt: skip
+        self.command = Command(
+            following.reference,
+            following.velocity,
+            self.time,
+            self._found,
+            self._tensor(codes),
+            reasons,
+            self._impedance,
+            self._novelty(),
+            self._tensor(progress.relocalized),
+            self._tensor(progress.servo.offset),
+        )
+        return self.command
+
+    # Conversions
+
+    def _tensor(self, rows: Any) -> Tensor:
+        """Rows of robots (B, ...) in the batch's shape."""
+        reference = self._following.reference if hasattr(self, "_following") else self._start
+        batch, like = reference.shape[:-1], reference
+        tensor = torch.from_numpy(np.ascontiguousarray(rows)).view((*batch, *rows.shape[1:]))
+        return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
+
+    def _checked(self, joints: Any) -> Tensor | None:
+        """Joints that are trusted, of as many robots as at the start."""
         if joints is None:
             return None
         measured = self._skill.kinematics.joint_tensor(joints)
@@ -362,323 +521,69 @@ class Controller:
             )
         return measured
 
-    @staticmethod
-    def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
-        return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
-
-    # Progress
-
-    def _locate(self, tick: _Tick) -> None:
-        """Progress of each robot; displaced robots restart from where they are."""
-        assert self.command is not None
-        measured, before, displaced = tick.measured, self._progress, None
-        if measured is not None and self._trust is not None and self._inputs is not None:
-            displaced, self._displacement = self._displacement.detect(
-                measured, self.reference, self._velocity, tick.seconds, self._trust
-            )
-        holding = self.holding
-        observation = Observation(
-            measured, self._target, None, holding.frames, self.command.estimate,
-            holding.state if holding.carries else None, displaced,
-        )  # fmt: skip
-        self._progress = before.advance(tick.passed, observation)
-        time = self._progress.time
-        if bool((time >= self._end).any()):
-            tick.ended = (time >= self._end) & (before.time >= self._end)
-        if measured is None:
-            return
-        self._restart_displaced(measured, displaced)
-        waits = time - before.time < WAITING_RATE * tick.passed
-        tick.waits = waits.expand(self._waiting.shape)
-        if tick.ended is not None:
-            tick.waits = tick.waits & ~tick.ended
-
-    def _restart_displaced(self, measured: Tensor, displaced: Tensor | None) -> None:
-        """Robots that were displaced, and those whose place was found."""
-        if displaced is not None:
-            self._restart_from(measured, displaced)
-            self._displaced = self._displaced | displaced
-        if bool((moved := self._progress.relocalized).any()):
-            self._restart_from(measured, moved)
-            self._displaced = self._displaced & ~moved
-
-    def _restart_from(self, measured: Tensor, robots: Tensor) -> None:
-        """References of some robots are where these stand, at rest."""
-        joints = robots.unsqueeze(-1) & ~measured.isnan()
-        self.reference = torch.where(joints, measured, self.reference)
-        self._velocity = torch.where(joints, 0.0, self._velocity)
-        if self._follower is not None:
-            self._follower = self._follower.put(joints, self.reference)
-        if self._search is not None:
-            self._search = self._search.ended(robots)
-        self._displacement = self._displacement.forget(joints)
-        self._restart_fading(robots)
-
-    # Holds
-
-    def _update_holds(
-        self,
-        tick: _Tick,
-        frames: Mapping[str, Frame] | None,
-        holds: Mapping[str, str | None] | None,
-    ) -> None:
-        """What the robots hold: by the skill's times, by what was given, and as it is seen."""
-        time, stands = self._progress.time, self._postures(tick, measured=True)
-        seconds = _each(tick.seconds, stands)
-        self._given_holds = self._given_holds.union(holds or ())
-        shares: Mapping[str, Tensor] = {}
-        if self._inputs is not None:
-            shares = self._inputs.shares
-            if self._inputs.poses and not holds:
-                now = time.expand(stands.shape[:-1])
-                given = self._first_holds.keys() & self._given_holds
-                self._watch, self.holding, frames = self._watch.update(
-                    self._inputs.poses.keys() - given, self._frames, stands, self.holding,
-                    seconds, {n: now < at for n, at in self._first_holds.items()},
-                )  # fmt: skip
-        self.holding = self.holding.advance(
-            time, stands, frames, holds, dt=seconds, shares=shares
-        )
-
     def _postures(self, tick: _Tick, measured: bool) -> Tensor:
         """References, or measured joints where there are some."""
-        if not measured or tick.measured is None:
+        if not measured or tick.joints is None:
             return self.reference
-        return torch.where(tick.measured.isnan(), self.reference, tick.measured)
-
-    # Estimate
-
-    def _estimated(self, tick: _Tick) -> tuple[Estimate, Tensor]:
-        """The skill's estimate, and the posture that is wanted."""
-        time, last = self._progress.time, self.command
-        at = self._postures(tick, self._measured_feedback)
-        estimate = self._estimate(time, at)
-        self._skill = self._skill.advance(estimate)
-        seconds = 0.0 if last is None else tick.seconds
-        shift = self._faded(estimate.joints, seconds)
-        wanted = self._rounded(estimate.joints, shift)
-        if last is not None and self._cannot_follow(tick, wanted):
-            wanted = self._rounded(self._nearest(tick, at, estimate, wanted), shift)
-        if last is not None and tick.ended is not None and bool(tick.ended.any()):
-            # for them it is as if all had come to the end
-            wanted = torch.where(tick.ended.unsqueeze(-1), self._wanted, wanted)
-            estimate = _choose(tick.ended, last.estimate, estimate)
-        return estimate, wanted
-
-    def _estimate(self, time: Tensor, at: Tensor) -> Estimate:
-        """The skill's estimate; not finite for robots for which it has none."""
-        state: Tensor | RobotState = at
-        if self.holding.carries:
-            state = self._state(at)
-        given = self.holding.frames, self._position_bounds
-        try:
-            return self._skill.estimate(time, state, *given)
-        except TPGMMError:
-            if self._trust is None or self.command is None:
-                raise  # nothing moves yet, or inputs are the caller's own
-        # one robot's failure is not its batch's
-        known, batch = self.command.estimate, at.shape[:-1]
-        joints = torch.full_like(at, torch.nan)
-        covariance = known.covariance.expand(*at.shape, -1).clone()
-        activation = known.activation.expand(*batch, -1).clone()
-        frames, bounds = given
-        for index in np.ndindex(*batch):
-            here = {n: f.expand(batch)[index] for n, f in frames.items()}
-            now = time[index] if time.ndim else time
-            try:
-                estimate = self._skill.estimate(now, state[index], here, bounds)
-            except TPGMMError:
-                continue
-            joints[index], covariance[index] = estimate.joints, estimate.covariance
-            activation[index] = estimate.activation
-        return Estimate(joints, covariance, activation)
+        return torch.where(tick.joints.isnan(), self.reference, tick.joints)
 
     def _state(self, joints: Tensor) -> RobotState:
         """With the objects that the robots hold."""
         return self.holding.state(self._skill.kinematics.state(joints))
-
-    def _cannot_follow(self, tick: _Tick, wanted: Tensor) -> bool:
-        """Whether a robot cannot be at its estimate, or is searched for already."""
-        if self._follower is None or self._skill.posture_search() is None:
-            return False
-        if self._search is None or self._search.active is None:
-            tick.following = self._follower.take(wanted, tick.seconds)
-        return tick.following is None
-
-    def _nearest(self, tick: _Tick, at: Tensor, estimate: Estimate, wanted: Tensor) -> Tensor:
-        """The nearest posture where an estimate, one linearised step, leads too far."""
-        assert self._follower is not None and self._position_bounds is not None
-        search = self._search or self._skill.posture_search()
-        assert search is not None
-        asked = ~self._follower.fits(wanted, tick.seconds) & wanted.isfinite().all(-1)
-        try:
-            joints, self._search = search.advance(
-                self._progress.time, at, self.holding.frames, estimate, self._position_bounds,
-                asked, self._state if self.holding.carries else None,
-            )  # fmt: skip
-        except TPGMMError:
-            if self._trust is None:
-                raise
-            return estimate.joints
-        return joints
 
     def _rounded(self, joints: Tensor, shift: Tensor | None) -> Tensor:
         """Wanted postures; where there are bounds, on a grid."""
         if shift is not None:
             joints = joints + shift
         joints = self._skill.kinematics.retract(joints)
-        if self._bounds is None:
+        if self._following.bounds is None:
             return joints
         rounded = (joints.detach() * GRID).round() / GRID
         return joints + (rounded - joints).detach() if joints.requires_grad else rounded
 
-    # Fading from where robots start
-
-    def _restart_fading(self, robots: Tensor) -> None:
-        self._fade_time = torch.where(robots, -1.0, self._fade_time)  # the gap is not known yet
-        self._fading = self._blend > 0
-
-    def _faded(self, estimate: Tensor, dt: Seconds) -> Tensor | None:
-        """The rest of the difference between where robots went on and the estimate."""
-        if not self._fading:
-            return None
-        fresh = self._fade_time < 0
-        if bool(fresh.any()):
-            gap = (self.reference - estimate).nan_to_num(0.0)
-            self._gap = torch.where(fresh.unsqueeze(-1), gap, self._gap)
-            if self.command is not None:
-                duration = fading_time(self._gap, self._blend)
-                self._fade_duration = torch.where(fresh, duration, self._fade_duration)
-        self._fade_time = torch.where(fresh, 0.0, self._fade_time + _each(dt, estimate))
-        left = 1 - minimum_jerk(self._fade_time / self._fade_duration)
-        self._fading = bool((left > 0).any())
-        return left.unsqueeze(-1) * self._gap
-
-    # Following
-
-    def _lead(self, tick: _Tick, estimate: Estimate, wanted: Tensor) -> Tensor | None:
-        """Postures to which waiting robots are led; None if none waits."""
-        if tick.waits is None or tick.measured is None or self._trust is None:
-            return None
-        measured, waits, lead = tick.measured, tick.waits, self._trust.lead
-        if bool(self._displaced.any()):
-            gap = (estimate.joints - measured).abs().nan_to_num(0.0).amax(-1)
-            self._displaced = self._displaced & ~(gap <= 2 * lead)
-        if bool((follow := self._waiting & ~waits).any()):
-            self._restart_fading(follow)  # from where they were led to
-        self._waiting = waits
-        if not bool(waits.any()):
-            return None
-        # whatever holds them is not fought, and joints go on together, as a held object needs
-        way = wanted - measured
-        size = way.abs().nan_to_num(0.0).amax(-1, keepdim=True)
-        most = way.new_full(waits.shape, lead)
-        most = torch.where(self.holding.busy(waits), HOLDING_LEAD * most, most).unsqueeze(-1)
-        step = way * (most / torch.maximum(size, most))
-        return torch.where(waits.unsqueeze(-1) & ~measured.isnan(), measured + step, wanted)
-
-    def _sent(
-        self, tick: _Tick, estimate: Estimate, wanted: Tensor, goal: Tensor | None = None
-    ) -> Command:
-        """The command that brings robots to the wanted postures, or to where they are led."""
-        before, self._wanted = self._wanted, wanted
-        to = wanted if goal is None else goal
-        lost = None
-        if self._bounds is None:
-            self._set_reference(tick, to)
-        elif self.command is not None:  # the first reference is where robots stand
-            lost = self._follow(tick, to, before)
-        # the clock compares with the estimate where a robot is led, or was displaced
-        self._target = self.reference
-        if goal is not None:
-            self._target = torch.where(self._waiting.unsqueeze(-1), wanted, self._target)
-        if self._trust is not None and bool(self._displaced.any()):
-            known = self._displaced.unsqueeze(-1) & estimate.joints.isfinite()
-            self._target = torch.where(known, estimate.joints, self._target)
-        codes, reasons = self._statuses(tick, lost)
-        self.command = Command(
-            self.reference,
-            self._velocity,
-            self.time,
-            estimate,
-            codes,
-            reasons,
-            self._impedance,
-            self._situation_novelty(),
-        )
-        return self.command
-
-    def _set_reference(self, tick: _Tick, to: Tensor) -> None:
-        """Without bounds, the wanted posture is the reference."""
-        last = self.reference
-        for still in (tick.halted, tick.late):
-            if still is not None:
-                to = torch.where(still.unsqueeze(-1), last, to)
-        if self.command is not None:
-            self._velocity = (to - last) / _column(tick.seconds, last)
-        self.reference = to
-
-    def _follow(self, tick: _Tick, to: Tensor, before: Tensor) -> Tensor | None:
-        """Within bounds; robots without a finite posture, which come to rest."""
-        assert self._bounds is not None
-        if tick.halted is not None:  # what is not finite brings a robot to rest
-            to = torch.where(tick.halted.unsqueeze(-1), torch.nan, to)
-        if self._follower is None:  # a gap to where the skill begins is no speed
-            fastest = self._bounds.velocity
-            moving = (to - before) / _column(tick.seconds, self.reference)
-            moving = moving.clamp(-fastest, fastest)
-            self._follower = Follower.at(self._bounds, self.reference, moving)
-        last, lost = self._follower, None
-        follower = tick.following
-        if follower is None or follower.reference is not to:
-            follower = last.advance(to, tick.seconds)
-            lost = ~to.isfinite().all(-1)
-        if tick.late is not None:
-            follower = follower.undone(tick.late, last)
-        self._follower = follower
-        self.reference, self._velocity = follower.reference, follower.velocity
-        return lost
-
-    # Status
-
-    def _statuses(
-        self, tick: _Tick, lost: Tensor | None
-    ) -> tuple[Tensor, dict[tuple[int, ...], str]]:
-        """Status of each robot, and why one is held."""
-        codes = torch.zeros_like(self._waiting, dtype=torch.int8)
-        reasons: dict[tuple[int, ...], str] = {}
-        if tick.ended is not None:
-            codes = torch.where(tick.ended, Status.FINISHED.code, codes)
-        held = ((lost, "the model has no finite answer here"), (tick.late, NOT_INCREASED))
-        for robots, reason in held:
-            if robots is not None and bool(robots.any()):
-                codes = torch.where(robots, Status.HOLDING.code, codes)
-                indices = map(tuple, np.argwhere(robots.numpy(force=True)).tolist())
-                reasons |= dict.fromkeys(indices, reason)
-        if tick.halted is not None and self._inputs is not None:
-            codes = torch.where(tick.halted, Status.HOLDING.code, codes)
-            reasons |= self._inputs.reasons(tick.halted.numpy(force=True))
-        return codes.to(torch.int8), reasons
-
-    def _refused(self, reason: str) -> Command:
-        """The last command, while nothing moves."""
-        assert self.command is not None
-        codes = torch.full_like(self.command.codes, Status.HOLDING.code)
-        robots = np.ndindex(*codes.shape)
-        self.command = replace(self.command, codes=codes, reasons=dict.fromkeys(robots, reason))
-        return self.command
-
-    def _situation_novelty(self) -> Callable[[], Tensor] | None:
-        """Novelty of where robots began and objects are, or were last free."""
+    def _novelty(self) -> Any:
+        """Computes the novelty of where robots began and objects are, or were last free."""
         summary = self._skill.summary
         if summary is None:
             return None
-        places = self.holding.frames, self._first_frames
-        return functools.partial(_novelty, summary, self._start, *places)
+        first, start = self._first_frames, self._start
+        known = {
+            n: f for n, f in first.items() if n in summary.frames and summary.frames[n].moves
+        }
+        frames = {**self.holding.frames, **known}
+        return functools.partial(_novelty, summary, start, frames)
 
 
-#: Why a robot is held whose time stood still.
-NOT_INCREASED = "time did not increase"
+#: Why a robot is held.
+NOT_INCREASED, NO_ANSWER = "time did not increase", "the model has no finite answer here"
+
+
+def _novelty(summary: Any, start: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+    """Novelty of each robot (...) of a batch of start postures."""
+    novelty = torch.as_tensor(summary.novelty(start, frames)).to(start)
+    return novelty.expand(start.shape[:-1])
+
+
+def _each(seconds: Seconds) -> float | Tensor:
+    """Durations of robots as a tensor."""
+    return torch.from_numpy(seconds) if isinstance(seconds, np.ndarray) else seconds
+
+
+def _rows(array: Array) -> Array:
+    """Robots of a batch in one dimension."""
+    return array.reshape(-1, array.shape[-1])
+
+
+def _converted(kinematics: Any, frames: Mapping[str, Frame]) -> dict[str, Frame]:
+    return {name: frame.to(kinematics.lower) for name, frame in frames.items()}
+
+
+def _span(skill: Skill, begin: float | None, end: float | None) -> tuple[float, float]:
+    begin = skill.begin if begin is None else begin
+    end = skill.end if end is None else end
+    if not -math.inf < begin < end < math.inf:
+        raise DataError(f"a skill ends after its beginning, got {begin!r} s to {end!r} s")
+    return begin, end
 
 
 def _motion_bounds(
@@ -694,52 +599,17 @@ def _motion_bounds(
     return skill.motion_bounds
 
 
-def _each(seconds: Seconds, like: Tensor | torch.dtype) -> float | Tensor:
-    """A tensor, if each robot has a duration of its own."""
-    return torch.as_tensor(seconds).to(like) if isinstance(seconds, np.ndarray) else seconds
-
-
-def _column(seconds: Seconds, like: Tensor) -> float | Tensor:
-    """Durations for the joints of each robot."""
-    each = _each(seconds, like)
-    return each.unsqueeze(-1) if isinstance(each, Tensor) else each
-
-
-def _durations(dt: float | Tensor) -> tuple[Seconds, Tensor | None]:
+def _durations(dt: Any) -> tuple[Seconds, Flags | None]:
     """Duration of a tick, of each robot or of all, and robots whose time did not increase."""
-    if not isinstance(dt, Tensor):
-        return dt, None
-    increased = (dt > 0) & dt.isfinite()
-    seconds = torch.where(increased, dt, INSTANT).double().numpy(force=True)
-    if not bool(increased.any()):
+    try:
+        given = dt.numpy(force=True) if isinstance(dt, Tensor) else dt
+        seconds = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
         return 0.0, None
-    if bool(increased.all()):
+    increased = (seconds > 0) & np.isfinite(seconds)
+    if not increased.any():
+        return 0.0, None
+    if increased.all():
         first = float(seconds.flat[0])
         return (first if (seconds == first).all() else seconds), None
-    return seconds, ~increased
-
-
-def _novelty(
-    summary: TrainingSummary,
-    start: Tensor,
-    frames: Mapping[str, Frame],
-    at_first: Mapping[str, Frame],
-) -> Tensor:
-    """Novelty of each robot (...) of a batch of start postures."""
-    moving = {
-        name: at_first[name]
-        for name in at_first
-        if name in summary.frames and summary.frames[name].moves
-    }
-    frames = {**frames, **moving}
-    return torch.as_tensor(summary.novelty(start, frames)).to(start).expand(start.shape[:-1])
-
-
-def _choose(where: Tensor, one: Estimate, other: Estimate) -> Estimate:
-    """One estimate for some robots (...), the other for the rest."""
-    mask = where.unsqueeze(-1)
-    return Estimate(
-        torch.where(mask, one.joints, other.joints),
-        torch.where(mask.unsqueeze(-1), one.covariance, other.covariance),
-        torch.where(mask, one.activation, other.activation),
-    )
+    return np.where(increased, seconds, INSTANT), ~increased.reshape(-1)

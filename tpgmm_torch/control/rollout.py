@@ -12,7 +12,6 @@ import torch
 from sklearn.utils import check_random_state
 
 from tpgmm_torch import gaussians
-from tpgmm_torch.control.clocks import EvenClock
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.holding import Holding
 from tpgmm_torch.control.situations import completed_situations, with_novelty
@@ -141,7 +140,7 @@ def _run_together(
         skill,
         joints,
         poses,
-        clock=EvenClock(),
+        clock="even",
         trust=None,
         smoothing=None,
         bounds=bounds,

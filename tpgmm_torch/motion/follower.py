@@ -88,25 +88,6 @@ class Follower:
             speed = _checked(bounds, velocity, "velocity").expand_as(start)
         return cls(bounds, start, Moment.moving(as_array(start), as_array(speed)))
 
-    def put(self, joints: Tensor, reference: Tensor) -> Self:
-        """The same follower, with some joints at rest somewhere else.
-
-        Parameters
-        ----------
-        joints : Tensor of bool, of shape (..., n_joints)
-            Which ones.
-        reference : Tensor of shape (..., n_joints)
-            Where they are then.
-        """
-        place = as_array(reference)
-        rest = Moment.moving(place, np.zeros_like(place))
-        moment = rest.choose(joints.numpy(force=True), self.moment)
-        return replace(
-            self,
-            reference=torch.where(joints, reference, self.reference),
-            moment=moment._replace(dt=self.moment.dt),
-        )
-
     def undone(self, robots: Tensor, before: Self) -> Self:
         """The same follower, with some robots as they were.
 
@@ -202,8 +183,8 @@ class Moment(NamedTuple):
         The posture that was wanted, and the velocity that it moves with.
     behind : ndarray of bool
         Joints that have not reached it.
-    dt : float or ndarray of shape (..., 1)
-        Duration of the tick [s]; 0 at the start.
+    dt, dt_before : float or ndarray of shape (..., 1)
+        Duration of the tick and of the one before [s]; 0 at the start.
     """
 
     motion: Array
@@ -213,13 +194,14 @@ class Moment(NamedTuple):
     drift: Array
     behind: Mask
     dt: Seconds
+    dt_before: Seconds
 
     @classmethod
     def moving(cls, position: Array, velocity: Array) -> Self:
         """With a constant velocity."""
         zero = np.zeros_like(position)
         motion = np.stack((position, velocity, zero))
-        return cls(motion, velocity, zero, position, velocity, zero.astype(bool), 0.0)
+        return cls(motion, velocity, zero, position, velocity, zero.astype(bool), 0.0, 0.0)
 
     def choose(self, where: Mask, other: Self) -> Self:
         """For some joints, or robots (..., 1), this moment, and another for the rest."""
@@ -232,7 +214,8 @@ class Moment(NamedTuple):
         drift = slope
         if self.behind.any():
             drift = (position - self.wanted) / dt
-        return type(self)(motion, slope, bend, position, drift, np.zeros_like(self.behind), dt)
+        none, before = np.zeros_like(self.behind), self._last_dt(dt)
+        return type(self)(motion, slope, bend, position, drift, none, dt, before)
 
     def _differences(self, position: Array, dt: Seconds) -> tuple[Array, Array]:
         slope = (position - self.motion[0]) / dt
@@ -247,7 +230,9 @@ class Moment(NamedTuple):
         limits = bounds.arrays
         position, velocity, acceleration = following.motion
         size = np.abs(acceleration)
-        between = (following.dt + 2 * self._last_dt(following.dt)) / 3
+        last = following.dt_before
+        earlier = np.where(np.asarray(self.dt_before) > 0, self.dt_before, last)
+        between = (following.dt + last + earlier) / 3
         fits: Mask = size <= limits.acceleration
         fits &= np.abs(acceleration - self.bend) / between <= limits.jerk
         if self.behind.any():
@@ -293,7 +278,9 @@ class Moment(NamedTuple):
         motion, drifts = exact.motion.copy(), exact.drift.copy()
         motion[:, asked], drifts[asked] = part, drift
         differences = self._differences(motion[0], exact.dt)
-        return type(self)(motion, *differences, exact.wanted, drifts, asked, exact.dt)
+        return exact._replace(
+            motion=motion, slope=differences[0], bend=differences[1], drift=drifts, behind=asked
+        )
 
     def _stops(self, motion: Array, asked: Mask, bounds: MotionBounds) -> Mask:
         """Whether motions (3, N), one tick later, can be stopped within speed and position.

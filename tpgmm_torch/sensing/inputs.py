@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.sensing.pose_filter import OneEuro, PoseFilter
 from tpgmm_torch.sensing.trust import (
+    DEAD,
     IMPOSSIBLE,
     JUMPED,
     LOST,
@@ -36,6 +37,7 @@ FAULTS = {
     IMPOSSIBLE: "cannot be (beyond the joints' limits, or no unit quaternion)",
     JUMPED: "has jumped further than it can have moved",
     OTHER_UNIT: "is in another unit than before (degrees for radians?)",
+    DEAD: "is 0 in all joints at once",
 }
 
 
@@ -56,6 +58,9 @@ class Inputs:
     trust : Trust
     smoothing : OneEuro, optional
         Filter of poses that come at each step; none by default.
+    ignored : ndarray of bool, of shape (n_joints,), optional
+        Joints of which readings tell nothing, as of grippers, which objects keep from their
+        references.
     joints : JointReading, optional
         None as long as nothing was measured.
     poses : dict of str to PoseReading
@@ -71,6 +76,7 @@ class Inputs:
     frames: dict[str, Frame]
     trust: Trust
     smoothing: OneEuro | None = None
+    ignored: Mask | None = None
     joints: JointReading | None = None
     poses: dict[str, PoseReading] = field(default_factory=dict)
     filters: dict[str, PoseFilter] = field(default_factory=dict)
@@ -100,34 +106,33 @@ class Inputs:
         ------
         ShapeError
             If an array does not have the shape of the robots.
-        UnknownNameError
-            If there is an age of something else.
         """
-        seen = frames or {}
-        reading = self.joints
-        if joints is None and reading is None and not (seen or ages or self.poses or self.ages):
+        seen, old = _mapping(frames), _mapping(ages)
+        quiet = joints is None and self.joints is None
+        if quiet and not (seen or old or self.poses or self.ages):
             return self
-        if joints is not None:
-            measured = self._array(joints, "joints", self.kinematics.n_joints)
-            reading = (reading or self._first_joints()).update(measured, dt)
-        elif reading is not None:
-            reading = reading.update(None, dt)
         poses, filters, known = dict(self.poses), dict(self.filters), dict(self.frames)
         for name in {*poses, *seen} & known.keys():  # operators refer to no other object
             pose = seen.get(name)
             if name in poses or pose is not known[name]:  # a pose of the start is no stream
                 poses[name], filters[name], known[name] = self._pose(name, pose, dt)
-        for name in ages or {}:
-            if name != "joints" and name not in known:
-                raise UnknownNameError("age of", name, "the inputs", ["joints", *known])
         return replace(
             self,
-            joints=reading,
+            joints=None if quiet else self._joints(joints, dt),
             poses=poses,
             filters=filters,
             frames=known,
-            ages={name: np.asarray(age, np.float64) for name, age in (ages or {}).items()},
+            ages={name: _number(age) for name, age in old.items()},
         )
+
+    def _joints(self, joints: Any, dt: float | Floats) -> JointReading:
+        """The joints after a tick."""
+        measured = None
+        if joints is not None:
+            measured = self._array(joints, "joints", self.kinematics.n_joints)
+        if measured is not None and self.ignored is not None:
+            measured = np.where(self.ignored, 0.0, measured)
+        return (self.joints or self._first_joints()).update(measured, dt)
 
     @property
     def measured(self) -> Tensor | None:
@@ -138,20 +143,39 @@ class Inputs:
         return torch.from_numpy(value).to(self.kinematics.lower)
 
     @property
+    def jumped(self) -> Mask:
+        """Robots (...) whose joints have jumped to where they are now."""
+        batch = tuple(self.start.shape[:-1])
+        return np.zeros(batch, bool) if self.joints is None else self.joints.jumped
+
+    @property
+    def frozen(self) -> Mask:
+        """Robots (...) whose joints have been the same to the last bit for too long."""
+        if self.joints is None:
+            return np.zeros(tuple(self.start.shape[:-1]), bool)
+        return self.joints.same_for > self.trust.joint_timeout
+
+    @property
     def shares(self) -> dict[str, Tensor]:
         """Share of the last reading in an object's pose (...), of those that filters delay."""
         shares = {name: np.asarray(smooth.share) for name, smooth in self.filters.items()}
         like = self.kinematics.lower
         return {n: torch.from_numpy(s).to(like) for n, s in shares.items() if (s < 1).any()}
 
-    def untrusted(self) -> Mask | None:
-        """Robots (...) without an accepted input for too long; None if there are none."""
-        held = np.zeros(tuple(self.start.shape[:-1]), dtype=bool)
+    def untrusted(self, held: Mapping[str, Mask]) -> Mask:
+        """Robots (...) without an accepted input for too long.
+
+        Parameters
+        ----------
+        held : mapping of str to ndarray of bool, of shape (...)
+            Robots that hold an object, and so know where it is.
+        """
+        old = np.zeros(tuple(self.start.shape[:-1]), dtype=bool)
         for name, reading in self._readings().items():
-            held |= reading.age > self._timeout(name)
+            old |= (reading.age > self._timeout(name)) & ~held.get(name, np.False_)
         for name, age in self.ages.items():
-            held |= ~(age <= self._timeout(name))
-        return held if held.any() else None
+            old |= ~(age <= self._timeout(name)) & ~held.get(name, np.False_)
+        return old
 
     def reasons(self, robots: Mask) -> dict[tuple[int, ...], str]:
         """Why these robots are held, in words, by their index."""
@@ -180,10 +204,14 @@ class Inputs:
         return joints | self.poses
 
     def _first_joints(self) -> JointReading:
+        start = _numpy(self.start)
+        ignored = np.zeros(start.shape[-1], bool) if self.ignored is None else self.ignored
+        ends = {"lower": -np.inf, "upper": np.inf, "velocity": np.inf}
         limits = {
-            n: _numpy(getattr(self.kinematics, n)) for n in ("lower", "upper", "velocity")
+            name: np.where(ignored, end, _numpy(getattr(self.kinematics, name)))
+            for name, end in ends.items()
         }
-        return JointReading.first(self.trust, _numpy(self.start).copy(), **limits)
+        return JointReading.first(self.trust, np.where(ignored, 0.0, start), **limits)
 
     def _pose(
         self, name: str, seen: Any, dt: float | Floats
@@ -193,6 +221,7 @@ class Inputs:
             reading, smooth = self.poses[name], self.filters[name]
         else:
             start = self._pose_array(self.frames[name], name)
+            assert start is not None
             reading = PoseReading.first(self.trust, start)
             smooth = PoseFilter.first(self.smoothing or OneEuro(cutoff=np.inf), start)
         reading = reading.update(pose, dt)
@@ -202,13 +231,18 @@ class Inputs:
         values = torch.from_numpy(smoother.pose).to(self.kinematics.lower)
         return reading, smoother, Frame._from(values[..., :3], values[..., 3:])
 
-    def _pose_array(self, pose: Any, name: str) -> Floats:
+    def _pose_array(self, pose: Any, name: str) -> Floats | None:
         if isinstance(pose, Frame):
             pose = np.concatenate((_numpy(pose.position), _numpy(pose.orientation)), -1)
         return self._array(pose, f"frame {name!r}", 7)
 
-    def _array(self, values: Any, what: str, size: int) -> Floats:
-        array = np.asarray(_numpy(values) if isinstance(values, Tensor) else values, np.float64)
+    def _array(self, values: Any, what: str, size: int) -> Floats | None:
+        """An array of the robots' shape; None if these are no numbers."""
+        try:
+            given = _numpy(values) if isinstance(values, Tensor) else values
+            array = np.asarray(given, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            return None
         batch = tuple(self.start.shape[:-1])
         try:
             if array.shape[-1:] == (size,):  # one value is not broadcast over the coordinates
@@ -219,6 +253,19 @@ class Inputs:
             f"the skill began with robots of shape {batch}, {what} now has shape "
             f"{array.shape}, not {(*batch, size)}: begin it again for other robots"
         )
+
+
+def _mapping(values: Any) -> Mapping[str, Any]:
+    """What was given by name; nothing if it was not."""
+    return values if isinstance(values, Mapping) else {}
+
+
+def _number(value: Any) -> Floats:
+    """An age; not a number if it is none."""
+    try:
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        return np.asarray(np.nan)
 
 
 def _numpy(values: Tensor) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from tpgmm_torch.exceptions import DataError
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
 
 #: Whether a reading was accepted, and why not.
-ACCEPTED, LOST, IMPOSSIBLE, JUMPED, OTHER_UNIT = range(5)
+ACCEPTED, LOST, IMPOSSIBLE, JUMPED, OTHER_UNIT, DEAD = range(6)
 
 #: Speed that no joint of a robot without limits of speed exceeds [rad/s].
 UNKNOWN_SPEED = 10.0
@@ -36,9 +36,10 @@ class Trust:
     """Rules of which readings a controller accepts, and for how long it goes on without.
 
     A reading that is not finite is lost; one beyond the limits is impossible; one too far from
-    the last one has jumped. None of them is used. A jump is accepted once the readings have
-    stayed there for ``settling_time``; a jump to the last reading in degrees never is. A robot
-    without an accepted reading for longer than a timeout is held until there is one.
+    the last one has jumped. None of them is used. A jump is accepted once readings that live,
+    which differ in the last bit, have stayed there for ``settling_time``; a jump to the last
+    reading in degrees, or of all joints to 0, never is. A robot without an accepted reading for
+    longer than a timeout is held until there is one.
 
     Parameters
     ----------
@@ -52,24 +53,13 @@ class Trust:
         How far measured joints may be beyond their limits of position [rad or m].
     joint_jump : float
         From one reading to the next, on top of what 1.5 times the limit of speed allows [rad].
+    largest_jump : float
+        What offsets and pushes of a joint do not exceed [rad or m]: readings that have jumped
+        further are accepted where the skill explains them, or when they are back.
     frame_jump : float
-        The same of an object's position, on top of 3 m/s [m].
+        The same as ``joint_jump`` of an object's position, on top of 3 m/s [m].
     turn_jump : float
         The same of its orientation, on top of 10 rad/s [rad].
-    largest_gap : float
-        Of a robot that stands further than this from its reference, in one joint, the reference
-        comes to where it stands, and goes on from there [rad or m]: against whatever moved it
-        away it would push with all force otherwise.
-    largest_push : float
-        Of a robot that was moved further than this from its reference, faster than the
-        reference moves itself, the same [rad or m].
-    lag : float
-        How late a servo may be: on top of that, the way of the reference in this time [s].
-    lead : float
-        How far the reference of a robot that is waited for is ahead of it [rad or m]; a third
-        of that if it holds an object, which it would lose with a jerk when it is let go.
-    longest_step : float
-        A loop that stood for longer goes on as if it had stood for that long [s].
 
     Raises
     ------
@@ -79,16 +69,12 @@ class Trust:
 
     joint_timeout: float = 0.2
     frame_timeout: float = 1.0
-    settling_time: float = 0.1
+    settling_time: float = 0.08
     limit_margin: float = 0.5
     joint_jump: float = 0.1
+    largest_jump: float = 0.5
     frame_jump: float = 0.06
     turn_jump: float = 0.6
-    largest_gap: float = 0.3
-    largest_push: float = 0.06
-    lag: float = 0.15
-    lead: float = 0.015
-    longest_step: float = 0.5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -113,6 +99,16 @@ class Reading:
         Where the signal jumped to, NaN where it did not.
     rival_age : ndarray of shape (...)
         For how long it has stayed there [s].
+    rival_lives : bool ndarray of shape (...)
+        Whether it has changed there.
+    lost_for : ndarray of shape (...)
+        For how long there has been none since the last accepted one [s].
+    same_for : ndarray of shape (...)
+        For how long it has been the same to the last bit [s].
+    jumped : bool ndarray of shape (...)
+        Whether the last one was accepted although it had jumped.
+    pending : bool ndarray of shape (...)
+        Whether the last one would be, had it not jumped so far; not at every tick.
     """
 
     trust: Trust
@@ -121,13 +117,32 @@ class Reading:
     fault: NDArray[np.int8]
     rival: Floats
     rival_age: Floats
+    rival_lives: Mask
+    lost_for: Floats
+    same_for: Floats
+    jumped: Mask
+    pending: Mask
 
     @classmethod
     def first(cls, trust: Trust, value: Floats, **limits: Any) -> Self:
         """An accepted value (..., d); ``limits`` are further fields of the class."""
         zero = np.zeros(value.shape[:-1])
         rival = np.full_like(value, np.nan)
-        return cls(trust, value, zero, zero.astype(np.int8), rival, zero, **limits)
+        none = zero.astype(np.int8)
+        return cls(
+            trust,
+            value,
+            zero,
+            none,
+            rival,
+            zero,
+            zero > 0,
+            zero,
+            zero,
+            zero > 0,
+            zero > 0,
+            **limits,
+        )
 
     @property
     def accepted(self) -> Mask:
@@ -146,43 +161,69 @@ class Reading:
         """
         if seen is None:
             seen = np.full_like(self.value, np.nan)
-        elif self.accepted.all():  # an ordinary tick
+        same = (seen == self.value).all(-1)
+        same_for = np.where(same, self.same_for + dt, 0.0)
+        if self.accepted.all():  # an ordinary tick
             change = np.abs(seen - self.value)
-            if (change <= self._small_change()).all() and self._possible(seen).all():
-                return replace(self, value=seen) if change.any() else self
-        finite = np.isfinite(seen).all(-1)
+            if (change <= self._small_change()).all() and not self._faults(seen).any():
+                none = np.zeros_like(self.jumped)
+                return replace(self, value=seen, same_for=same_for, jumped=none, pending=none)
         with np.errstate(invalid="ignore"):
-            possible = finite & self._possible(seen)
-            elapsed = dt + np.minimum(self.age, self.trust.settling_time)
-            near = possible & self._near(seen, self.value, elapsed)
-            scaled = possible & ~near & self._other_unit(seen)
-            jumped = possible & ~near & ~scaled
-            stays = jumped & self._near(seen, self.rival, dt)
+            fault = self._faults(seen)
+            known = np.maximum(np.minimum(self.age, self.trust.settling_time), self.lost_for)
+            elapsed = dt + known
+            near = (fault == ACCEPTED) & self._near(seen, self.value, elapsed)
+            far = (fault == ACCEPTED) & ~near
+            stays = far & self._near(seen, self.rival, dt)
+            lives = stays & (self.rival_lives | self._lives(seen))
         rival_age = np.where(stays, self.rival_age + dt, 0.0)
-        accepted = near | (stays & (rival_age >= self.trust.settling_time))
-        cases = [accepted, ~finite, ~possible, scaled]
-        fault = np.select(cases, [ACCEPTED, LOST, IMPOSSIBLE, OTHER_UNIT], JUMPED)
+        each = 2 * self.trust.settling_time
+        settled = stays & (rival_age >= self.trust.settling_time)
+        jumped = settled & lives & self._small(seen)
+        accepted = near | jumped
         return replace(
             self,
             value=np.where(accepted[..., None], seen, self.value),
             age=np.where(accepted, 0.0, self.age + dt),
-            fault=fault.astype(np.int8),
-            rival=np.where((jumped & ~accepted)[..., None], seen, np.nan),
+            fault=np.where(far & ~accepted, JUMPED, fault).astype(np.int8),
+            rival=np.where((far & ~accepted)[..., None], seen, np.nan),
             rival_age=rival_age,
+            rival_lives=lives,
+            lost_for=np.where(accepted, 0.0, self.lost_for + dt * (fault == LOST)),
+            same_for=same_for,
+            jumped=jumped,
+            pending=settled & ~jumped & (rival_age // each > self.rival_age // each),
         )
+
+    def accept(self, robots: Mask) -> Self:
+        """The readings to which the signal of some robots has jumped."""
+        return replace(
+            self,
+            value=np.where(robots[..., None], self.rival, self.value),
+            age=np.where(robots, 0.0, self.age),
+            fault=np.where(robots, ACCEPTED, self.fault).astype(np.int8),
+            jumped=self.jumped | robots,
+        )
+
+    def _lives(self, seen: Floats) -> Mask:
+        """Readings after a jump that count for its being over."""
+        return np.ones(seen.shape[:-1], dtype=bool)
+
+    def _small(self, seen: Floats) -> Mask:
+        """Jumps that are accepted wherever they lead."""
+        return np.ones(seen.shape[:-1], dtype=bool)
 
     def _small_change(self) -> float:
         """A change of each coordinate that is accepted whatever the time step."""
         raise NotImplementedError
 
-    def _possible(self, seen: Floats) -> Mask:
+    def _faults(self, seen: Floats) -> NDArray[np.int8]:
+        """Why readings cannot be right, whatever the time step."""
         raise NotImplementedError
 
     def _near(self, seen: Floats, other: Floats, elapsed: float | Floats) -> Mask:
+        """Readings that are as near to others as the time allows."""
         raise NotImplementedError
-
-    def _other_unit(self, seen: Floats) -> Mask:
-        return np.zeros(seen.shape[:-1], dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,26 +242,48 @@ class JointReading(Reading):
     upper: Floats
     velocity: Floats
 
+    def _lives(self, seen: Floats) -> Mask:
+        return np.asarray((seen != self.rival).any(-1))
+
+    def _small(self, seen: Floats) -> Mask:
+        return np.asarray(np.abs(seen - self.value).max(-1) <= self.trust.largest_jump)
+
     def _small_change(self) -> float:
         return self.trust.joint_jump
 
-    def _possible(self, seen: Floats) -> Mask:
+    def _faults(self, seen: Floats) -> NDArray[np.int8]:
         margin = self.trust.limit_margin
-        inside = (seen >= self.lower - margin) & (seen <= self.upper + margin)
-        return np.all(inside, axis=-1)
+        with np.errstate(invalid="ignore"):
+            inside = (seen >= self.lower - margin) & (seen <= self.upper + margin)
+        dead = (seen == 0).all(-1) & (np.abs(self.value).max(-1) > margin / 10)
+        dead &= seen.shape[-1] > 1
+        fine = inside.all(-1) & ~dead
+        if fine.all() and (np.abs(seen - self.value) <= self.trust.joint_jump).all():
+            return np.zeros(fine.shape, np.int8)
+        cases = [~np.isfinite(seen).all(-1), ~inside.all(-1), dead, self._other_unit(seen)]
+        return np.select(cases, [LOST, IMPOSSIBLE, DEAD, OTHER_UNIT], ACCEPTED).astype(np.int8)
+
+    @property
+    def _speed(self) -> Floats:
+        """What no joint exceeds (n_joints,) [rad/s]."""
+        return SPEED_MARGIN * np.minimum(self.velocity, UNKNOWN_SPEED)
 
     def _near(self, seen: Floats, other: Floats, elapsed: float | Floats) -> Mask:
-        speed = SPEED_MARGIN * np.minimum(self.velocity, UNKNOWN_SPEED)
-        reach = self.trust.joint_jump + speed * np.asarray(elapsed)[..., None]
+        reach = self.trust.joint_jump + self._speed * np.asarray(elapsed)[..., None]
         return (np.abs(seen - other) <= reach).all(-1)
 
     def _other_unit(self, seen: Floats) -> Mask:
         """Whether it is the last value in degrees, or that was and it is in radians."""
         size = np.linalg.norm(self.value, axis=-1) + self.trust.joint_jump
         degrees = math.degrees(1.0)
-        off = np.linalg.norm(seen - degrees * self.value, axis=-1)
+        # it has moved on meanwhile
+        room = 0.1 * size + np.minimum(
+            np.linalg.norm(self._speed) * self.age, self.trust.largest_jump
+        )
+        off = np.linalg.norm(seen / degrees - self.value, axis=-1)
         back = np.linalg.norm(degrees * seen - self.value, axis=-1)
-        return (off < 0.1 * degrees * size) | (back < 0.1 * size)
+        far = (np.abs(seen - self.value) > self.trust.joint_jump).any(-1)
+        return far & ((off < 0.1 * np.linalg.norm(self.value, axis=-1)) | (back < room))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,9 +293,11 @@ class PoseReading(Reading):
     def _small_change(self) -> float:
         return 0.5 * min(self.trust.frame_jump, self.trust.turn_jump / 2)
 
-    def _possible(self, seen: Floats) -> Mask:
+    def _faults(self, seen: Floats) -> NDArray[np.int8]:
         turn = seen[..., 3:]
-        return np.abs(np.einsum("...i,...i", turn, turn) - 1) < 2e-2
+        unit = np.abs(np.einsum("...i,...i", turn, turn) - 1) < 2e-2
+        cases = [~np.isfinite(seen).all(-1), ~unit]
+        return np.select(cases, [LOST, IMPOSSIBLE], ACCEPTED).astype(np.int8)
 
     def _near(self, seen: Floats, other: Floats, elapsed: float | Floats) -> Mask:
         elapsed = np.asarray(elapsed)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol, Self
 
 import torch
@@ -18,39 +18,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.posture import PostureSearch
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
-__all__ = ["CompositeSkill", "Observation", "Skill"]
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """Measurements of a batch of robots at one tick.
-
-    Parameters
-    ----------
-    joints : Tensor of shape (..., n_joints), optional
-        Measured joints [rad or m]; None if nothing was measured. NaN stands for a coordinate
-        without a sensor.
-    reference : Tensor of shape (..., n_joints)
-        The last reference [rad or m].
-    velocity : Tensor of shape (..., n_joints), optional
-        Of the reference [rad/s or m/s].
-    frames : mapping of str to Frame
-        Present poses of the objects; of a held one, its pose when it was last free.
-    estimate : Estimate, optional
-        What the reference was made from.
-    attach : callable, optional
-        Adds the objects that robots hold to their state: :meth:`Holding.state`.
-    pushed : Tensor of bool of shape (...), optional
-        Robots that were displaced, faster than their references moved.
-    """
-
-    joints: Tensor | None
-    reference: Tensor
-    velocity: Tensor | None
-    frames: Mapping[str, Frame]
-    estimate: Estimate | None = None
-    attach: Callable[[RobotState], RobotState] | None = None
-    pushed: Tensor | None = None
+__all__ = ["CompositeSkill", "Skill"]
 
 
 class Skill(Protocol):

@@ -127,7 +127,7 @@ def reach(plan: Plan) -> Iterator[tuple[str, Work]]:
         model = example.learned()
         there = example.outside(bottles, 0, 0.5)
         ticks = round((example.GRASP + 4.0) / example.DT)
-        paths = example.played(model, there, example.UpTo(), ticks)
+        paths = example.played(model, there, ticks, True)
         found = {f"error:{k}": [v] for k, v in example.calm(model, paths).items()}
         here, least = example.distances(model, there, paths[-1], starts, 25)
         far = least > example.REACHED

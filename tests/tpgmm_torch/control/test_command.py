@@ -9,7 +9,7 @@ from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance, Stiffness
 from tpgmm_torch.regression.estimate import Estimate
 
-WORDS = ["running", "waiting", "holding", "finished"]
+WORDS = ["running", "waiting", "displaced", "holding", "finished"]
 
 
 def command(*batch: int, codes=None, **options) -> Command:
@@ -29,7 +29,7 @@ def test_a_single_robot_has_a_status_in_words():
 
 
 def test_each_robot_of_a_batch_has_its_own_status_and_reason():
-    sent = command(2, 2, codes=[[0, 2], [3, 0]], reasons={(0, 1): "frame 'cup' is NaN"})
+    sent = command(2, 2, codes=[[0, 3], [4, 0]], reasons={(0, 1): "frame 'cup' is NaN"})
     assert sent.status == [["running", "holding"], ["finished", "running"]]
     assert sent.reason((0, 1)) == "frame 'cup' is NaN"
     assert sent.reason((1, 1)) == ""

@@ -68,14 +68,38 @@ def test_what_cannot_be_is_not_used(seen, fault):
 
 
 def test_a_jump_is_accepted_once_it_stays():
-    reading, there = joints(), START + np.array([0.9, 0.6])
+    reading, there = joints(), START + np.array([0.3, 0.45])
     for k in range(20):
         reading = reading.update(there + 0.001 * k, DT)
         # the first one begins the time for which it stays
         settled = k * DT >= TRUST.settling_time - 1e-9
         assert bool(reading.accepted) == settled
+        assert bool(reading.jumped) == (settled and (k - 1) * DT < TRUST.settling_time - 1e-9)
     assert reading.age == 0
     assert np.abs(reading.value - there).max() < 0.02
+
+
+@pytest.mark.parametrize("there", [[0.0, 0.0], START + 0.4, START + np.array([1.2, 0.6])])
+def test_dead_frozen_and_far_readings_are_not_accepted_because_they_last(there):
+    reading, pending = joints(), 0
+    moves = np.array([1e-6, 0.0]) * (np.abs(there - START).max() > 1)
+    for k in range(200):
+        reading = reading.update(np.asarray(there) + k * moves, DT)
+        assert not reading.accepted
+        pending += int(reading.pending)
+    assert reading.age == pytest.approx(200 * DT)
+    if reading.fault == JUMPED:  # whoever knows that it may be there is asked now and then
+        assert pending == pytest.approx(200 * DT / (2 * TRUST.settling_time), abs=2)
+        assert reading.accept(np.asarray(True)).value.tolist() == reading.rival.tolist()
+    assert reading.update(START, DT).accepted
+
+
+def test_what_was_lost_for_long_may_be_elsewhere():
+    reading, there = joints(), START + np.array([0.7, 0.6])
+    assert not reading.update(there, DT).accepted
+    for _ in range(50):
+        reading = reading.update(None, DT)
+    assert reading.update(there, DT).accepted
 
 
 def test_a_reading_that_jumps_about_is_never_accepted():

@@ -1,12 +1,16 @@
-"""Finding holds that were not given: objects that move along with a link."""
+"""Stage *hold*: objects that robots hold, by the skill, as it is given, and as it is seen.
+
+Holds that were not given are found: objects that move along with a link.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,8 +25,10 @@ from tpgmm_torch.control.holding import (
 )
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.sensing.inputs import Inputs
+from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["HoldWatch", "Rest"]
+__all__ = ["HoldWatch", "Holds", "Rest"]
 
 #: Distance [m], angle [rad] and time [s] after which an object is lost by its link.
 LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
@@ -210,3 +216,83 @@ class HoldWatch:
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
         since = rest.since.masked_fill(due, 0.0)
         return replace(rest, pose=pose, joints=stood, away=away, since=since), holding
+
+
+@dataclass(frozen=True, eq=False)
+class Holds:
+    """The objects of a batch of robots, and where they were last free; immutable.
+
+    Parameters
+    ----------
+    holding : Holding
+    watch : HoldWatch
+        Finds holds that nobody gave.
+    first : mapping of str to float
+        Start of the first hold of each object in the skill [s].
+    given : frozenset of str
+        Objects whose holds were given at run time.
+    """
+
+    holding: Holding
+    watch: HoldWatch
+    first: Mapping[str, float]
+    given: frozenset[str] = frozenset()
+
+    @classmethod
+    def start(cls, skill: Skill, frames: Mapping[str, Frame]) -> Self:
+        """Before anything is held, with poses of all objects."""
+        holding = Holding.start(skill.kinematics, skill.carried_names, skill.holds, frames)
+        first: dict[str, float] = {}
+        for hold in holding.holds:
+            first[hold.frame] = min(hold.begin, first.get(hold.frame, math.inf))
+        return cls(holding, HoldWatch(skill.kinematics), first)
+
+    def advance(
+        self,
+        time: Tensor,
+        joints: Tensor,
+        frames: Mapping[str, Frame] | None,
+        holds: Mapping[str, str | None] | None,
+        dt: float | Tensor,
+        inputs: Inputs | None,
+    ) -> Self:
+        """The next tick.
+
+        Parameters
+        ----------
+        time : Tensor of shape () or (...)
+            In the skill [s].
+        joints : Tensor of shape (..., n_joints)
+            Measured postures.
+        frames : mapping of str to Frame, optional
+            Objects that are seen now.
+        holds : mapping of str to str or None, optional
+            Links that hold objects from now on, None if they are free from now on.
+        dt : float or Tensor of shape (...)
+            Since the last tick [s].
+        inputs : Inputs, optional
+            Which objects are seen at each tick, and how late.
+        """
+        given, watch, holding = self.given.union(holds or ()), self.watch, self.holding
+        shares: Mapping[str, Tensor] = {}
+        if inputs is not None:
+            shares = inputs.shares
+            if inputs.poses and not holds:
+                now = time.expand(joints.shape[:-1])
+                told = self.first.keys() & given
+                watch, holding, frames = watch.update(
+                    inputs.poses.keys() - told, inputs.frames, joints, holding, dt,
+                    {name: now < begin for name, begin in self.first.items()},
+                )  # fmt: skip
+        holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
+        return replace(self, holding=holding, watch=watch, given=given)
+
+    def known(self, like: Tensor) -> dict[str, Any]:
+        """For which robots (...) the hand knows where each object is."""
+        one, free = like[..., 0], self.holding.free
+        return {n: np.asarray(~free(n, one).numpy(force=True)) for n in self.holding.held}
+
+    def busy(self, like: Tensor) -> Any:
+        """Robots (B,) that hold something."""
+        busy = self.holding.busy(torch.zeros(like.shape[:-1]))
+        return busy.numpy(force=True).reshape(-1)
