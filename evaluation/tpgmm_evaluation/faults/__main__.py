@@ -1,0 +1,137 @@
+"""Run a controller on random servos with random faults.
+
+    python -m tpgmm_evaluation.faults --half development --runs 100
+    python -m tpgmm_evaluation.faults --half development --run 17
+
+The first prints a table with a row for each kind of fault, and the seeds of the worst runs of
+each measure (:func:`~tpgmm_evaluation.faults.measures.measure`); the second one run, every
+tenth of a second, with references, readings and joints. The run of a seed depends on
+``--half``, ``--rates`` and ``--robots``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import batched, chain
+from multiprocessing import get_context
+
+import numpy as np
+import torch
+
+from tpgmm_evaluation.faults.drawing import HALVES, Run
+from tpgmm_evaluation.faults.measures import false_status, measure
+from tpgmm_evaluation.faults.runs import simulate
+from tpgmm_evaluation.faults.skills import ROBOTS
+
+__all__ = ["main", "measured"]
+
+#: Robots whose servos are simulated together.
+TOGETHER = 16
+
+
+def _most(values: Sequence[float]) -> float:
+    return max((value for value in values if not np.isnan(value)), default=np.nan)
+
+
+#: What is printed of a measure of several runs, and what of one run counts as bad.
+COLUMNS: Mapping[str, tuple[Callable[..., float], float]] = {
+    "position": (np.sum, 0),
+    "speed": (np.sum, 0),
+    "acceleration": (np.sum, 0),
+    "jerk": (np.sum, 0),
+    "step": (np.max, np.inf),
+    "infinite": (np.sum, 0),
+    "raised": (np.sum, 0),
+    "false": (np.sum, 0),
+    "open": (np.sum, 0),
+    "late": (_most, 1),
+    "gap": (_most, 0.05),
+    "runaway": (np.max, 0.05),
+}
+Measures = Mapping[str, float]
+
+
+def measured(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
+    """Measures of runs."""
+    groups = defaultdict(list)
+    for run in runs:
+        groups[run.robot, run.rate].append(run)
+    parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
+    if workers == 1:
+        return list(chain.from_iterable(map(_measured, parts)))
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        return list(chain.from_iterable(pool.map(_measured, parts)))
+
+
+def _measured(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
+    torch.set_num_threads(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return [(log.run, measure(log)) for log in simulate(runs)]
+
+
+def _table(found: Sequence[tuple[Run, Measures]]) -> str:
+    """A row for each kind of fault and for all runs; the worst seeds."""
+    rows = {"no faults": [each for run, each in found if not run.faults]}
+    for kind in sorted({fault.kind for run, _ in found for fault in run.faults}):
+        rows[kind] = [each for run, each in found if kind in {f.kind for f in run.faults}]
+    rows["all"] = [each for _, each in found]
+    lines = [f"{'':10}{'runs':>6}{'true %':>8}" + "".join(f"{name:>13}" for name in COLUMNS)]
+    for kind, each in rows.items():
+        if each:
+            true = 100 - 100 * sum(m["false"] for m in each) / sum(m["ticks"] for m in each)
+            cells = [f"{pick([m[n] for m in each]):13.4g}" for n, (pick, _) in COLUMNS.items()]
+            lines.append(f"{kind:10}{len(each):6}{true:8.2f}" + "".join(cells))
+    for name, (_, most) in COLUMNS.items():
+        worst = sorted(
+            ((m[name], run.seed) for run, m in found if m[name] > most), reverse=True
+        )
+        seeds = ", ".join(f"{seed} ({size:.3g})" for size, seed in worst[:8])
+        lines.append(f"{name:13}{len(worst):4} runs > {most:g}   {seeds}")
+    return "\n".join(lines)
+
+
+def _show(run: Run) -> None:
+    """One run, every tenth of a second."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        [log] = simulate([run])
+    ticks, wrong = log.ticks, false_status(log)
+    every = max(1, round(run.rate / 10))
+    with np.printoptions(precision=3, suppress=True, linewidth=200):
+        for k in range(0, len(wrong), every):
+            false = "FALSE" if wrong[k : k + every].any() else ""
+            when = f"{ticks.time[k]:6.2f} s at {ticks.progress[k]:5.2f} {ticks.status[k]:9}"
+            print(f"{when} {false:5}", ticks.reference[k], ticks.reading[k], ticks.joints[k])
+    print(run, log.reason, log.error, measure(log), sep="\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command line."""
+    form = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="python -m tpgmm_evaluation.faults", description=__doc__, formatter_class=form
+    )
+    parser.add_argument("--half", choices=HALVES, default=HALVES[0], help="of the seeds")
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0, help="of the first run")
+    parser.add_argument("--run", type=int, metavar="SEED", help="show this run alone")
+    parser.add_argument("--rates", default="50", help="with commas [Hz]")
+    parser.add_argument("--robots", default=",".join(ROBOTS), help="with commas")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    given = parser.parse_args(arguments)
+    seeds = range(given.seed, given.seed + given.runs) if given.run is None else [given.run]
+    rates = [float(rate) for rate in given.rates.split(",")]
+    runs = [Run.draw(given.half, seed, rates, given.robots.split(",")) for seed in seeds]
+    if given.run is None:
+        print(_table(measured(runs, given.workers)))
+    else:
+        _show(*runs)
+
+
+if __name__ == "__main__":
+    main()

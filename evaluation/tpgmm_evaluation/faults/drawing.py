@@ -1,0 +1,195 @@
+"""Runs that are drawn: a robot, its servo, a rate, and faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_evaluation.faults.servos import Servo
+from tpgmm_evaluation.faults.skills import ROBOTS, Situation, situations
+
+__all__ = ["HALVES", "KINDS", "READINGS", "Fault", "Run"]
+
+Array = NDArray[np.float64]
+#: Of the seeds; constants are chosen on the first one alone.
+HALVES = ("development", "held-out")
+#: How much longer than its skill a run may be [s].
+GRACE = 8.0
+
+
+@dataclass
+class Fault:
+    """Something that goes wrong for some time.
+
+    Parameters
+    ----------
+    kind : str
+    begin, end : float
+        Since the start of the run [s].
+    joints : ndarray of shape (n_joints,)
+        0, or a sign for joints that are concerned.
+    size : float
+        In the unit of the kind.
+    kept : ndarray, optional
+        What was found when it began.
+    """
+
+    kind: str
+    begin: float
+    end: float
+    joints: Array
+    size: float = 1.0
+    kept: Array | None = None
+
+    def __str__(self) -> str:
+        joints = np.flatnonzero(self.joints).tolist()
+        return f"{self.kind} {self.size:.3g} of {joints}, {self.begin:.2f} to {self.end:.2f} s"
+
+    def active(self, time: Array | float) -> NDArray[np.bool_]:
+        """Whether it lasts at these times; for one tick at least that is for the caller."""
+        return (time >= np.array(self.begin)) & (time < np.array(self.end))
+
+
+def _frozen(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
+    if fault.kept is None:
+        fault.kept = reading
+    return fault.kept
+
+
+def _swapped(reading: Array, fault: Fault, last: Array, rng: np.random.Generator) -> Array:
+    order, concerned = np.arange(len(reading)), np.flatnonzero(fault.joints)
+    order[concerned] = np.roll(concerned, 1)
+    return reading[order]
+
+
+#: What is read in place of a reading y, given the last one.
+READINGS: Mapping[str, Callable[[Array, Fault, Array, np.random.Generator], Array]] = {
+    "offset": lambda y, fault, last, rng: y + fault.size * fault.joints,
+    "noise": lambda y, fault, last, rng: y + fault.size * rng.standard_normal(len(y)),
+    "dropped": lambda y, fault, last, rng: np.full_like(y, np.nan),
+    "repeated": lambda y, fault, last, rng: last if rng.random() < fault.size else y,
+    "frozen": _frozen,
+    "zeros": lambda y, fault, last, rng: np.zeros_like(y),
+    "swapped": _swapped,
+    "units": lambda y, fault, last, rng: np.rad2deg(y) if fault.size > 0 else np.deg2rad(y),
+    "flipped": lambda y, fault, last, rng: np.where(fault.joints != 0, -y, y),
+    "outliers": lambda y, fault, last, rng: (
+        y + (rng.random() < 0.1) * fault.size * fault.joints
+    ),
+}
+#: Smallest and largest size, longest duration [s], and how often all joints are concerned.
+#: What may last for ever does so in half of the runs.
+KINDS: Mapping[str, tuple[float, float, float, float]] = {
+    "offset": (0.05, 0.35, np.inf, 0.0),  # rad
+    "noise": (0.001, 0.03, np.inf, 1.0),  # rad, standard deviation
+    "dropped": (1, 1, 1.5, 1.0),
+    "repeated": (0.1, 0.9, np.inf, 1.0),  # share of the ticks
+    "frozen": (1, 1, 2.5, 1.0),
+    "zeros": (1, 1, 1.5, 1.0),
+    "swapped": (1, 1, 1.5, 0.5),
+    "units": (-1, 1, 1.5, 1.0),  # degrees, or radians taken for degrees
+    "flipped": (1, 1, 1.5, 0.5),
+    "outliers": (0.05, 1.0, np.inf, 0.0),  # rad
+    "stall": (-0.3, 1.0, 0.1, 1.0),  # s; if negative, the controller is not told
+    "jitter": (0.1, 0.8, np.inf, 1.0),  # standard deviation of the logarithm of dt
+    "clock": (0.02, 0.2, 1.5, 1.0),  # share of ticks whose dt is 0, negative or NaN
+    "payload": (0.05, 0.35, np.inf, 0.0),  # rad
+    "stop": (1, 1, 3.0, 0.7),
+    "push": (-2, 2, 0.5, 1.0),  # s along the undisturbed path
+    "teleport": (0.05, 0.4, 0.1, 0.7),  # rad
+    "contact": (0.02, 0.1, 2.0, 0.0),  # rad before where a joint would come to
+    "grasp": (0.3, 1.2, 2.0, 0.0),  # the same of the last one, a gripper
+}
+
+
+@dataclass(eq=False)
+class Run:
+    """One run, to be simulated once.
+
+    Parameters
+    ----------
+    robot : str
+    rate : float
+        [Hz].
+    servo : Servo
+    faults : sequence of Fault
+    number : int
+        Of the situation.
+    rng : numpy.random.Generator
+        Of noise.
+    seed : int
+    true, told : ndarray of shape (n_ticks,)
+        Durations that pass, and that the controller is told [s].
+    """
+
+    robot: str
+    rate: float
+    servo: Servo
+    faults: Sequence[Fault]
+    number: int
+    rng: np.random.Generator
+    seed: int = 0
+    true: Array = field(init=False)
+    told: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        usual = 1 / self.rate
+        self.true = np.full(int((self.situation.skill.end + GRACE) * self.rate), usual)
+        now, rng, n = np.cumsum(self.true), self.rng, len(self.true)
+        unnoticed, wrong = np.zeros((2, n), dtype=bool)
+        for fault in self.faults:
+            inside = fault.active(now)
+            if fault.kind == "stall":
+                stall = np.flatnonzero(now >= fault.begin)[:1]
+                self.true[stall] += abs(fault.size)
+                unnoticed[stall] = fault.size < 0
+            elif fault.kind == "jitter":
+                factor = np.exp(fault.size * rng.standard_normal(n)).clip(0.2, 5)
+                self.true *= np.where(inside, factor, 1.0)
+            elif fault.kind == "clock":
+                wrong |= inside & (rng.random(n) < fault.size)
+        self.told = np.where(unnoticed, usual, self.true)
+        self.told[wrong] = rng.choice([0, -usual, np.nan], wrong.sum())
+
+    @property
+    def situation(self) -> Situation:
+        """Where it begins."""
+        return situations(self.robot)[self.number]
+
+    def __str__(self) -> str:
+        most = {k: f"{np.abs(v).max():.3g}" for k, v in vars(self.servo).items()}
+        servo = ", ".join(f"{name} {value}" for name, value in most.items())
+        faults = "; ".join(map(str, self.faults)) or "no faults"
+        return f"{self.seed}: {self.robot} at {self.rate:g} Hz; {servo}; {faults}"
+
+    @classmethod
+    def draw(
+        cls, half: str, seed: int, rates: Sequence[float], robots: Sequence[str] = tuple(ROBOTS)
+    ) -> Run:
+        """The run of a seed of one half."""
+        rng = np.random.default_rng((HALVES.index(half), seed))
+        robot, rate = str(rng.choice(robots)), float(rng.choice(rates))
+        number = int(rng.integers(len(situations(robot))))
+        situation = situations(robot)[number]
+        servo = Servo.draw(rng, situation.limits[2])
+        faults = [_draw(rng, situation) for _ in range(rng.choice([0, 1, 1, 1, 2, 3]))]
+        # offsets and noise before what replaces readings
+        faults.sort(key=lambda one: (list(KINDS).index(one.kind), one.begin))
+        return cls(robot, rate, servo, faults, number, rng, seed)
+
+
+def _draw(rng: np.random.Generator, situation: Situation) -> Fault:
+    """Any fault, some time in the skill."""
+    kind, n = str(rng.choice(list(KINDS))), len(situation.joints)
+    least, most, longest, share = KINDS[kind]
+    begin, lasting = rng.uniform(0.2, situation.skill.end), rng.uniform(0.05, min(longest, 3.0))
+    if longest == np.inf and rng.random() < 0.5:
+        lasting = np.inf
+    several = n if rng.random() < share else min(n, 1 + (kind == "swapped"))
+    chosen = np.array([n - 1]) if kind == "grasp" else rng.choice(n, several, replace=False)
+    joints = np.zeros(n)
+    joints[chosen] = rng.choice([-1, 1], len(chosen))
+    return Fault(kind, begin, begin + lasting, joints, rng.uniform(least, most))

@@ -1,0 +1,170 @@
+"""What went wrong in a run: bounds, status, end, gap, runaway."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_evaluation.faults.drawing import KINDS
+from tpgmm_evaluation.faults.runs import Log, Tick
+
+__all__ = ["false_status", "measure"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+#: Share by which rounding may exceed a bound.
+ROOM = 1.01
+
+
+def measure(log: Log) -> Mapping[str, float]:
+    """Measure one run.
+
+    Returns
+    -------
+    mapping of str to float
+        ``ticks``; ticks beyond ``position``, ``speed``, ``acceleration`` and ``jerk``, over
+        the durations that were told, ``infinite`` ones, and those with a ``false`` status;
+        ``step``, the greatest speed in units of its bound; ``raised``, whether there was an
+        exception; ``open``, whether it neither finished, nor waits at last and names a joint,
+        nor is held for readings that last; ``late``, seconds after the skill and all
+        interruptions; ``gap``, between reference and joints while stopped, on top of what it
+        was at that moment [rad]; ``runaway``, the distance of the reference from the
+        undisturbed path, on top of 1.5 times what readings, sag and load are off [rad]. What
+        does not apply is NaN.
+    """
+    ticks, at = log.ticks, log.run.situation
+    low, high = at.limits[0] - 1e-9, at.limits[1] + 1e-9
+    rates = _rates(ticks, at.joints, at.limits[2:])
+    beyond = [float((rate > ROOM).sum()) for rate in rates]
+    return {
+        "ticks": len(ticks.time),
+        "position": float(((ticks.reference < low) | (ticks.reference > high)).any(-1).sum()),
+        **dict(zip(("speed", "acceleration", "jerk"), beyond, strict=True)),
+        "step": float(np.nanmax(rates[0], initial=0)),
+        "infinite": float((~np.isfinite(ticks.reference)).any(-1).sum()),
+        "raised": float(bool(log.error)),
+        "false": float(false_status(log).sum()),
+        "open": float(_open(log, ticks)),
+        "late": _late(log, ticks),
+        "gap": _gap(log, ticks),
+        "runaway": _runaway(log, ticks),
+    }
+
+
+def _rates(ticks: Tick, start: Array, limits: tuple[Array, ...]) -> list[Array]:
+    """Speed, acceleration and jerk of each tick, in units of their limits, from rest."""
+    timed = ticks.told > 0  # false where it is not a number
+    reference = np.concatenate((start[None], ticks.reference))
+    jumped = (np.diff(reference, axis=0)[~timed] != 0).any(-1)  # in no time
+    dt = ticks.told[timed]
+    before = np.concatenate((dt[:1], dt[:-1]))
+    earlier = np.concatenate((before[:1], before[:-1]))
+    change = np.diff(np.concatenate((start[None], ticks.reference[timed])), axis=0)
+    rates = []
+    for span, limit in zip(
+        (dt, (dt + before) / 2, (dt + before + earlier) / 3), limits, strict=True
+    ):
+        rate = change / span[:, None]
+        rates.append(np.abs(rate / limit).max(-1))
+        change = np.diff(rate, axis=0, prepend=0)
+    return [np.concatenate((rates[0], np.where(jumped, np.inf, 0.0))), *rates[1:]]
+
+
+def _lasting(mask: Mask, time: Array) -> Array:
+    """For how long something has been so at each tick [s]; 0 where it is not."""
+    return time - np.maximum.accumulate(np.where(mask, 0.0, time))
+
+
+def _readings(log: Log, ticks: Tick) -> tuple[Mask, Mask]:
+    """Ticks with readings that cannot be right, and those with readings that are off at all."""
+    off = np.abs(ticks.reading - ticks.expected)
+    lost = np.isnan(off).any(-1)
+    off = np.nan_to_num(off).max(-1)
+    zero = (ticks.reading == 0).all(-1) & (off > 0.1)
+    kinds = ("units", "swapped", "flipped", "frozen")
+    wrong = [fault.active(ticks.time) for fault in log.run.faults if fault.kind in kinds]
+    jump = 0.1 + 1.5 * log.run.situation.limits[2].min() / log.run.rate
+    far = np.any(wrong, axis=0) & (off > max(0.5, jump))
+    return lost | zero | far, lost | (off > 0.02)
+
+
+def false_status(log: Log) -> Mask:
+    """Ticks with a status that is not so.
+
+    A robot has to *hold* while readings are impossible for more than 0.3 s; to *wait* (or be
+    *displaced*) while it is away from where its servos would be if nothing had disturbed them,
+    for longer than they need to come there; to *run* (or be *finished*) while it is there for
+    that long, its readings are right, and no offset or load has changed. Between these, it may
+    have any status but that it runs while progress stands for a second.
+    """
+    ticks, servo, few = log.ticks, log.run.servo, 2 / log.run.rate
+    settle = 0.5 + 2 * (np.max(servo.lag) + servo.delay) + few
+    slack = np.max(2 * servo.stiction + servo.backlash)
+    apart = np.abs(ticks.joints - ticks.shadow).max(-1)
+    impossible, off = _readings(log, ticks)
+    lag = np.abs(ticks.reference - servo.sag - ticks.load - ticks.shadow).max(-1)
+    changed = np.abs(np.diff(_offset(log, ticks), axis=0, prepend=0)).max(-1) > 1e-3
+    calm = (apart < 0.01 + slack) & ~off & (lag < 0.1) & ~changed
+    stands = ticks.progress - np.interp(ticks.time - 1, ticks.time, ticks.progress) < 0.1
+    running, waiting, ended = (
+        np.isin(ticks.status, names)
+        for names in (("running",), ("waiting", "displaced"), ("finished",))
+    )
+    holding = ticks.status == "holding"
+    frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
+    wrong = running & stands & ~off & (ticks.time > 1)
+    wrong |= (_lasting(calm, ticks.time) > settle) & ~(running | ended)
+    away = _lasting((apart > 0.03 + slack) & ~off, ticks.time) > settle
+    wrong = np.where(away, ~waiting, wrong)
+    held = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.told > 0)
+    return np.where(held, ~(holding | ended | frozen), wrong)
+
+
+def _offset(log: Log, ticks: Tick) -> Array:
+    """Of readings and load (n_ticks, n_joints)."""
+    offset = ticks.load
+    for fault in log.run.faults:
+        if fault.kind == "offset":
+            offset = offset + np.outer(fault.active(ticks.time), fault.size * fault.joints)
+    return offset
+
+
+def _open(log: Log, ticks: Tick) -> bool:
+    names = log.run.situation.skill.kinematics.joint_names
+    waits = ticks.status[-1] == "waiting" and any(name in log.reason for name in names)
+    held = ticks.status[-1] == "holding" and _readings(log, ticks)[0][-1]
+    return bool(log.error) or not (log.done < np.inf or waits or held)
+
+
+def _late(log: Log, ticks: Tick) -> float:
+    if not log.done < np.inf or log.error:
+        return np.nan
+    late = log.done - log.run.situation.skill.end
+    for fault in log.run.faults:
+        if KINDS[fault.kind][2] < np.inf:
+            late -= max(0.0, min(fault.end, log.done) - fault.begin)
+        if fault.kind in ("push", "stall"):
+            late -= abs(fault.size)  # of the skill, and of real time
+    return float(late)
+
+
+def _gap(log: Log, ticks: Tick) -> float:
+    gaps, gap = [], np.abs(ticks.reference - ticks.joints)
+    for fault in log.run.faults:
+        inside = np.flatnonzero(fault.active(ticks.time))
+        if fault.kind == "stop" and len(inside):
+            grown = gap[inside] - gap[max(0, inside[0] - 1)]
+            gaps.append(float((grown * (fault.joints != 0)).max()))
+    return max(gaps, default=np.nan)
+
+
+def _runaway(log: Log, ticks: Tick) -> float:
+    at, sag = log.run.situation, log.run.servo.sag
+    every = slice(None, None, max(1, int(log.run.rate / 20)))
+    distance = np.abs(ticks.reference[every, None] - at.path).max(-1).min(-1)
+    away = np.abs(ticks.reading - ticks.shadow - sag).max(-1)
+    away = np.where(_readings(log, ticks)[0], 0.0, away) + np.abs(ticks.load).max(-1)
+    allowed = np.maximum.accumulate(np.nan_to_num(away)) + np.abs(sag).max()
+    return float((distance - 1.5 * allowed[every]).max(initial=0))

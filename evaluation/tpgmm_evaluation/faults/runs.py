@@ -1,0 +1,179 @@
+"""Runs of controllers beside simulated servos, tick by tick."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tpgmm_evaluation.faults.drawing import READINGS, Fault, Run
+from tpgmm_evaluation.faults.servos import Servos
+from tpgmm_evaluation.faults.skills import PATH_RATE
+from tpgmm_torch.control.controller import Controller
+
+__all__ = ["Log", "Tick", "simulate"]
+
+Array = NDArray[np.float64]
+#: Seconds for which a robot is looked at after it has finished.
+AFTER_END = 0.3
+
+
+class Tick(NamedTuple):
+    """One tick, or, stacked, all of a run.
+
+    ``joints`` and ``shadow`` are those of the servos, and of servos that follow the same
+    references undisturbed; ``expected`` is read by sensors that have an offset and noise at
+    most, ``reading`` is what the controller was given; ``progress`` [s] and ``status`` are its
+    answer.
+    """
+
+    told: Any
+    time: Any
+    reference: Any
+    joints: Any
+    shadow: Any
+    load: Any
+    expected: Any
+    reading: Any
+    progress: Any
+    status: Any
+
+
+@dataclass(eq=False)
+class Log:
+    """One robot with its controller: what became of a run.
+
+    Parameters
+    ----------
+    run : Run
+    controller : Controller
+    reference : ndarray of shape (n_joints,)
+        The last one.
+    reading : ndarray of shape (n_joints,)
+        The last one.
+    done : float
+        When it finished [s].
+    error : str
+        An exception, which ends the run.
+    reason : str
+        Of the last status.
+    """
+
+    run: Run
+    controller: Controller
+    reference: Array
+    reading: Array
+    done: float = np.inf
+    error: str = ""
+    reason: str = ""
+    rows: list[Tick] = field(default_factory=list)
+
+    @property
+    def ticks(self) -> Tick:
+        """Arrays of shape (n_ticks, ...)."""
+        return Tick(*(np.array(column) for column in zip(*self.rows, strict=True)))
+
+    def step(self, told: float, now: float, joints: Array, load: Array) -> None:
+        """The next reference; nothing happens after the end."""
+        if self.error or now > self.done + AFTER_END:
+            return
+        expected, self.reading = _read(self.run, joints[0], self.reading, now)
+        try:
+            command = self.controller.step(told, self.reading)
+        except Exception as error:
+            self.error, self.done = f"{type(error).__name__}: {error}", now
+            return
+        self.reference, self.reason = command.reference.numpy(), command.reason()
+        if self.controller.finished:
+            self.done = min(self.done, now)
+        answer = float(command.time), str(command.status)
+        known = self.reference, joints[0], joints[1], load, expected, self.reading
+        self.rows.append(Tick(told, now, *known, *answer))
+
+
+def simulate(runs: Sequence[Run], **options: Any) -> list[Log]:
+    """Run controllers, each alone, beside servos that are simulated together.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Of one robot and one rate.
+    **options
+        Of the controllers.
+    """
+    logs = []
+    for run in runs:
+        at = run.situation
+        controller = Controller(at.skill, at.joints, at.frames, **options)
+        logs.append(Log(run, controller, at.joints, at.joints))
+    starts, limits = np.array([log.reference for log in logs]), runs[0].situation.limits
+    n_ticks = len(runs[0].true)
+    servos = Servos([run.servo for run in runs], starts, limits[:2], n_ticks)
+    now = np.zeros(len(runs))
+    for k in range(n_ticks):
+        dt = np.array([run.true[k] for run in runs])
+        now = now + dt
+        load = _disturb(runs, now, servos, dt)
+        for i, log in enumerate(logs):
+            log.step(runs[i].told[k], now[i], servos.joints[:, i], load[i])
+        if all(log.error or now[i] > log.done + AFTER_END for i, log in enumerate(logs)):
+            break
+        servos.send(np.array([log.reference for log in logs]))
+    return logs
+
+
+def _read(run: Run, joints: Array, last: Array, now: float) -> tuple[Array, Array]:
+    """Readings with an offset and noise at most, and with all faults."""
+    step = run.servo.resolution
+    expected = reading = np.round(joints / step) * step
+    for fault in run.faults:
+        if fault.kind in READINGS and fault.active(now):
+            reading = READINGS[fault.kind](reading, fault, last, run.rng)
+            expected = reading if fault.kind in ("offset", "noise") else expected
+    return expected, reading
+
+
+def _disturb(runs: Sequence[Run], now: Array, servos: Servos, dt: Array) -> Array:
+    """Servos go on for a tick, disturbed by somebody; the loads."""
+    shape = servos.joints.shape[1:]
+    held, load = np.zeros(shape, dtype=bool), np.zeros(shape)
+    walls = np.stack((np.full(shape, -np.inf), np.full(shape, np.inf)))
+    for i, run in enumerate(runs):
+        for fault in run.faults:
+            if fault.kind == "payload":
+                load[i] += fault.size * fault.joints * fault.active(now[i])
+            elif fault.kind == "stop":
+                held[i] |= (fault.joints != 0) & fault.active(now[i])
+            elif fault.kind in ("contact", "grasp") and fault.active(now[i]):
+                _block(run, fault, walls[:, i])
+            elif fault.kind in ("push", "teleport") and fault.active(now[i]):
+                servos.place(i, _moved(run, fault, servos.joints[0, i], now[i]))
+                held[i] = True
+    servos.advance(dt, held, load, walls)
+    return load
+
+
+def _block(run: Run, fault: Fault, walls: Array) -> None:
+    """A wall stands before where a joint would come to in the meantime."""
+    [joint] = np.flatnonzero(fault.joints)
+    part = run.situation.path[:, joint]
+    part = part[int(fault.begin * PATH_RATE) : int(min(fault.end, 100) * PATH_RATE)]
+    if len(part) and fault.joints[joint] > 0:
+        walls[1, joint] = part.max() - fault.size
+    elif len(part):
+        walls[0, joint] = part.min() + fault.size
+
+
+def _moved(run: Run, fault: Fault, joints: Array, now: float) -> Array:
+    """Where somebody carries a robot: at once to anywhere, or along its way."""
+    path = run.situation.path
+    if fault.kept is None:
+        fault.kept = joints
+    if fault.kind == "teleport":
+        return fault.kept + fault.size * fault.joints
+    goal = path[int(np.clip((fault.begin + fault.size) * PATH_RATE, 0, len(path) - 1))]
+    share = min(1.0, 2 * (now - fault.begin) / (fault.end - fault.begin))
+    return fault.kept + share * (goal - fault.kept)

@@ -1,0 +1,122 @@
+"""Small skills on three arms and on the upper body, fitted once in a process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.bottle.skill import BottleShaking
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import Canonical, Demonstration, Frame, RelativePosition, Robot
+from tpgmm_torch import TaskParameterizedGMM as Model
+from tpgmm_torch.alignment import DynamicTimeWarping
+from tpgmm_torch.control.controller import Controller
+from tpgmm_torch.skills.skill import Skill
+
+__all__ = ["PATH_RATE", "ROBOTS", "Situation", "situations"]
+
+Array = NDArray[np.float64]
+#: Of the undisturbed references [Hz].
+PATH_RATE = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """A skill, and where it begins.
+
+    Parameters
+    ----------
+    skill : Skill
+    joints : ndarray of shape (n_joints,)
+    frames : mapping of str to Frame
+    path : ndarray of shape (n_ticks, n_joints)
+        Undisturbed references at 50 Hz.
+    """
+
+    skill: Skill
+    joints: Array
+    frames: Mapping[str, Frame]
+    path: Array
+
+    @property
+    def limits(self) -> tuple[Array, ...]:
+        """Of lower and upper positions, speed, acceleration and jerk, each (n_joints,)."""
+        bounds = self.skill.motion_bounds
+        assert bounds is not None
+        names = ("lower", "upper", "velocity", "acceleration", "jerk")
+        return tuple(getattr(bounds, name).numpy() for name in names)
+
+
+def _rise(share: Any) -> Any:
+    """Minimum jerk from 0 to 1, as a column."""
+    u = np.clip(share, 0, 1)
+    return (u**3 * (10 - 15 * u + 6 * u * u))[:, None]
+
+
+def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstration]]:
+    """Joints about these axes reach a cup, rest while a gripper closes, and leave it."""
+    text, links = (
+        ['<robot name="arm"><link name="base"/>'],
+        ["base", *range(1, len(axes)), "hand"],
+    )
+    for number, axis in enumerate(axes, 1):
+        way = " ".join("1" if axis == name else "0" for name in "xyz")
+        text.append(
+            f'<link name="{links[number]}"/><joint name="joint{number}" type="revolute">'
+            f'<parent link="{links[number - 1]}"/><child link="{links[number]}"/><origin '
+            f'xyz="0.2 0 0"/><axis xyz="{way}"/><limit lower="-2.5" upper="2.5" velocity="2" '
+            'effort="1"/></joint>'
+        )
+    coordinates = ("gripper",) if gripper else ()
+    robot = Robot.from_urdf("".join(text) + "</robot>", ["hand"], coordinates=coordinates)
+    rng, time, n = np.random.default_rng(0), 0.045 * np.arange(101.0), len(axes)
+    home, reach, leave = (rng.choice([-1, 1], n) * rng.uniform(0.2, 0.7, n) for _ in range(3))
+    shown = []
+    for _ in range(6):
+        start, there = np.stack((home, home + reach)) + 0.1 * rng.standard_normal((2, n))
+        joints = start + _rise(time / 2) * (there - start) + _rise((time - 3) / 1.5) * leave
+        joints += 1e-3 * rng.standard_normal(joints.shape)
+        if gripper:
+            joints = np.hstack((joints, 2 * _rise((time - 2.1) / 0.8) - 1))
+        at_cup = np.append(there, np.zeros(len(coordinates)))
+        cup = Frame(robot.state(torch.from_numpy(at_cup)).position("hand"))
+        shown.append(Demonstration(time, joints, {"cup": cup}, robot.joint_names))
+    operators = [RelativePosition("hand", "cup"), Canonical()]
+    return Model(8, operators, robot).fit(shown), shown
+
+
+def _upper_body() -> tuple[Model, Sequence[Demonstration]]:
+    """The paper's skill, of four demonstrations."""
+    robot = Robot.from_urdf(upper_body_urdf(), links=("l_hand", "r_hand"))
+    recorded = BottleShaking(rate=10, robot=robot).demonstrations(4, seed=0)
+    shown = DynamicTimeWarping(robot=robot).fit_transform(recorded)
+    return Model(8, bottle_operators(), robot, tol=1e-2).fit(shown), shown
+
+
+ROBOTS: Mapping[str, Callable[[], tuple[Model, Sequence[Demonstration]]]] = {
+    "four joints": partial(_arm, "zzzx"),
+    "seven joints": partial(_arm, "zyxyxyx"),
+    "gripper": partial(_arm, "yy", gripper=True),
+    "upper body": _upper_body,
+}
+
+
+@cache
+def situations(robot: str) -> Sequence[Situation]:
+    """Those of the demonstrations of one of the robots."""
+    (model, shown), found = ROBOTS[robot](), []
+    skill = model.skill
+    for one in shown:
+        start, path = one.joints[0], [one.joints[0]]
+        controller = Controller(skill, start, one.frames)
+        for _ in range(round(skill.end * PATH_RATE)):
+            path.append(controller.step(1 / PATH_RATE).reference)
+        found.append(Situation(skill, start.numpy(), one.frames, torch.stack(path).numpy()))
+    return found

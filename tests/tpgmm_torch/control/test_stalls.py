@@ -1,0 +1,53 @@
+"""Every skill ends, or says for which joint it waits: soft drives, contact, grippers."""
+
+import numpy as np
+import pytest
+
+from tests.tpgmm_torch.control.test_reference_continuity import BOUNDS, measures, pytestmark
+from tpgmm_evaluation.faults.drawing import Fault
+from tpgmm_evaluation.faults.servos import Servo
+from tpgmm_evaluation.faults.skills import situations
+
+__all__ = ["pytestmark"]
+
+LAGS = (0.02, 0.14, 0.4)
+
+
+def touched(size, begin=1.5, end=3.0, joint=1):
+    """Something stands in the way of a joint of the arm with a gripper, when it arrives."""
+    path = situations("gripper")[0].path[:, joint]
+    way = np.sign(path[100] - path[50]) * np.eye(3)[joint]
+    return Fault("contact", begin, end, way, size)
+
+
+def grasped(size):
+    """The gripper closes on something, and does not open again."""
+    return Fault("grasp", 2.1, 100.0, np.eye(3)[2], size)
+
+
+@pytest.mark.parametrize("lag", LAGS)
+@pytest.mark.parametrize("size", [0.02, 0.045, 0.1])
+def test_contact_while_a_gripper_closes_on_something(size, lag):
+    found = measures(20, Servo(lag=lag), [touched(size), grasped(0.8)], "gripper")
+    assert {name: found[name] for name in BOUNDS} == dict.fromkeys(BOUNDS, 0)
+    assert not found["open"]
+
+
+@pytest.mark.parametrize("lag", LAGS)
+def test_contact_alone(lag):
+    found = measures(50, Servo(lag=lag), [touched(0.045)], "gripper")
+    assert not found["open"]
+
+
+@pytest.mark.parametrize("robot", ["four joints", "seven joints", "gripper"])
+@pytest.mark.parametrize("lag", LAGS)
+def test_soft_drives_reach_the_end(lag, robot):
+    found = measures(50, Servo(lag=lag), [], robot)
+    assert found["late"] < 1.0
+    assert not found["false"]
+
+
+@pytest.mark.parametrize("stiction", [0.02, 0.045, 0.08])
+def test_joints_that_stick_are_named_or_reached(stiction):
+    found = measures(50, Servo(stiction=stiction), [])
+    assert not found["open"]
