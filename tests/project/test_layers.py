@@ -75,7 +75,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], ...]] = {
         ("jobs",),
         ("report",),
         ("compare", "metaworld"),
-        ("command", "regressions"),
+        ("command", "faults", "regressions"),
     ),
 }
 #: A face hands names on; every other file counts.

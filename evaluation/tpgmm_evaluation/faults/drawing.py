@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tpgmm_evaluation.faults.servos import Servo
 from tpgmm_evaluation.faults.skills import ROBOTS, Situation, situations
 
-__all__ = ["HALVES", "KINDS", "READINGS", "Fault", "Run"]
+__all__ = ["HALVES", "KINDS", "POSES", "READINGS", "Fault", "Run"]
 
 Array = NDArray[np.float64]
 #: Of the seeds; constants are chosen on the first one alone.
@@ -102,6 +102,17 @@ KINDS: Mapping[str, tuple[float, float, float, float]] = {
     "teleport": (0.05, 0.4, 0.1, 0.7),  # rad
     "contact": (0.02, 0.1, 2.0, 0.0),  # rad before where a joint would come to
     "grasp": (0.3, 1.2, 2.0, 0.0),  # the same of the last one, a gripper
+    "pose lost": (1, 1, 2.0, 1.0),
+    "pose noise": (0.001, 0.01, np.inf, 1.0),  # m, and three times that in quaternions
+    "pose flipped": (1, 1, 2.0, 1.0),
+}
+#: What is seen of a pose (7,), position and quaternion.
+POSES: Mapping[str, Callable[[Array, Fault, np.random.Generator], Array]] = {
+    "pose lost": lambda pose, fault, rng: np.full(7, np.nan),
+    "pose noise": lambda pose, fault, rng: (
+        pose + fault.size * np.repeat((1, 3), (3, 4)) * rng.standard_normal(7)
+    ),
+    "pose flipped": lambda pose, fault, rng: np.append(pose[:3], pose[[5, 6, 3, 4]]),
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_evaluation.faults.drawing import KINDS
+from tpgmm_evaluation.faults.drawing import KINDS, POSES
 from tpgmm_evaluation.faults.runs import Log, Tick
 
 __all__ = ["false_status", "measure"]
@@ -30,9 +30,9 @@ def measure(log: Log) -> Mapping[str, float]:
         exception; ``open``, whether it neither finished, nor waits at last and names a joint,
         nor is held for readings that last; ``late``, seconds after the skill and all
         interruptions; ``gap``, between reference and joints while stopped, on top of what it
-        was at that moment [rad]; ``runaway``, the distance of the reference from the
-        undisturbed path, on top of 1.5 times what readings, sag and load are off [rad]. What
-        does not apply is NaN.
+        was at that moment or would be with its lag [rad]; ``runaway``, the distance of the
+        reference from the undisturbed path, on top of 1.5 times what readings, sag and load
+        are off [rad]. What does not apply is NaN.
     """
     ticks, at = log.ticks, log.run.situation
     low, high = at.limits[0] - 1e-9, at.limits[1] + 1e-9
@@ -84,10 +84,13 @@ def _readings(log: Log, ticks: Tick) -> tuple[Mask, Mask]:
     off = np.nan_to_num(off).max(-1)
     zero = (ticks.reading == 0).all(-1) & (off > 0.1)
     kinds = ("units", "swapped", "flipped", "frozen")
-    wrong = [fault.active(ticks.time) for fault in log.run.faults if fault.kind in kinds]
+    wrong, unseen = (
+        [fault.active(ticks.time) for fault in log.run.faults if fault.kind in names]
+        for names in (kinds, ("pose lost", "pose flipped"))
+    )
     jump = 0.1 + 1.5 * log.run.situation.limits[2].min() / log.run.rate
     far = np.any(wrong, axis=0) & (off > max(0.5, jump))
-    return lost | zero | far, lost | (off > 0.02)
+    return lost | zero | far, lost | (off > 0.02) | np.any(unseen, axis=0)
 
 
 def false_status(log: Log) -> Mask:
@@ -107,14 +110,17 @@ def false_status(log: Log) -> Mask:
     lag = np.abs(ticks.reference - servo.sag - ticks.load - ticks.shadow).max(-1)
     changed = np.abs(np.diff(_offset(log, ticks), axis=0, prepend=0)).max(-1) > 1e-3
     calm = (apart < 0.01 + slack) & ~off & (lag < 0.1) & ~changed
-    stands = ticks.progress - np.interp(ticks.time - 1, ticks.time, ticks.progress) < 0.1
+    stands = ticks.time > 1
+    for seconds in (1.0, 0.3):
+        before = np.interp(ticks.time - seconds, ticks.time, ticks.progress)
+        stands &= ticks.progress - before < 0.1 * seconds
     running, waiting, ended = (
         np.isin(ticks.status, names)
         for names in (("running",), ("waiting", "displaced"), ("finished",))
     )
     holding = ticks.status == "holding"
     frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
-    wrong = running & stands & ~off & (ticks.time > 1)
+    wrong = (_lasting(running, ticks.time) > 0.3) & stands & ~off
     wrong |= (_lasting(calm, ticks.time) > settle) & ~(running | ended)
     away = _lasting((apart > 0.03 + slack) & ~off, ticks.time) > settle
     wrong = np.where(away, ~waiting, wrong)
@@ -152,16 +158,21 @@ def _late(log: Log, ticks: Tick) -> float:
 
 def _gap(log: Log, ticks: Tick) -> float:
     gaps, gap = [], np.abs(ticks.reference - ticks.joints)
+    usual = np.abs(ticks.reference - ticks.shadow)
     for fault in log.run.faults:
         inside = np.flatnonzero(fault.active(ticks.time))
         if fault.kind == "stop" and len(inside):
-            grown = gap[inside] - gap[max(0, inside[0] - 1)]
+            before = gap[max(0, inside[0] - 1)]
+            usual[inside] = np.maximum.accumulate(np.maximum(usual[inside], before))
+            grown = gap[inside] - usual[inside]
             gaps.append(float((grown * (fault.joints != 0)).max()))
     return max(gaps, default=np.nan)
 
 
 def _runaway(log: Log, ticks: Tick) -> float:
     at, sag = log.run.situation, log.run.servo.sag
+    if any(fault.kind in POSES for fault in log.run.faults):
+        return 0.0  # there is another path to another pose
     every = slice(None, None, max(1, int(log.run.rate / 20)))
     distance = np.abs(ticks.reference[every, None] - at.path).max(-1).min(-1)
     away = np.abs(ticks.reading - ticks.shadow - sag).max(-1)

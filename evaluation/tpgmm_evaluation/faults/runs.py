@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tpgmm_evaluation.faults.drawing import READINGS, Fault, Run
+from tpgmm_evaluation.faults.drawing import POSES, READINGS, Fault, Run
 from tpgmm_evaluation.faults.servos import Servos
 from tpgmm_evaluation.faults.skills import PATH_RATE
 from tpgmm_torch.control.controller import Controller
@@ -82,16 +82,15 @@ class Log:
             return
         expected, self.reading = _read(self.run, joints[0], self.reading, now)
         try:
-            command = self.controller.step(told, self.reading)
+            command = self.controller.step(told, self.reading, _seen(self.run, now))
         except Exception as error:
             self.error, self.done = f"{type(error).__name__}: {error}", now
             return
         self.reference, self.reason = command.reference.numpy(), command.reason()
-        if self.controller.finished:
-            self.done = min(self.done, now)
-        answer = float(command.time), str(command.status)
-        known = self.reference, joints[0], joints[1], load, expected, self.reading
-        self.rows.append(Tick(told, now, *known, *answer))
+        self.done = min(self.done, now if self.controller.finished else np.inf)
+        ours = self.reference, joints[0], joints[1], load, expected
+        answer = self.reading, float(command.time), str(command.status)
+        self.rows.append(Tick(told, now, *ours, *answer))
 
 
 def simulate(runs: Sequence[Run], **options: Any) -> list[Log]:
@@ -134,6 +133,20 @@ def _read(run: Run, joints: Array, last: Array, now: float) -> tuple[Array, Arra
             reading = READINGS[fault.kind](reading, fault, last, run.rng)
             expected = reading if fault.kind in ("offset", "noise") else expected
     return expected, reading
+
+
+def _seen(run: Run, now: float) -> Mapping[str, Array] | None:
+    """Poses of the objects, where a camera sees them."""
+    faults = [fault for fault in run.faults if fault.kind in POSES]
+    if not faults:
+        return None
+    seen = {}
+    for name, frame in run.situation.frames.items():
+        pose = np.append(frame.position, frame.orientation)
+        for fault in faults:
+            pose = POSES[fault.kind](pose, fault, run.rng) if fault.active(now) else pose
+        seen[name] = pose / np.append(np.ones(3), np.full(4, np.linalg.norm(pose[3:])))
+    return seen
 
 
 def _disturb(runs: Sequence[Run], now: Array, servos: Servos, dt: Array) -> Array:

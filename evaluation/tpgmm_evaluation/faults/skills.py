@@ -76,18 +76,22 @@ def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstratio
         )
     coordinates = ("gripper",) if gripper else ()
     robot = Robot.from_urdf("".join(text) + "</robot>", ["hand"], coordinates=coordinates)
-    rng, time, n = np.random.default_rng(0), 0.045 * np.arange(101.0), len(axes)
+    rng, n, time = np.random.default_rng(0), len(axes), 0.045 * np.arange(101.0)
     home, reach, leave = (rng.choice([-1, 1], n) * rng.uniform(0.2, 0.7, n) for _ in range(3))
     shown = []
     for _ in range(6):
         start, there = np.stack((home, home + reach)) + 0.1 * rng.standard_normal((2, n))
-        joints = start + _rise(time / 2) * (there - start) + _rise((time - 3) / 1.5) * leave
+        joints: Any = (
+            start + _rise(time / 2) * (there - start) + _rise((time - 3) / 1.5) * leave
+        )
         joints += 1e-3 * rng.standard_normal(joints.shape)
         if gripper:
             joints = np.hstack((joints, 2 * _rise((time - 2.1) / 0.8) - 1))
         at_cup = np.append(there, np.zeros(len(coordinates)))
         cup = Frame(robot.state(torch.from_numpy(at_cup)).position("hand"))
-        shown.append(Demonstration(time, joints, {"cup": cup}, robot.joint_names))
+        shown.append(
+            Demonstration(torch.from_numpy(time), joints, {"cup": cup}, robot.joint_names)
+        )
     operators = [RelativePosition("hand", "cup"), Canonical()]
     return Model(8, operators, robot).fit(shown), shown
 
