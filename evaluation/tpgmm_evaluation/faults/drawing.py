@@ -49,7 +49,7 @@ class Fault:
         return f"{self.kind} {self.size:.3g} of {joints}, {self.begin:.2f} to {self.end:.2f} s"
 
     def active(self, time: Array | float) -> NDArray[np.bool_]:
-        """Whether it lasts at these times; for one tick at least that is for the caller."""
+        """Whether it lasts at these times."""
         return (time >= np.array(self.begin)) & (time < np.array(self.end))
 
 

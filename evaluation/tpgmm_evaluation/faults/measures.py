@@ -122,10 +122,16 @@ def false_status(log: Log) -> Mask:
     frozen = waiting & any(fault.kind == "frozen" for fault in log.run.faults)
     wrong = (_lasting(running, ticks.time) > 0.3) & stands & ~off
     wrong |= (_lasting(calm, ticks.time) > settle) & ~(running | ended)
-    away = _lasting((apart > 0.03 + slack) & ~off, ticks.time) > settle
+    arm = np.abs(ticks.joints - ticks.shadow)[:, _arm(log)].max(-1)
+    away = _lasting((arm > 0.03 + slack) & ~off, ticks.time) > settle
     wrong = np.where(away, ~waiting, wrong)
     held = (_lasting(impossible, ticks.time) > 0.3 + few) | ~(ticks.told > 0)
     return np.where(held, ~(holding | ended | frozen), wrong)
+
+
+def _arm(log: Log) -> Mask:
+    """Joints that are waited for: no gripper, which closes on something."""
+    return np.array(log.run.situation.skill.kinematics.joint_names) != "gripper"
 
 
 def _offset(log: Log, ticks: Tick) -> Array:
@@ -165,7 +171,7 @@ def _gap(log: Log, ticks: Tick) -> float:
             before = gap[max(0, inside[0] - 1)]
             usual[inside] = np.maximum.accumulate(np.maximum(usual[inside], before))
             grown = gap[inside] - usual[inside]
-            gaps.append(float((grown * (fault.joints != 0)).max()))
+            gaps.append(float((grown * (fault.joints != 0))[:, _arm(log)].max()))
     return max(gaps, default=np.nan)
 
 
