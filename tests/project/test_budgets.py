@@ -52,7 +52,7 @@ CEILINGS = {
     "lines of tpgmm_torch": 13700,
     "lines of lerobot_policy_tpgmm": 1900,
     "lines of tpgmm_tools": 2750,
-    "lines of environments and evaluation": 8285,
+    "lines of environments and evaluation": 8950,
     "lines of tests of core, data sets, policy and tools": 18550,
     "longest function of the core": 81,
     "named numeric constants of the core": 117,

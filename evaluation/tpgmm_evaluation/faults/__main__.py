@@ -75,17 +75,24 @@ def _measured(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
 
 
 def _table(found: Sequence[tuple[Run, Measures]]) -> str:
-    """A row for each kind of fault and for all runs; the worst seeds."""
-    rows = {"no faults": [each for run, each in found if not run.faults]}
-    for kind in sorted({fault.kind for run, _ in found for fault in run.faults}):
-        rows[kind] = [each for run, each in found if kind in {f.kind for f in run.faults}]
-    rows["all"] = [each for _, each in found]
-    lines = [f"{'':10}{'runs':>6}{'true %':>8}" + "".join(f"{name:>13}" for name in COLUMNS)]
-    for kind, each in rows.items():
-        if each:
-            true = 100 - 100 * sum(m["false"] for m in each) / sum(m["ticks"] for m in each)
-            cells = [f"{pick([m[n] for m in each]):13.4g}" for n, (pick, _) in COLUMNS.items()]
-            lines.append(f"{kind:10}{len(each):6}{true:8.2f}" + "".join(cells))
+    """A row for each kind of fault, and for all runs."""
+    rows = defaultdict(list)
+    for run, each in found:
+        for kind in sorted({fault.kind for fault in run.faults}) or ["no faults"]:
+            rows[kind].append(each)
+    lines = [f"{'':12}{'runs':>6}{'true %':>8}" + "".join(f"{name:>13}" for name in COLUMNS)]
+    for kind, several in [*sorted(rows.items()), ("all", [each for _, each in found])]:
+        ticks, false = (np.sum([each[name] for each in several]) for name in ("ticks", "false"))
+        cells = [f"{pick([m[n] for m in several]):13.4g}" for n, (pick, _) in COLUMNS.items()]
+        lines.append(
+            f"{kind:12}{len(several):6}{100 - 100 * false / ticks:8.2f}{''.join(cells)}"
+        )
+    return "\n".join(lines)
+
+
+def _worst(found: Sequence[tuple[Run, Measures]]) -> str:
+    """Seeds of the worst runs of each measure."""
+    lines = []
     for name, (_, most) in COLUMNS.items():
         worst = sorted(
             ((m[name], run.seed) for run, m in found if m[name] > most), reverse=True
@@ -128,7 +135,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rates = [float(rate) for rate in given.rates.split(",")]
     runs = [Run.draw(given.half, seed, rates, given.robots.split(",")) for seed in seeds]
     if given.run is None:
-        print(_table(measured(runs, given.workers)))
+        found = measured(runs, given.workers)
+        print(_table(found), _worst(found), sep="\n")
     else:
         _show(*runs)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,13 @@ class Log:
     reason: str = ""
     rows: list[Tick] = field(default_factory=list)
 
+    @classmethod
+    def start(cls, run: Run, **options: Any) -> Self:
+        """Nothing has happened yet."""
+        at = run.situation
+        controller = Controller(at.skill, at.joints, at.frames, **options)
+        return cls(run, controller, at.joints, at.joints)
+
     @property
     def ticks(self) -> Tick:
         """Arrays of shape (n_ticks, ...)."""
@@ -103,11 +110,7 @@ def simulate(runs: Sequence[Run], **options: Any) -> list[Log]:
     **options
         Of the controllers.
     """
-    logs = []
-    for run in runs:
-        at = run.situation
-        controller = Controller(at.skill, at.joints, at.frames, **options)
-        logs.append(Log(run, controller, at.joints, at.joints))
+    logs = [Log.start(run, **options) for run in runs]
     starts, limits = np.array([log.reference for log in logs]), runs[0].situation.limits
     n_ticks = len(runs[0].true)
     servos = Servos([run.servo for run in runs], starts, limits[:2], n_ticks)
