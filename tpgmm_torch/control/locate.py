@@ -55,7 +55,7 @@ MOTION, REST = 0.02, 0.01
 DISPLACEMENT = 0.06
 #: Lead of the reference of a held robot, at first and at last [rad or m], and the time between
 #: [s].
-LEAD, LARGEST_LEAD, LEAD_TIME = 0.015, 0.05, 2.0
+LEAD, LARGEST_LEAD, LEAD_TIME = 0.015, 0.1, 6.0
 #: A probe that tells nothing ends after that time [s].
 LONGEST_PROBE = 2.0
 #: Share of the lead of robots that hold an object, which they would lose with a jerk.
@@ -153,6 +153,7 @@ class Progress:
     displaced: Flags
     placed: Flags
     relocalized: Flags
+    wanted: Array
 
     @classmethod
     def start(cls, clock: Clock, time: Array, end: float, posture: Array) -> Self:
@@ -163,6 +164,7 @@ class Progress:
             clock, end, Servo.at_rest(posture), time, zero + 1, zero, zero,
             zero.astype(int), zero, zero, zero, posture, posture < -np.inf, 0 * posture,
             posture, posture, none, none, both, both, time, zero - np.inf, none, none, none,
+            posture,
         )  # fmt: skip
 
     @property
@@ -217,7 +219,8 @@ class Progress:
         excess = np.where(known, self.servo.excess, 0.0).max(-1)
         stands = seen.halted | (self.mode != RUNNING)
         waits = self.clock.kind != "even"
-        rate = np.clip(2 - waits * excess, 0.0, 1.0)
+        lead = np.where(known, self.servo.lead, 0.0).max(-1)
+        rate = np.clip(2 - waits * 2 * np.maximum(excess, lead), 0.0, 1.0)
         if waits:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
         rate = np.where(stands, 0.0, rate)
@@ -232,8 +235,9 @@ class Progress:
         moved = np.where(known, np.abs(servo.reading - self.rest[0]), 0.0)
         left = (moved > REST + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
         asked = np.abs(servo.expected - self.rest[1]) - 2 * np.sqrt(servo.spread)
-        stalled = waits & ~stands & ~left & (np.where(known, asked, 0.0).max(-1) > 2 * FLOOR)
-        off = ~stands & (excess > 1) | stalled
+        asked = np.where(known, asked - 6 * np.sqrt(servo.noise), 0.0).max(-1)
+        stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
+        off = ~stands & (excess > 0.75) | stalled
         slow = off & (rate < WAITING_RATE) | stalled
         now = np.stack((servo.reading, servo.expected))
         return replace(
@@ -271,7 +275,7 @@ class Progress:
 
     def _off(self, seen: Seen) -> Flags:
         """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
-        off = self.servo.excess > 1
+        off = self.servo.excess > 0.75
         probed = (self.mode == PROBING)[:, None] & self.stuck
         off |= probed & (np.abs(self.servo.gap) > 0.5 * self.opened)
         return np.isfinite(seen.joints) & off
@@ -362,7 +366,8 @@ class Progress:
         stuck = np.isfinite(seen.joints) & self.stuck
         way = np.where(stuck, np.abs(self.servo.reading - self.reading), 0.0)
         moved = (way > REST + 3 * np.sqrt(self.servo.noise)).any(-1)
-        rows = (self.mode == HELD) & moved & ~seen.halted
+        ahead = np.where(stuck, np.abs(self.wanted - self.target), 0.0).max(-1)
+        rows = (self.mode == HELD) & (moved | (ahead < FLOOR)) & ~seen.halted
         if not rows.any():
             return self
         back = rows & (self.time - self.rest_time > MISSED)

@@ -73,6 +73,11 @@ class Servo:
         Expected position without offset, mean of the lag [s], variance of that position.
     usual : array of shape (B, n_joints)
         Size that gaps usually have at most.
+    lead : array of shape (B, n_joints)
+        How far a joint is from the servo of the shortest lag that is possible, in units of what
+        is usual if it has that lag.
+    near_reading : array of shape (B, n_joints)
+        Low pass of the readings over a tenth of a second: a joint that is there stands.
     """
 
     first: Array
@@ -91,6 +96,8 @@ class Servo:
     lag: Array
     spread: Array
     usual: Array
+    lead: Array
+    near_reading: Array
 
     @classmethod
     def at_rest(cls, posture: Array) -> Self:
@@ -99,9 +106,18 @@ class Servo:
         zero, one = np.zeros_like(posture), np.ones_like(posture)
         return cls(
             bank, bank, bank, bank, posture, np.zeros(bank.shape), np.stack([posture] * 3),
-            np.zeros((3, *posture.shape)), 1e-6 * one, zero, OFFSET_STD**2 * one, zero, posture,
-            LAGS.mean() * one, zero, (2 * FLOOR + 2 * OFFSET_STD) * one,
+            np.full((3, *posture.shape), np.nan), 1e-6 * one, zero, OFFSET_STD**2 * one, zero,
+            posture,
+            LAGS.mean() * one, zero, (2 * FLOOR + 2 * OFFSET_STD) * one, zero, posture,
         )  # fmt: skip
+
+    @property
+    def weight(self) -> Array:
+        """Posterior of the lags: other joints of the robot are a prior."""
+        alone = np.exp(self.score)
+        alone = alone / alone.sum(0)
+        weight = alone * alone.mean(-1, keepdims=True)
+        return weight / weight.sum(0)
 
     @property
     def reading(self) -> Array:
@@ -122,7 +138,9 @@ class Servo:
     def moves(self) -> NDArray[np.bool_]:
         """Joints that have been asked to move lately, and have moved."""
         asked = np.abs(self.expected - self.slow.mean(0)) > FLOOR
-        return asked & (np.abs(self.reading - self.slow_reading) > FLOOR / 2)
+        moved = np.abs(self.reading - self.slow_reading) > FLOOR / 2
+        now = np.abs(self.reading - self.near_reading) > 0.002 + 0.5 * np.sqrt(self.noise)
+        return asked & moved & now
 
     def update(
         self,
@@ -151,8 +169,7 @@ class Servo:
         left = np.exp(-moved)
         behind = self.first - reference
         second = reference + left * (self.second - reference + moved * behind)
-        weight = np.exp(self.score)
-        weight = weight / weight.sum(0)
+        weight = self.weight
         expected = (weight * second).sum(0)
         spread = (weight * (second - expected) ** 2).sum(0)
         lag = (weight * LAGS).sum(0)
@@ -160,6 +177,7 @@ class Servo:
         y = np.where(known, reading, expected + self.offset + self.gap)
         gaps = np.stack((*self.gaps[1:], y - expected))
         readings = np.stack((*self.readings[1:], y))
+        jumped = jumped | np.isnan(self.gaps[2])
         if jumped.any():
             gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
         # readings without noise need no smoothing, which would be late
@@ -174,7 +192,13 @@ class Servo:
         wash = 1 - np.exp(-dt / WASH_OUT)
         noise_of_mean = noise * np.minimum(1.0, dt / (2 * smooth))
         own = np.abs(reference - expected)
-        usual = 2 * FLOOR + 2 * np.sqrt(noise_of_mean + spread + self.variance)
+        floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
+        usual = floor + 2 * np.sqrt(noise_of_mean + spread + self.variance)
+        possible = (weight > 0.1 * weight.max(0)).argmax(0)[None]
+        shortest = np.take_along_axis(second, possible, 0)[0]
+        least = floor + 2 * np.sqrt(noise_of_mean + self.variance)
+        least = least + MODEL_ERROR * np.abs(reference - shortest)
+        lead = np.abs(expected + gap - shortest) / least
         return replace(
             self,
             first=reference + left * behind,
@@ -190,6 +214,8 @@ class Servo:
             lag=lag,
             spread=spread,
             usual=usual + MODEL_ERROR * own,
+            lead=np.where(known, lead, 0.0),
+            near_reading=self.near_reading + (1 - np.exp(-dt / 0.1)) * (y - self.near_reading),
         )._learned(own, dt, known & learns)
 
     def _learned(self, own: Array, dt: Array, learns: NDArray[np.bool_]) -> Self:
@@ -201,7 +227,7 @@ class Servo:
         variance = (SERVO_STD / 2) ** 2 + self.noise + (0.1 * motion.mean(0)) ** 2
         worth = dt / np.maximum(2 * self.lag, dt)
         score = self.score - np.where(
-            learns & moves & (self.excess < CERTAIN),
+            learns & moves & (self.excess < 1),
             worth * np.minimum(error / (2 * variance), 8.0),
             0.0,
         )
@@ -210,7 +236,6 @@ class Servo:
         noise = SERVO_STD**2 + self.noise + self.spread + (MODEL_ERROR * own) ** 2
         noise = noise * self.lag
         before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
-        usual &= moves | (self.variance > FLOOR**2)
         gain = np.where(usual, before * dt / (before * dt + noise), 0.0)
         step = gain * self.gap
         return replace(
@@ -232,7 +257,7 @@ class Servo:
 
     def moving_on(self, joints: NDArray[np.bool_]) -> Self:
         """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
-        weight = np.exp(self.score) / np.exp(self.score).sum(0)
+        weight = self.weight
         motion = (weight * (self.previous - self.slow)).sum(0)
         slow = np.where(joints, self.reading - motion, self.slow_reading)
         return replace(self, slow_reading=slow)
