@@ -311,7 +311,8 @@ class Progress:
         late = (self.slow_for > np.maximum(DWELL, 2 * seen.dt)) | (
             seen.jumped & (off.sum(-1) > 0)
         )
-        rows = late & (self.mode == RUNNING) & (self.time < self.end) & ~seen.halted
+        settled = self.since > RESTART + 4 * np.where(off, self.servo.lag, 0.0).max(-1)
+        rows = late & settled & (self.mode == RUNNING) & (self.time < self.end) & ~seen.halted
         if not rows.any():
             return self
         servo, known = self.servo, np.isfinite(seen.joints)
@@ -410,7 +411,7 @@ class Progress:
         servo, rest = self.servo, self.rest
         if mode == RUNNING:
             servo = servo.moving_on(np.broadcast_to(rows[:, None], self.target.shape))
-            rest = np.where(rows[:, None], np.stack((servo.reading, servo.corrected)), rest)
+            rest = np.where(rows[:, None], np.stack((servo.reading, servo.expected)), rest)
         return replace(
             self,
             servo=servo,
