@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.sensing.servo import CERTAIN, FLOOR, Servo
+from tpgmm_torch.sensing.servo import FLOOR, Servo
 
 __all__ = ["LONGEST_TICK", "Progress", "Seen"]
 
@@ -249,9 +249,7 @@ class Progress:
             since=self.since + seen.dt,
             off_for=np.where(off, self.off_for + seen.dt, 0.0),
             slow_for=np.where(slow, self.slow_for + seen.dt, 0.0),
-            followed=np.where(
-                (excess < CERTAIN)[:, None] & ~stands[:, None], now, self.followed
-            ),
+            followed=np.where((excess < 0.5)[:, None] & ~stands[:, None], now, self.followed),
             rest=np.where(left[:, None], now, self.rest),
             rest_time=np.where(left, time, self.rest_time),
         )

@@ -34,13 +34,16 @@ LAGS = np.geomspace(0.01, 0.64, 7)[:, None, None]
 FLOOR = 0.02
 #: Share of the servo's own gap by which the model of its lag may be wrong.
 MODEL_ERROR = 0.3
-#: Share of what is usual up to which a gap is certain to be the servo's own, and teaches its
-#: lag.
-CERTAIN = 0.5
 #: Standard deviations of an offset beforehand, and of what servos do beside it all [rad or m].
 OFFSET_STD, SERVO_STD = 0.05, 0.01
 #: Time in which offsets drift, and after which motion counts no longer [s].
 DRIFT, WASH_OUT = 2.0, 1.0
+#: Time in which readings show that a joint stands, and that their noise is known [s].
+STANDSTILL, NOISE_TIME = 0.1, 0.5
+#: Motion in that time of a joint that stands [rad or m].
+STILL = 0.002
+#: Share of the likeliest lag's probability from which on a lag is possible.
+POSSIBLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +54,16 @@ class Servo:
     ----------
     first, second : array of shape (K, B, n_joints)
         The bank: servos of each lag, of first and of second order.
-    previous : array of shape (K, B, n_joints)
-        ``second`` a tick ago.
     slow : array of shape (K, B, n_joints)
         Low pass of ``second``: motion is what is beside it.
-    slow_reading : array of shape (B, n_joints)
-        The same of the readings.
+    slow_reading, near_reading : array of shape (B, n_joints)
+        The same of the readings, and with a shorter time: a joint that is there stands.
     score : array of shape (K, B, n_joints)
-        Logarithm of the posterior of the lags, up to a constant.
-    readings : array of shape (3, B, n_joints)
-        The last ones.
-    gaps : array of shape (3, B, n_joints)
-        Between these and the expected positions.
+        Logarithm of the likelihood of the lags, up to a constant.
+    readings, gaps : array of shape (3, B, n_joints)
+        The last ones, and the same less expected positions; NaN before the first.
+    reading : array of shape (B, n_joints)
+        Their median: without single outliers.
     noise : array of shape (B, n_joints)
         Variance of the readings.
     offset, variance : array of shape (B, n_joints)
@@ -74,20 +75,19 @@ class Servo:
     usual : array of shape (B, n_joints)
         Size that gaps usually have at most.
     lead : array of shape (B, n_joints)
-        How far a joint is from the servo of the shortest lag that is possible, in units of what
-        is usual if it has that lag.
-    near_reading : array of shape (B, n_joints)
-        Low pass of the readings over a tenth of a second: a joint that is there stands.
+        Size of the gap for the shortest lag that is possible, in units of what is usual then:
+        how far the reference leads.
     """
 
     first: Array
     second: Array
-    previous: Array
     slow: Array
     slow_reading: Array
+    near_reading: Array
     score: Array
     readings: Array
     gaps: Array
+    reading: Array
     noise: Array
     offset: Array
     variance: Array
@@ -97,32 +97,18 @@ class Servo:
     spread: Array
     usual: Array
     lead: Array
-    near_reading: Array
 
     @classmethod
     def at_rest(cls, posture: Array) -> Self:
         """Robots that stand at their references (B, n_joints)."""
         bank = np.broadcast_to(posture, (len(LAGS), *posture.shape))
         zero, one = np.zeros_like(posture), np.ones_like(posture)
+        none = np.full((3, *posture.shape), np.nan)
         return cls(
-            bank, bank, bank, bank, posture, np.zeros(bank.shape), np.stack([posture] * 3),
-            np.full((3, *posture.shape), np.nan), 1e-6 * one, zero, OFFSET_STD**2 * one, zero,
-            posture,
-            LAGS.mean() * one, zero, (2 * FLOOR + 2 * OFFSET_STD) * one, zero, posture,
+            bank, bank, bank, posture, posture, np.zeros(bank.shape),
+            none, none, posture, 1e-6 * one, zero,
+            OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
         )  # fmt: skip
-
-    @property
-    def weight(self) -> Array:
-        """Posterior of the lags: other joints of the robot are a prior."""
-        alone = np.exp(self.score)
-        alone = alone / alone.sum(0)
-        weight = alone * alone.mean(-1, keepdims=True)
-        return weight / weight.sum(0)
-
-    @property
-    def reading(self) -> Array:
-        """The readings without single outliers: medians of three."""
-        return np.median(self.readings, 0)
 
     @property
     def corrected(self) -> Array:
@@ -131,16 +117,16 @@ class Servo:
 
     @property
     def excess(self) -> Array:
-        """Size of the gaps in units of what is usual: above 1, a joint does not follow."""
+        """Size of the gaps in units of what is usual: at 1 a joint does not follow."""
         return np.abs(self.gap) / self.usual
 
     @property
-    def moves(self) -> NDArray[np.bool_]:
-        """Joints that have been asked to move lately, and have moved."""
-        asked = np.abs(self.expected - self.slow.mean(0)) > FLOOR
-        moved = np.abs(self.reading - self.slow_reading) > FLOOR / 2
-        now = np.abs(self.reading - self.near_reading) > 0.002 + 0.5 * np.sqrt(self.noise)
-        return asked & moved & now
+    def weight(self) -> Array:
+        """Posterior of the lags (K, B, n_joints); the robot's other joints are a prior."""
+        alone = np.exp(self.score)
+        alone /= alone.sum(0)
+        weight: Array = alone * alone.sum(-1, keepdims=True)
+        return weight / weight.sum(0)
 
     def update(
         self,
@@ -166,77 +152,85 @@ class Servo:
             Robots whose motion teaches lags and offsets.
         """
         moved = 2 * dt / LAGS
-        left = np.exp(-moved)
-        behind = self.first - reference
+        left, behind = np.exp(-moved), self.first - reference
         second = reference + left * (self.second - reference + moved * behind)
         weight = self.weight
         expected = (weight * second).sum(0)
-        spread = (weight * (second - expected) ** 2).sum(0)
-        lag = (weight * LAGS).sum(0)
         known = np.isfinite(reading)
         y = np.where(known, reading, expected + self.offset + self.gap)
-        gaps = np.stack((*self.gaps[1:], y - expected))
-        readings = np.stack((*self.readings[1:], y))
-        jumped = jumped | np.isnan(self.gaps[2])
+        readings = np.stack((self.readings[1], self.readings[2], y))
+        gaps = np.stack((self.gaps[1], self.gaps[2], y - expected))
+        jumped = jumped | np.isnan(gaps[1])
         if jumped.any():
             gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
-        # readings without noise need no smoothing, which would be late
-        noisy = np.minimum(3 * np.sqrt(self.noise) / FLOOR, 1.0)
-        smooth = np.maximum(0.5 * lag * noisy, dt / 4)
         bend = (gaps[2] - 2 * gaps[1] + gaps[0]) ** 2 / 6
-        noise = self.noise + np.minimum(dt / 0.5, 1) * known * (
-            np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
-        )
+        bend = np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
+        noise = self.noise + np.minimum(dt / NOISE_TIME, 1) * known * bend
+        lag = (weight * LAGS).sum(0)
+        # readings without noise need no smoothing, which would be late
+        noisy = np.minimum(3 * np.sqrt(noise) / FLOOR, 1.0)
+        smooth = np.maximum(0.5 * lag * noisy, dt / 4)
         share = np.where(jumped, 1.0, 1 - np.exp(-dt / smooth))
-        gap = self.gap + share * (np.median(gaps, 0) - self.offset - self.gap)
-        wash = 1 - np.exp(-dt / WASH_OUT)
-        noise_of_mean = noise * np.minimum(1.0, dt / (2 * smooth))
-        own = np.abs(reference - expected)
-        floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
-        usual = floor + 2 * np.sqrt(noise_of_mean + spread + self.variance)
-        possible = (weight > 0.1 * weight.max(0)).argmax(0)[None]
-        shortest = np.take_along_axis(second, possible, 0)[0]
-        least = floor + 2 * np.sqrt(noise_of_mean + self.variance)
-        least = least + MODEL_ERROR * np.abs(reference - shortest)
-        lead = np.abs(expected + gap - shortest) / least
-        return replace(
+        gap = self.gap + share * (_median(gaps) - self.offset - self.gap)
+        gap = np.where(known, gap, 0.0)
+        wash, near = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
+        new = replace(
             self,
             first=reference + left * behind,
             second=second,
-            previous=self.second,
             slow=self.slow + wash * (second - self.slow),
             slow_reading=self.slow_reading + wash * (y - self.slow_reading),
+            near_reading=self.near_reading + near * (y - self.near_reading),
             readings=readings,
             gaps=gaps,
+            reading=_median(readings),
             noise=noise,
-            gap=np.where(known, gap, 0.0),
+            gap=gap,
             expected=expected,
             lag=lag,
-            spread=spread,
-            usual=usual + MODEL_ERROR * own,
-            lead=np.where(known, lead, 0.0),
-            near_reading=self.near_reading + (1 - np.exp(-dt / 0.1)) * (y - self.near_reading),
-        )._learned(own, dt, known & learns)
-
-    def _learned(self, own: Array, dt: Array, learns: NDArray[np.bool_]) -> Self:
-        """Lags and offsets of joints whose gaps are usual, from their motion."""
-        moves, usual = self.moves, learns & (self.excess < 1)
-        # lags: from motion beside the slow one, in which offsets are gone
-        motion = self.previous - self.slow  # medians are a tick late
-        error = (self.reading - self.slow_reading - motion) ** 2
-        variance = (SERVO_STD / 2) ** 2 + self.noise + (0.1 * motion.mean(0)) ** 2
-        worth = dt / np.maximum(2 * self.lag, dt)
-        score = self.score - np.where(
-            learns & moves & (self.excess < 1),
-            worth * np.minimum(error / (2 * variance), 8.0),
-            0.0,
+            spread=(weight * (second - expected) ** 2).sum(0),
         )
-        score = np.maximum(score - score.max(0), -10.0)
+        noise = noise * np.minimum(1.0, dt / (2 * smooth))
+        new = new._judged(reference, weight, noise)
+        motion = self.second - self.slow  # a tick ago, as medians are
+        return new._learned(reference, motion, dt, known & learns)
+
+    def _judged(self, reference: Array, weight: Array, noise: Array) -> Self:
+        """How large the gaps are, beside their noise and what is not known."""
+        # a part of an offset may be friction, which changes sides where a joint turns back
+        floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
+        usual = floor + 2 * np.sqrt(noise + self.spread + self.variance)
+        usual += MODEL_ERROR * np.abs(reference - self.expected)
+        possible = (weight > POSSIBLE * weight.max(0)).argmax(0)
+        shortest = np.take_along_axis(self.second, possible[None], 0)[0]
+        least = floor + 2 * np.sqrt(noise + self.variance)
+        least += MODEL_ERROR * np.abs(reference - shortest)
+        lead = np.abs(self.expected + self.gap - shortest) / least
+        return replace(self, usual=usual, lead=lead)
+
+    def _learned(
+        self, reference: Array, motion: Array, dt: Array, learns: NDArray[np.bool_]
+    ) -> Self:
+        """Lags and offsets of joints whose gaps are usual."""
+        learns = learns & (self.excess < 1)
+        # lags: from motion beside the slow one, in which offsets are gone, of joints that have
+        # been asked to move lately, have moved, and do so now
+        ran = self.reading - self.slow_reading
+        mean = motion.sum(0) / len(LAGS)
+        moves = learns & (np.abs(mean) > FLOOR) & (np.abs(ran) > FLOOR / 2)
+        now = np.abs(self.reading - self.near_reading)
+        moves &= now > STILL + 0.5 * np.sqrt(self.noise)
+        score = self.score
+        if moves.any():
+            variance = (SERVO_STD / 2) ** 2 + self.noise + (0.1 * mean) ** 2
+            error = np.minimum((ran - motion) ** 2 / (2 * variance), 8.0)
+            score = score - moves * (dt / np.maximum(2 * self.lag, dt)) * error
+            score = np.maximum(score - score.max(0), -10.0)
         # offsets: a Kalman filter to which the servo's own motion is noise
-        noise = SERVO_STD**2 + self.noise + self.spread + (MODEL_ERROR * own) ** 2
-        noise = noise * self.lag
+        own = (MODEL_ERROR * (reference - self.expected)) ** 2
+        noise = (SERVO_STD**2 + self.noise + self.spread + own) * self.lag
         before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
-        gain = np.where(usual, before * dt / (before * dt + noise), 0.0)
+        gain = learns * before * dt / (before * dt + noise)
         step = gain * self.gap
         return replace(
             self,
@@ -257,7 +251,11 @@ class Servo:
 
     def moving_on(self, joints: NDArray[np.bool_]) -> Self:
         """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
-        weight = self.weight
-        motion = (weight * (self.previous - self.slow)).sum(0)
+        motion = (self.weight * (self.second - self.slow)).sum(0)
         slow = np.where(joints, self.reading - motion, self.slow_reading)
         return replace(self, slow_reading=slow)
+
+
+def _median(three: Array) -> Array:
+    low, high = np.minimum(three[0], three[1]), np.maximum(three[0], three[1])
+    return np.maximum(low, np.minimum(high, three[2]))
