@@ -46,16 +46,13 @@ LONGEST_TICK = 0.5
 CATCH_UP = 1.5
 #: Time in which the rate of progress of a robot that stood rises to 1 [s].
 RESTART = 0.2
-#: Rate of progress below which, and time after which, a robot does not follow [s].
-WAITING_RATE, DWELL = 0.25, 0.04
-#: Motion that tells whether a joint runs along with its reference, and that it does not rest
-#: [rad or m].
-MOTION, REST = 0.02, 0.01
-#: Motion beyond what reference and rest explain: somebody else's [rad or m].
-DISPLACEMENT = 0.06
-#: Lead of the reference of a held robot, at first and at last [rad or m], and the time between
-#: [s].
-LEAD, LARGEST_LEAD, LEAD_TIME = 0.015, 0.1, 6.0
+#: Gaps, in units of what is usual, from which on a joint does not follow, and for how long [s].
+OFF, DWELL = 0.85, 0.04
+#: Motion that tells something: whether a joint runs along with its reference, that it does not
+#: rest (half of it), and that somebody else moves it (three times) [rad or m].
+MOTION = FLOOR
+#: Time in which the lead of a held robot's reference grows by MOTION, five times at most [s].
+LEAD_TIME = 1.5
 #: A probe that tells nothing ends after that time [s].
 LONGEST_PROBE = 2.0
 #: Share of the lead of robots that hold an object, which they would lose with a jerk.
@@ -103,8 +100,8 @@ class Progress:
     owed, usual_dt : array of shape (B,)
         Time that is still to be caught up, mean duration of the ticks [s].
     mode : int array of shape (B,)
-    since, off_for, slow_for : array of shape (B,)
-        For how long a robot is in its mode, has gaps that are not usual, or hardly goes on [s].
+    since, off_for : array of shape (B,)
+        For how long a robot is in its mode, and has gaps that are not usual [s].
     target : array of shape (B, n_joints)
         Where the references of robots go that do not run.
     stuck : bool array of shape (B, n_joints)
@@ -138,7 +135,6 @@ class Progress:
     mode: NDArray[np.int_]
     since: Array
     off_for: Array
-    slow_for: Array
     target: Array
     stuck: Flags
     opened: Array
@@ -162,7 +158,7 @@ class Progress:
         none, both = zero > 0, np.stack((posture, posture))
         return cls(
             clock, end, Servo.at_rest(posture), time, zero + 1, zero, zero,
-            zero.astype(int), zero, zero, zero, posture, posture < -np.inf, 0 * posture,
+            zero.astype(int), zero, zero, posture, posture < -np.inf, 0 * posture,
             posture, posture, none, none, both, both, time, zero - np.inf, none, none, none,
             posture,
         )  # fmt: skip
@@ -170,7 +166,7 @@ class Progress:
     @property
     def waits(self) -> Flags:
         """Robots that are waited for."""
-        slow = (self.slow_for > DWELL) | (self.mode != RUNNING)
+        slow = (self.off_for > DWELL) | (self.mode != RUNNING)
         return slow & (self.time < self.end)
 
     def advance(self, reference: Array, seen: Seen, find: Find) -> Self:
@@ -205,7 +201,7 @@ class Progress:
 
     def goal(self, wanted: Array, careful: Flags) -> Array:
         """Where references go: of robots that run, the wanted postures (B, n_joints)."""
-        lead = LEAD + (LARGEST_LEAD - LEAD) * np.minimum(self.since / LEAD_TIME, 1.0)
+        lead = MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 5.0)
         lead = np.where(careful, CAREFUL * lead, lead)[:, None]
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
@@ -233,12 +229,11 @@ class Progress:
         time = self._arrived(self._until_end(step), known)
         servo = self.servo
         moved = np.where(known, np.abs(servo.reading - self.rest[0]), 0.0)
-        left = (moved > REST + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
+        left = (moved > MOTION / 2 + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
         asked = np.abs(servo.expected - self.rest[1]) - 2 * np.sqrt(servo.spread)
         asked = np.where(known, asked - 6 * np.sqrt(servo.noise), 0.0).max(-1)
         stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
-        off = ~stands & (excess > 0.75) | stalled
-        slow = off & (rate < WAITING_RATE) | stalled
+        off = ~stands & (excess > OFF) | stalled
         now = np.stack((servo.reading, servo.expected))
         return replace(
             self,
@@ -248,7 +243,6 @@ class Progress:
             usual_dt=usual,
             since=self.since + seen.dt,
             off_for=np.where(off, self.off_for + seen.dt, 0.0),
-            slow_for=np.where(slow, self.slow_for + seen.dt, 0.0),
             followed=np.where((excess < 0.5)[:, None] & ~stands[:, None], now, self.followed),
             rest=np.where(left[:, None], now, self.rest),
             rest_time=np.where(left, time, self.rest_time),
@@ -273,7 +267,7 @@ class Progress:
 
     def _off(self, seen: Seen) -> Flags:
         """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
-        off = self.servo.excess > 0.75
+        off = self.servo.excess > OFF
         probed = (self.mode == PROBING)[:, None] & self.stuck
         off |= probed & (np.abs(self.servo.gap) > 0.5 * self.opened)
         return np.isfinite(seen.joints) & off
@@ -306,7 +300,7 @@ class Progress:
     def _noticed(self, reference: Array, seen: Seen, find: Find) -> Self:
         """Robots that do not follow, and are probed."""
         off = self._off(seen)
-        late = (self.slow_for > np.maximum(DWELL, 2 * seen.dt)) | (
+        late = (self.off_for > np.maximum(DWELL, 2 * seen.dt)) | (
             seen.jumped & (off.sum(-1) > 0)
         )
         settled = self.since > RESTART + 4 * np.where(off, self.servo.lag, 0.0).max(-1)
@@ -319,7 +313,7 @@ class Progress:
         # what a joint that is slow or held does lies between rest and what its reference did
         done, asked = servo.reading - self.followed[0], servo.expected - self.followed[1]
         strange = done - np.clip(done, np.minimum(asked, 0), np.maximum(asked, 0))
-        moved = (off & (np.abs(strange) > DISPLACEMENT)).any(-1)
+        moved = (off & (np.abs(strange) > 3 * MOTION)).any(-1)
         target = np.where(off, servo.corrected, reference)
         new = self._switched(rows, PROBING, target)
         new = replace(
@@ -364,7 +358,7 @@ class Progress:
         """Robots that were held, and move again: what they missed is done then."""
         stuck = np.isfinite(seen.joints) & self.stuck
         way = np.where(stuck, np.abs(self.servo.reading - self.reading), 0.0)
-        moved = (way > REST + 3 * np.sqrt(self.servo.noise)).any(-1)
+        moved = (way > MOTION / 2 + 3 * np.sqrt(self.servo.noise)).any(-1)
         ahead = np.where(stuck, np.abs(self.wanted - self.target), 0.0).max(-1)
         rows = (self.mode == HELD) & (moved | (ahead < FLOOR)) & ~seen.halted
         if not rows.any():
@@ -404,7 +398,7 @@ class Progress:
             return self
         zero: Any = {
             name: np.where(rows, 0.0, getattr(self, name))
-            for name in ("since", "slow_for", "rate", "owed")
+            for name in ("since", "off_for", "rate", "owed")
         }
         servo, rest = self.servo, self.rest
         if mode == RUNNING:

@@ -35,13 +35,11 @@ FLOOR = 0.02
 #: Share of the servo's own gap by which the model of its lag may be wrong.
 MODEL_ERROR = 0.3
 #: Standard deviations of an offset beforehand, and of what servos do beside it all [rad or m].
-OFFSET_STD, SERVO_STD = 0.05, 0.01
+OFFSET_STD, SERVO_STD = 0.05, FLOOR / 2
 #: Time in which offsets drift, and after which motion counts no longer [s].
 DRIFT, WASH_OUT = 2.0, 1.0
-#: Time in which readings show that a joint stands, and that their noise is known [s].
-STANDSTILL, NOISE_TIME = 0.1, 0.5
-#: Motion in that time of a joint that stands [rad or m].
-STILL = 0.002
+#: Time in which readings show that a joint stands [s].
+STANDSTILL = 0.1
 #: Share of the likeliest lag's probability from which on a lag is possible.
 POSSIBLE = 0.1
 
@@ -165,7 +163,7 @@ class Servo:
             gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
         bend = (gaps[2] - 2 * gaps[1] + gaps[0]) ** 2 / 6
         bend = np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
-        noise = self.noise + np.minimum(dt / NOISE_TIME, 1) * known * bend
+        noise = self.noise + np.minimum(dt / WASH_OUT, 1) * known * bend
         lag = (weight * LAGS).sum(0)
         # readings without noise need no smoothing, which would be late
         noisy = np.minimum(3 * np.sqrt(noise) / FLOOR, 1.0)
@@ -219,7 +217,7 @@ class Servo:
         mean = motion.sum(0) / len(LAGS)
         moves = learns & (np.abs(mean) > FLOOR) & (np.abs(ran) > FLOOR / 2)
         now = np.abs(self.reading - self.near_reading)
-        moves &= now > STILL + 0.5 * np.sqrt(self.noise)
+        moves &= now > FLOOR / 10 + 0.5 * np.sqrt(self.noise)
         score = self.score
         if moves.any():
             variance = (SERVO_STD / 2) ** 2 + self.noise + (0.1 * mean) ** 2
