@@ -463,9 +463,8 @@ class Controller:
         """The next references, within the bounds."""
         self._found, goal, progress = found, wanted, self._progress
         if progress.mode.any() and tick.joints is not None:
-            progress = replace(progress, wanted=_rows(as_array(wanted)))
-            self._progress = progress
-            led = progress.goal(progress.wanted, self._holds.busy(wanted))
+            busy = self._holds.busy(wanted)
+            self._progress, led = progress.led(_rows(as_array(wanted)), busy)
             alone = self._tensor(progress.mode == 0).unsqueeze(-1)
             alone = alone | tick.joints.isnan()
             goal = torch.where(alone, wanted, self._tensor(led).to(wanted))

@@ -51,7 +51,7 @@ OFF, DWELL = 0.85, 0.04
 #: Motion that tells something: whether a joint runs along with its reference, that it does not
 #: rest (half of it), and that somebody else moves it (three times) [rad or m].
 MOTION = FLOOR
-#: Time in which the lead of a held robot's reference grows by MOTION, five times at most [s].
+#: Time in which the lead of a held robot's reference grows by MOTION, up to 0.05 [s].
 LEAD_TIME = 1.5
 #: A probe that tells nothing ends after that time [s].
 LONGEST_PROBE = 2.0
@@ -123,6 +123,8 @@ class Progress:
     displaced, placed, relocalized : bool array of shape (B,)
         Robots that somebody else has moved; whose place was found; whose time was set at this
         tick.
+    wanted : array of shape (B, n_joints)
+        What the skill wanted last of robots that do not run.
     """
 
     clock: Clock
@@ -199,13 +201,21 @@ class Progress:
         """Progress where nothing is measured."""
         return replace(self, time=self._until_end(self.clock.speed * dt))
 
-    def goal(self, wanted: Array, careful: Flags) -> Array:
-        """Where references go: of robots that run, the wanted postures (B, n_joints)."""
-        lead = MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 5.0)
+    def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
+        """Where references go: of robots that run, the wanted postures (B, n_joints).
+
+        Parameters
+        ----------
+        wanted : array of shape (B, n_joints)
+        careful : bool array of shape (B,)
+            Robots that hold an object.
+        """
+        lead = MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 2.5)
         lead = np.where(careful, CAREFUL * lead, lead)[:, None]
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
-        return np.where((self.mode == RUNNING)[:, None], wanted, led)
+        goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
+        return replace(self, wanted=wanted), goal
 
     # Running
 

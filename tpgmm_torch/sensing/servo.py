@@ -105,7 +105,7 @@ class Servo:
         return cls(
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none, none, posture, 1e-6 * one, zero,
-            OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
+            16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
         )  # fmt: skip
 
     @property
