@@ -17,10 +17,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_tpgmm.configuration_tpgmm import (
-    TPGMMConfig,
-    state_features,
-)
+from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig, state_features
 from lerobot_policy_tpgmm.dataset_contract import adopt, check_dataset
 from lerobot_policy_tpgmm.mixture_parameters import MixtureParameters
 from lerobot_policy_tpgmm.observations import (
@@ -38,6 +35,7 @@ from tpgmm_tools.cli.learning import Choices
 from tpgmm_tools.hub import describe, download, model_card, upload
 from tpgmm_torch import TaskParameterizedGMM
 from tpgmm_torch.atomic import consistent, recover
+from tpgmm_torch.control.command import Command, Status
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.exceptions import (
     DataError,
@@ -186,16 +184,9 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
             places = {n: p for n, p in (config.frames or {}).items() if n in recorded}
             shown = FrameFeatures(recorded, places, *named, default, width)
             self._learner = Learner(
-                config,
-                self.kinematics,
-                operators,
-                self.mixture,
-                self.joints,
-                shown,
-                dataset_meta,
-                self._become,
-                model,
-            )
+                config, self.kinematics, operators, self.mixture, self.joints, shown,
+                dataset_meta, self._become, model,
+            )  # fmt: skip
         self.reset()
 
     def _asked(self, dataset_meta: Any) -> tuple[Kinematics, Sequence[Operator]]:
@@ -235,9 +226,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         config, dtype = self.config, getattr(torch, self.config.em.dtype)
         self._model, self._stale = model, False
-        self._plain = config.choices() == Choices()
-        if model is not None:
-            self._plain &= isinstance(model, TaskParameterizedGMM)
+        plain = model is None or isinstance(model, TaskParameterizedGMM)
+        self._plain = plain and config.choices() == Choices()
         if not self._plain:
             self.mixture = MixtureParameters(1, [1], dtype)
         else:
@@ -395,7 +385,7 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """Begin a new episode with the next observation."""
         self._controller: Controller | None = None
         self._chunk: Chunk | None = None
-        self._ticks = TickDurations()
+        self._ticks, self._statuses = TickDurations(), dict[int, Status]()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **_unused: Any) -> Tensor:
@@ -511,7 +501,19 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         command = controller.step(float(passed) if start.ndim == 1 else passed, *measured)
         if first:
             self._check_start(start, command.estimate.joints)
+        self._log(command)
         return controller.reference.reshape(-1, start.shape[-1])
+
+    def _log(self, command: Command) -> None:
+        """A line for each robot whose status is another one than at the last action."""
+        several = command.codes.ndim > 0
+        times = command.time.expand(command.codes.shape).flatten().tolist()
+        for robot, status in enumerate(command.status if several else [command.status]):
+            if status != self._statuses.get(robot, Status.RUNNING):
+                reason = command.reason(robot if several else ())
+                what = f"{status}: {reason}" if reason else status
+                log.info("robot %d at %.2f s of the skill: %s", robot, times[robot], what)
+            self._statuses[robot] = status
 
     def _passed(self, batch: Mapping[str, Tensor]) -> float | Tensor:
         """Seconds for which the next reference is."""

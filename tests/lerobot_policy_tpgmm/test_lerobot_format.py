@@ -1,6 +1,7 @@
 """The policy in LeRobot's own commands, from ``tpgmm fit`` on."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -101,11 +102,13 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
     )
     done, log = rollout(
         tmp_path / "policy", start, tmp_path, "--fps=20", "--policy.units=deg",
+        "--duration=4", "--robot.stuck_after=15",
         f"--policy.state_names={json.dumps(list(start))}",
         f"--policy.action_names={json.dumps(list(start)[:17])}",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "'r_wrist_roll.pos'" in done.stderr and "20 per second (--fps)" in done.stderr
+    assert re.search(r"robot 0 at 1\..* of the skill: waiting: joint '.*' is", done.stderr)
     sent = json.loads(log.read_text())
     assert len(sent) >= 12 and list(sent[0]) == list(start)[:17]
     time = torch.arange(len(sent), dtype=torch.float64) / 20

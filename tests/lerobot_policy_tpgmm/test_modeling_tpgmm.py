@@ -236,14 +236,19 @@ def test_each_robot_of_a_batch_does_what_it_does_alone():
 
 
 @pytest.mark.parametrize("what", [STATE, ENVIRONMENT])
-def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what):
+def test_a_robot_that_cannot_be_believed_is_held_and_goes_on(what, caplog):
     def observe(step, now):
         if 40 <= step < 90:
             now[what] = now[what].clone()
             now[what][1] = float("nan")
         return now
 
-    actions, undisturbed = run(closed(), 120, observe), run(closed(), 120, as_it_is)
+    undisturbed = run(closed(), 120, as_it_is)
+    with caplog.at_level("INFO"):
+        actions = run(closed(), 120, observe)
+    log = [line.removeprefix("robot 1 at ") for line in caplog.messages]
+    assert [line.split()[5] for line in log] == ["holding:", "running"]
+    assert "is missing or not finite" in log[0]
     assert bool(actions.isfinite().all())
     # later a last bit decides, for two ticks, between two postures that are wanted
     assert_close(actions[:1, :100], undisturbed[:1, :100].double())

@@ -123,6 +123,8 @@ def test_live_a_controller_leads_the_robot_to_an_object_that_is_moved_meanwhile(
         for _ in range(40):
             view.step(0.05)
         assert view.clock - at < 1.5  # the skill waits for the robot
+        assert [line.partition(": ")[2] for line in view.statuses] == ["running", "waiting"]
+        assert "joint '" in view._status.content
         view.hold.value = False
         bottle = situation.frames["bottle"]
         view.move_frame("bottle", Frame(bottle.position + 0.05, bottle.orientation))

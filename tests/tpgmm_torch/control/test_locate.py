@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tpgmm_torch.control.clock import Clock
-from tpgmm_torch.control.locate import HELD, PROBING, RUNNING, Progress, Seen
+from tpgmm_torch.control.locate import HELD, Progress, Seen
 
 END, FASTEST = 6.0, 2.0
 
@@ -39,7 +39,7 @@ class Loop:
         self.reference = self.first = self.joints = start
         self.now, self.log = 0.0, list[tuple[float, Progress, np.ndarray, np.ndarray]]()
 
-    def tick(self, dt=None, stuck=False, sag=0.0, offset=0.0, put=None, jumped=False) -> None:
+    def tick(self, dt=None, stuck=False, sag=0.0, offset=0.0, put=np.nan) -> None:
         """A tick, in which some joints may be stuck, sag, read wrongly, or be put elsewhere."""
         dt = self.dt if dt is None else dt
         to = self.reference + sag
@@ -47,10 +47,11 @@ class Loop:
         joints = to + left * (self.joints - to + 2 * dt / self.lag * behind)
         self.joints = np.where(stuck, self.joints, joints)
         self.first = np.where(stuck, self.joints, to + left * behind)
-        if put is not None:
-            self.joints = self.first = np.broadcast_to(put, self.joints.shape)
+        self.joints, self.first = (
+            np.where(np.isnan(put), x, put) for x in (self.joints, self.first)
+        )
         each, none = np.full(self.robots, dt), np.zeros(self.robots, bool)
-        seen = Seen(each, self.joints + offset, none | jumped, none)
+        seen = Seen(each, self.joints + offset, none, none)
         self.progress = self.progress.advance(self.reference, seen, self.find)
         wanted = path(self.progress.time)
         self.progress, goal = self.progress.led(wanted, none)
@@ -193,36 +194,16 @@ def test_where_nothing_is_measured_time_goes_on_evenly():
 
 def test_robots_of_a_batch_are_each_as_if_alone():
     happens = [{}, {"stuck": True}, {"put": path(np.array([0.3]))}, {"sag": [0, 0.2, 0]}]
-    alone = [Loop() for _ in happens]
-    together = Loop(robots=len(happens))
+    alone, together = [Loop() for _ in happens], Loop(robots=len(happens))
     for loop, happened in zip(alone, happens, strict=True):
         loop.run(1.2)
         loop.run(1.0, **happened)
         loop.run(1.0)
-    rows = np.arange(len(happens))
+    row = np.arange(len(happens))[:, None]
     together.run(1.2)
-    for _ in range(50):
-        place = np.where((rows == 2)[:, None], happens[2]["put"], np.nan)
-        each, none = np.full(4, 0.02), np.zeros(4, bool)
-        together.put = place
-        stuck, sag = (rows == 1)[:, None], np.outer(rows == 3, [0, 0.2, 0])
-        to = together.reference + sag
-        left, behind = np.exp(-2 * 0.02 / 0.08), together.first - to
-        joints = to + left * (together.joints - to + 0.5 * behind)
-        joints = np.where(stuck, together.joints, joints)
-        first = np.where(stuck, joints, to + left * behind)
-        together.joints = np.where(np.isnan(place), joints, place)
-        together.first = np.where(np.isnan(place), first, place)
-        seen = Seen(each, together.joints, none, none)
-        together.progress = together.progress.advance(together.reference, seen, together.find)
-        _, goal = together.progress.led(path(together.progress.time), none)
-        step = np.clip(goal - together.reference, -FASTEST * 0.02, FASTEST * 0.02)
-        together.reference = together.reference + step
+    put, sag = np.where(row == 2, happens[2]["put"], np.nan), (row == 3) * [0, 0.2, 0]
+    together.run(1.0, stuck=row == 1, put=put, sag=sag)
     together.run(1.0)
     for row, loop in enumerate(alone):
         assert together.progress.time[row] == pytest.approx(loop.progress.time[0], abs=1e-12)
         np.testing.assert_allclose(together.reference[row], loop.reference[0], atol=1e-12)
-
-
-def test_modes_are_told_apart():
-    assert len({RUNNING, PROBING, HELD}) == 3

@@ -308,6 +308,8 @@ class LiveView:
         With the objects where they are now.
     command : Command or None
         The controller's last, if one leads.
+    statuses : list of str
+        Each status of that controller, and from which instant of the skill on.
     clock : float
         The instant that is shown, from the start of the motion [s].
 
@@ -333,6 +335,7 @@ class LiveView:
         self._handles: dict[str, Any] = {}
         self._controller: Controller | None = None
         self.command: Command | None = None
+        self.statuses: list[str] = []
         self.clock, self._posture = 0.0, self._situations[first].joints
         self._lock = threading.RLock()
         with ExitStack() as stack:
@@ -380,12 +383,14 @@ class LiveView:
             if self._controller is None:
                 self._move_to(self.clock + seconds)
                 return
+            last = self.command
             self.command = self._controller.step(seconds, self._posture, self._frames_now())
             if not self.hold.value:
                 self._posture = self.command.reference
-            reason = self.command.reason()
-            self._status.value = self.command.status + (f": {reason}" if reason else "")
             self.clock = float(self.command.time - self.drawing.trajectory.time[0])
+            if last is None or self.command.status != last.status:
+                self.statuses.append(f"{self.clock:.1f} s: {self.command.status}")
+            self._status.content = "  \n".join((*self.statuses[-5:], self.command.reason()))
             self._move_to(self.clock)
             for path, poses in self._scene.robot_poses(self._posture).items():
                 place(self._handles[path], poses[0])
@@ -395,13 +400,13 @@ class LiveView:
         with self._lock:
             self.clock, self._posture = 0.0, self.situation.joints
             self._controller = Controller(self._model.skill, self._posture, self._frames_now())
-            self._run.value = True
+            self.command, self.statuses, self._run.value = None, [], True
 
     def stop_controller(self) -> None:
         """Go back to the reproduction and its time line."""
         with self._lock:
             self._controller = self.command = None
-            self._run.value, self._status.value = False, ""
+            self._run.value, self._status.content = False, ""
             self._move_to(self.clock)
 
     def _frames_now(self) -> dict[str, Frame]:
@@ -440,7 +445,7 @@ class LiveView:
         self._marks = gui.add_markdown("")
         self._run = gui.add_checkbox("controller", False)
         self.hold = gui.add_checkbox("hold the robot", False)
-        self._status = gui.add_text("status", "", disabled=True)
+        self._status = gui.add_markdown("")
         if len(self._situations) > 1:
             numbers = [str(index) for index in range(len(self._situations))]
             chosen = gui.add_dropdown("situation", numbers, initial_value=numbers[first])

@@ -52,7 +52,8 @@ class Bimanual(Robot):
 
     def send_action(self, action):
         self._actions.append(dict(action))
-        self._observed |= action
+        if len(self._actions) <= self.config.stuck_after:
+            self._observed |= action
         return action
 
     def disconnect(self):

@@ -7,7 +7,11 @@ from lerobot.robots import RobotConfig
 @RobotConfig.register_subclass("bimanual")
 @dataclass(kw_only=True)
 class BimanualConfig(RobotConfig):
-    """``start`` holds what is observed by name, ``log`` will hold the actions."""
+    """``start`` holds what is observed by name, ``log`` will hold the actions.
+
+    After ``stuck_after`` actions it stands.
+    """
 
     start: Path
     log: Path
+    stuck_after: int = 10**6
