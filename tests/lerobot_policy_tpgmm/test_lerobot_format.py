@@ -18,7 +18,8 @@ from tpgmm_torch import Demonstration
 from tpgmm_torch import rollout as reproduced
 
 NAMES = fitted().kinematics.joint_names
-POSE_NAMES = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+PARTS = [f"bottle_{part}.pos" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+POSE = dict(zip(PARTS, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True))
 
 BOTTLE = (
     "--robot", "upper_body", "--link", "l_hand", "--link", "r_hand", "--n-components", 30,
@@ -80,6 +81,11 @@ def test_lerobot_eval_runs_it(directory, tmp_path):
     assert outcome["n_episodes"] == 2 and outcome["pc_success"] == 100
 
 
+def joints_named(values):
+    """Joints as the robot calls them."""
+    return dict(zip((f"{name}.pos" for name in NAMES), values.tolist(), strict=True))
+
+
 def rollout(path, start, home, *more):
     """What was sent to the robot, tick by tick, by name."""
     (home / "start.json").write_text(json.dumps(start))
@@ -96,10 +102,7 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
     policy = changed(fitted(), control_fps=20.0)
     policy.save_pretrained(tmp_path / "policy")
     degrees = observed[STATE][0].double().rad2deg()
-    start = {f"{n}.pos": v for n, v in zip(NAMES[::-1], degrees.tolist()[::-1], strict=True)}
-    start |= dict(
-        zip(POSE_NAMES, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True)
-    )
+    start = dict(reversed(joints_named(degrees).items())) | POSE
     done, log = rollout(
         tmp_path / "policy", start, tmp_path, "--fps=20", "--policy.units=deg",
         "--duration=4", "--robot.stuck_after=15",
@@ -125,10 +128,7 @@ def test_lerobot_rollout_moves_a_robot_of_other_order_and_units(tmp_path):
 def test_lerobot_rollout_sends_chunks_that_a_thread_makes(tmp_path):
     observed = {key: value[:1] for key, value in batch().items()}
     changed(fitted(), control_fps=20.0).save_pretrained(tmp_path / "policy")
-    start = dict(zip((f"{n}.pos" for n in NAMES), observed[STATE][0].tolist(), strict=True))
-    start |= dict(
-        zip(POSE_NAMES, pose(bottle_demonstrations()[5].frames["bottle"]).tolist(), strict=True)
-    )
+    start = joints_named(observed[STATE][0]) | POSE
     done, log = rollout(
         tmp_path / "policy", start, tmp_path, "--fps=20", "--inference.type=rtc",
         "--inference.queue_threshold=30", f"--policy.state_names={json.dumps(list(start))}",

@@ -39,15 +39,9 @@ def _most(values: Sequence[float]) -> float:
 
 #: What is printed of a measure of several runs, and what of one run counts as bad.
 COLUMNS: Mapping[str, tuple[Callable[..., float], float]] = {
-    "position": (np.sum, 0),
-    "speed": (np.sum, 0),
-    "acceleration": (np.sum, 0),
-    "jerk": (np.sum, 0),
+    **dict.fromkeys(("position", "speed", "acceleration", "jerk"), (np.sum, 0)),
     "step": (np.max, np.inf),
-    "infinite": (np.sum, 0),
-    "raised": (np.sum, 0),
-    "false": (np.sum, 0),
-    "open": (np.sum, 0),
+    **dict.fromkeys(("infinite", "raised", "false", "open"), (np.sum, 0)),
     "late": (_most, 1),
     "gap": (_most, 0.05),
     "runaway": (np.max, 0.05),

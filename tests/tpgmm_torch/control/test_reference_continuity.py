@@ -1,19 +1,12 @@
 """References move within their bounds, whatever servos, sensors and loops do."""
 
-import warnings
-
 import numpy as np
 import pytest
 
-from tpgmm_evaluation.faults.drawing import Fault, Run
-from tpgmm_evaluation.faults.measures import measure
-from tpgmm_evaluation.faults.runs import simulate
+from tpgmm_evaluation.faults.__main__ import measured
+from tpgmm_evaluation.faults.drawing import HALVES, Fault, Run
 from tpgmm_evaluation.faults.servos import Servo
-from tpgmm_torch.control.command import Status
 
-pytestmark = pytest.mark.skipif(
-    not hasattr(Status, "DISPLACED"), reason="the controller sets references"
-)
 ALL, ONE = np.ones(4), np.eye(4)[1]
 BOUNDS = ("position", "speed", "acceleration", "jerk", "infinite", "raised")
 
@@ -38,11 +31,9 @@ CASES = {
 
 def measures(rate, servo, faults, robot="four joints"):
     """Of one run."""
-    rng = np.random.default_rng(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        [log] = simulate([Run(robot, rate, servo, faults, 0, rng)])
-    return measure(log)
+    run = Run(robot, rate, servo, faults, 0, np.random.default_rng(0))
+    [(_, found)] = measured([run])
+    return found
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -69,3 +60,13 @@ def test_an_offset_that_stays_is_no_reason_to_stop(size, begin):
 def test_a_stopped_robot_is_not_led_far(lag, begin):
     found = measures(50, Servo(lag=lag), [Fault("stop", begin, begin + 3, ALL)])
     assert found["gap"] <= 0.05
+
+
+@pytest.mark.parametrize("robot", ["four joints", "gripper"])
+def test_whatever_is_drawn_references_keep_bounds_and_the_status_is_true(robot):
+    """A few of those that ``python -m tpgmm_evaluation.faults`` draws."""
+    found = measured([Run.draw(HALVES[0], seed, [50.0], [robot]) for seed in range(10)])
+    for run, one in found:
+        assert {name: one[name] for name in BOUNDS} == dict.fromkeys(BOUNDS, 0), str(run)
+        assert not one["open"], str(run)
+    assert sum(one["false"] for _, one in found) <= 0.01 * sum(m["ticks"] for _, m in found)

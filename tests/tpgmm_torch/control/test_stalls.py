@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from tests.tpgmm_torch.control.test_reference_continuity import BOUNDS, measures, pytestmark
+from tests.tpgmm_torch.control.test_reference_continuity import BOUNDS, measures
 from tpgmm_evaluation.faults.drawing import Fault
 from tpgmm_evaluation.faults.servos import Servo
 from tpgmm_evaluation.faults.skills import situations
-
-__all__ = ["pytestmark"]
 
 LAGS = (0.02, 0.14, 0.4)
 

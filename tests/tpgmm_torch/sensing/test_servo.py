@@ -69,11 +69,11 @@ def test_an_offset_is_learned_from_motion(offset, noise):
 
 
 def test_a_joint_that_stops_is_neither_late_nor_off():
-    stop = [None]
+    seen = []
 
     def stopped(time, x, rng):
-        stop[0] = x if time < 3.2 or stop[0] is None else stop[0]
-        return stop[0]
+        seen.append(x if time < 3.2 else seen[-1])
+        return seen[-1]
 
     before, _ = followed(0.08, 3.2)
     servo, _ = followed(0.08, 4.0, reading=stopped)
