@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_evaluation.faults.servos import Servo
-from tpgmm_evaluation.faults.skills import ROBOTS, Situation, situations
+from tpgmm_evaluation.faults.skills import ROBOTS, Scenario, situations
 
 __all__ = ["HALVES", "KINDS", "POSES", "READINGS", "Fault", "Run"]
 
@@ -166,7 +166,7 @@ class Run:
         self.told[wrong] = rng.choice([0, -usual, np.nan], wrong.sum())
 
     @property
-    def situation(self) -> Situation:
+    def situation(self) -> Scenario:
         """Where it begins."""
         return situations(self.robot)[self.number]
 
@@ -192,7 +192,7 @@ class Run:
         return cls(robot, rate, servo, faults, number, rng, seed)
 
 
-def _draw(rng: np.random.Generator, situation: Situation) -> Fault:
+def _draw(rng: np.random.Generator, situation: Scenario) -> Fault:
     """Any fault, some time in the skill."""
     kind, n = str(rng.choice(list(KINDS))), len(situation.joints)
     least, most, longest, share = KINDS[kind]

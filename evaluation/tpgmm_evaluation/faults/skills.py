@@ -20,7 +20,7 @@ from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.skills.skill import Skill
 
-__all__ = ["PATH_RATE", "ROBOTS", "Situation", "situations"]
+__all__ = ["PATH_RATE", "ROBOTS", "Scenario", "situations"]
 
 Array = NDArray[np.float64]
 #: Of the undisturbed references [Hz].
@@ -28,7 +28,7 @@ PATH_RATE = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Situation:
+class Scenario:
     """A skill, and where it begins.
 
     Parameters
@@ -113,7 +113,7 @@ ROBOTS: Mapping[str, Callable[[], tuple[Model, Sequence[Demonstration]]]] = {
 
 
 @cache
-def situations(robot: str) -> Sequence[Situation]:
+def situations(robot: str) -> Sequence[Scenario]:
     """Those of the demonstrations of one of the robots."""
     (model, shown), found = ROBOTS[robot](), []
     skill = model.skill
@@ -122,5 +122,5 @@ def situations(robot: str) -> Sequence[Situation]:
         controller = Controller(skill, start, one.frames)
         for _ in range(round(skill.end * PATH_RATE)):
             path.append(controller.step(1 / PATH_RATE).reference)
-        found.append(Situation(skill, start.numpy(), one.frames, torch.stack(path).numpy()))
+        found.append(Scenario(skill, start.numpy(), one.frames, torch.stack(path).numpy()))
     return found
