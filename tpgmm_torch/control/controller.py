@@ -388,7 +388,10 @@ class Controller:
             readings = np.full_like(reference, np.nan)
             if tick.joints is not None:
                 readings = _rows(as_array(tick.joints))
-            jumped = none if self._inputs is None else self._inputs.jumped.reshape(-1)
+            jumped = none
+            if self._inputs is not None:
+                jumped = self._inputs.jumped.reshape(-1)
+                still = still | self._inputs.jumping.reshape(-1)
             seen = Seen(passed, readings, jumped, still)
             self._progress = before.advance(reference, seen, self._find)
             self._resume((before.mode != 0) & (self._progress.mode == 0))

@@ -116,8 +116,10 @@ class Progress:
         Robots of which a gap was found to be an offset at this tick.
     followed : array of shape (2, B, n_joints)
         Readings and expected positions when a robot last followed.
-    rest : array of shape (2, B, n_joints)
-        Its reading and expected position when it came to rest.
+    rest : array of shape (B, n_joints)
+        Its reading when it came to rest.
+    rest_bank : array of shape (K, B, n_joints)
+        Its servos then.
     rest_time, resumed : array of shape (B,)
         Time in the skill then, and to which a robot went back last [s].
     displaced, placed, relocalized : bool array of shape (B,)
@@ -146,6 +148,7 @@ class Progress:
     told: Flags
     followed: Array
     rest: Array
+    rest_bank: Array
     rest_time: Array
     resumed: Array
     displaced: Flags
@@ -157,19 +160,23 @@ class Progress:
     def start(cls, clock: Clock, time: Array, end: float, posture: Array) -> Self:
         """At times (B,) of the skill, at rest in a posture (B, n_joints)."""
         zero = np.zeros_like(time)
-        none, both = zero > 0, np.stack((posture, posture))
+        none, both, servo = zero > 0, np.stack((posture, posture)), Servo.at_rest(posture)
         return cls(
-            clock, end, Servo.at_rest(posture), time, zero + 1, zero, zero,
+            clock, end, servo, time, zero + 1, zero, zero,
             zero.astype(int), zero, zero, posture, posture < -np.inf, 0 * posture,
-            posture, posture, none, none, both, both, time, zero - np.inf, none, none, none,
-            posture,
+            posture, posture, none, none, both, posture, servo.second, time,
+            zero - np.inf, none, none, none, posture,
         )  # fmt: skip
 
     @property
     def waits(self) -> Flags:
         """Robots that are waited for."""
-        slow = (self.off_for > DWELL) | (self.mode != RUNNING)
-        return slow & (self.time < self.end)
+        return (self._lasting | (self.mode != RUNNING)) & (self.time < self.end)
+
+    @property
+    def _lasting(self) -> Flags:
+        """Robots that have been off for more than a moment."""
+        return self.off_for > np.maximum(DWELL, 2 * self.usual_dt)
 
     def advance(self, reference: Array, seen: Seen, find: Find) -> Self:
         """Progress after a tick.
@@ -210,12 +217,16 @@ class Progress:
         careful : bool array of shape (B,)
             Robots that hold an object.
         """
-        lead = MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 2.5)
-        lead = np.where(careful, CAREFUL * lead, lead)[:, None]
+        lead = np.where(careful, CAREFUL, 1.0)[:, None] * self._lead
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
         goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
         return replace(self, wanted=wanted), goal
+
+    @property
+    def _lead(self) -> Array:
+        """Of the references of robots that are held (B, 1)."""
+        return MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 2.5)[:, None]
 
     # Running
 
@@ -238,10 +249,10 @@ class Progress:
         step = self.clock.speed * rate * step
         time = self._arrived(self._until_end(step), known)
         servo = self.servo
-        moved = np.where(known, np.abs(servo.reading - self.rest[0]), 0.0)
+        moved = np.where(known, np.abs(servo.reading - self.rest), 0.0)
         left = (moved > MOTION / 2 + 3 * np.sqrt(servo.noise)).any(-1) & (self.mode == RUNNING)
-        asked = np.abs(servo.expected - self.rest[1]) - 2 * np.sqrt(servo.spread)
-        asked = np.where(known, asked - 6 * np.sqrt(servo.noise), 0.0).max(-1)
+        asked = servo.asked(self.rest_bank) - 6 * np.sqrt(servo.noise)
+        asked = np.where(known, asked, 0.0).max(-1)
         stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
         off = ~stands & (excess > OFF) | stalled
         now = np.stack((servo.reading, servo.expected))
@@ -254,7 +265,8 @@ class Progress:
             since=self.since + seen.dt,
             off_for=np.where(off, self.off_for + seen.dt, 0.0),
             followed=np.where((excess < 0.5)[:, None] & ~stands[:, None], now, self.followed),
-            rest=np.where(left[:, None], now, self.rest),
+            rest=np.where(left[:, None], servo.reading, self.rest),
+            rest_bank=np.where(left[:, None], servo.second, self.rest_bank),
             rest_time=np.where(left, time, self.rest_time),
         )
 
@@ -305,20 +317,19 @@ class Progress:
             reading=reading,
             compared=(self.compared | begins) & (asked | held),
             told=along.any(-1),
+            displaced=self.displaced & ~along.any(-1),
         )
 
     def _noticed(self, reference: Array, seen: Seen, find: Find) -> Self:
         """Robots that do not follow, and are probed."""
         off = self._off(seen)
-        late = (self.off_for > np.maximum(DWELL, 2 * seen.dt)) | (
-            seen.jumped & (off.sum(-1) > 0)
-        )
+        late = self._lasting | (seen.jumped & (off.sum(-1) > 0))
         settled = self.since > RESTART + 4 * np.where(off, self.servo.lag, 0.0).max(-1)
         rows = late & settled & (self.mode == RUNNING) & (self.time < self.end) & ~seen.halted
         if not rows.any():
             return self
         servo, known = self.servo, np.isfinite(seen.joints)
-        asked = known & (np.abs(servo.expected - self.rest[1]) > FLOOR)  # it stands
+        asked = known & (servo.asked(self.rest_bank) > FLOOR)  # it stands
         off = np.where(off.any(-1, keepdims=True), off, asked)
         # what a joint that is slow or held does lies between rest and what its reference did
         done, asked = servo.reading - self.followed[0], servo.expected - self.followed[1]
@@ -369,8 +380,9 @@ class Progress:
         stuck = np.isfinite(seen.joints) & self.stuck
         way = np.where(stuck, np.abs(self.servo.reading - self.reading), 0.0)
         moved = (way > MOTION / 2 + 3 * np.sqrt(self.servo.noise)).any(-1)
-        ahead = np.where(stuck, np.abs(self.wanted - self.target), 0.0).max(-1)
-        rows = (self.mode == HELD) & (moved | (ahead < FLOOR)) & ~seen.halted
+        # as far as it is led it may stick: from where nothing more is wanted, time goes on
+        there = (~stuck | (np.abs(self.wanted - self.target) < self._lead)).all(-1)
+        rows = (self.mode == HELD) & (moved | there) & ~seen.halted
         if not rows.any():
             return self
         back = rows & (self.time - self.rest_time > MISSED)
@@ -410,14 +422,18 @@ class Progress:
             name: np.where(rows, 0.0, getattr(self, name))
             for name in ("since", "off_for", "rate", "owed")
         }
-        servo, rest = self.servo, self.rest
+        servo, rest, bank = self.servo, self.rest, self.rest_bank
         if mode == RUNNING:
             servo = servo.moving_on(np.broadcast_to(rows[:, None], self.target.shape))
-            rest = np.where(rows[:, None], np.stack((servo.reading, servo.expected)), rest)
+            if (self.displaced & rows).any():
+                servo = servo.put((self.displaced & rows)[:, None])
+            rest = np.where(rows[:, None], servo.reading, rest)
+            bank = np.where(rows[:, None], servo.second, bank)
         return replace(
             self,
             servo=servo,
             rest=rest,
+            rest_bank=bank,
             mode=np.where(rows, mode, self.mode),
             target=np.where(rows[:, None], target, self.target),
             displaced=self.displaced & ~(rows & (mode == RUNNING)),

@@ -149,6 +149,13 @@ class Inputs:
         return np.zeros(batch, bool) if self.joints is None else self.joints.jumped
 
     @property
+    def jumping(self) -> Mask:
+        """Robots (...) whose joints are read elsewhere, which is not accepted yet."""
+        if self.joints is None:
+            return np.zeros(tuple(self.start.shape[:-1]), bool)
+        return self.joints.fault == JUMPED
+
+    @property
     def frozen(self) -> Mask:
         """Robots (...) whose joints have been the same to the last bit for too long."""
         if self.joints is None:

@@ -75,6 +75,8 @@ class Servo:
     lead : array of shape (B, n_joints)
         Size of the gap for the shortest lag that is possible, in units of what is usual then:
         how far the reference leads.
+    longest : int array of shape (1, B, n_joints)
+        Of the lags that are possible.
     """
 
     first: Array
@@ -95,6 +97,7 @@ class Servo:
     spread: Array
     usual: Array
     lead: Array
+    longest: NDArray[np.int_]
 
     @classmethod
     def at_rest(cls, posture: Array) -> Self:
@@ -106,6 +109,7 @@ class Servo:
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none, none, posture, 1e-6 * one, zero,
             16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
+            np.zeros((1, *posture.shape), int),
         )  # fmt: skip
 
     @property
@@ -199,12 +203,13 @@ class Servo:
         floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
         usual = floor + 2 * np.sqrt(noise + self.spread + self.variance)
         usual += MODEL_ERROR * np.abs(reference - self.expected)
-        possible = (weight > POSSIBLE * weight.max(0)).argmax(0)
-        shortest = np.take_along_axis(self.second, possible[None], 0)[0]
+        possible = weight > POSSIBLE * weight.max(0)
+        shortest = np.take_along_axis(self.second, possible.argmax(0)[None], 0)[0]
+        longest = len(LAGS) - 1 - possible[::-1].argmax(0)[None]
         least = floor + 2 * np.sqrt(noise + self.variance)
         least += MODEL_ERROR * np.abs(reference - shortest)
         lead = np.abs(self.expected + self.gap - shortest) / least
-        return replace(self, usual=usual, lead=lead)
+        return replace(self, usual=usual, lead=lead, longest=longest)
 
     def _learned(
         self, reference: Array, motion: Array, dt: Array, learns: NDArray[np.bool_]
@@ -245,6 +250,19 @@ class Servo:
             offset=np.where(joints, self.offset + self.gap, self.offset),
             gap=np.where(joints, 0.0, self.gap),
             variance=np.where(joints, FLOOR**2, self.variance),
+        )
+
+    def asked(self, bank: Array) -> Array:
+        """How far joints have at least been asked to move since ``second`` was this bank."""
+        return np.abs(np.take_along_axis(self.second - bank, self.longest, 0)[0])
+
+    def put(self, robots: NDArray[np.bool_]) -> Self:
+        """Some robots (B, 1) were put to where they are."""
+        here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
+        here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
+        here |= {"gaps": self.offset, "gap": 0 * self.gap}
+        return replace(
+            self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
         )
 
     def moving_on(self, joints: NDArray[np.bool_]) -> Self:

@@ -69,7 +69,7 @@ class Trust:
 
     joint_timeout: float = 0.2
     frame_timeout: float = 1.0
-    settling_time: float = 0.08
+    settling_time: float = 0.02
     limit_margin: float = 0.5
     joint_jump: float = 0.1
     largest_jump: float = 0.5
@@ -174,13 +174,14 @@ class Reading:
             elapsed = dt + known
             near = (fault == ACCEPTED) & self._near(seen, self.value, elapsed)
             far = (fault == ACCEPTED) & ~near
-            stays = far & self._near(seen, self.rival, dt)
+            stays = (fault == ACCEPTED) & self._near(seen, self.rival, dt)
             lives = stays & (self.rival_lives | self._lives(seen))
         rival_age = np.where(stays, self.rival_age + dt, 0.0)
         each = 2 * self.trust.settling_time
         settled = stays & (rival_age >= self.trust.settling_time)
         jumped = settled & lives & self._small(seen)
         accepted = near | jumped
+        jumped |= near & (self.fault == JUMPED) & stays
         return replace(
             self,
             value=np.where(accepted[..., None], seen, self.value),
