@@ -291,7 +291,7 @@ class Progress:
         """Joints that do not follow; of robots that are probed, whose gaps have not closed."""
         off = self.servo.excess > OFF
         probed = (self.mode == PROBING)[:, None] & self.stuck
-        off |= probed & (np.abs(self.servo.gap) > 0.5 * self.opened)
+        off |= probed & (np.abs(self.servo.gap) > np.maximum(0.5 * self.opened, MOTION / 2))
         return np.isfinite(seen.joints) & off
 
     # From mode to mode
@@ -335,6 +335,8 @@ class Progress:
         done, asked = servo.reading - self.followed[0], servo.expected - self.followed[1]
         strange = done - np.clip(done, np.minimum(asked, 0), np.maximum(asked, 0))
         moved = (off & (np.abs(strange) > 3 * MOTION)).any(-1)
+        several = moved & (off.sum(-1) > 1)
+        off |= moved[:, None] & known  # who was displaced is met in all joints
         target = np.where(off, servo.corrected, reference)
         new = self._switched(rows, PROBING, target)
         new = replace(
@@ -345,7 +347,6 @@ class Progress:
             placed=self.placed & ~rows,
             compared=self.compared & ~rows,
         )
-        several = moved & (off.sum(-1) > 1)
         return new._placed(rows & several, known, find)
 
     def _probed(self, reference: Array, seen: Seen, find: Find) -> Self:
@@ -356,7 +357,7 @@ class Progress:
         off, known = self._off(seen), np.isfinite(seen.joints)
         lag = np.where(off, servo.lag, 0.0).max(-1)
         stuck = known & self.stuck
-        near = np.where(stuck, np.abs(reference - self.target), 0.0).max(-1) < FLOOR
+        near = np.where(stuck, np.abs(reference - self.target), 0.0).max(-1) < FLOOR / 10
         way = np.where(stuck, np.abs(servo.corrected - self.target), 0.0)
         moved = (way > MOTION + 3 * np.sqrt(servo.noise)).any(-1)
         closed = probing & ~off.any(-1)
