@@ -1,20 +1,64 @@
 """LeRobot's asynchronous inference server, with this policy among those that it takes.
 
 ``python -m lerobot_policy_tpgmm.async_server --host=127.0.0.1 --port=8080 --fps=25``
+
+LeRobot's protocol unpickles what it receives, so whoever can connect runs code here. Addresses
+that other machines can reach are refused without ``--allow-remote``.
 """
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+from ipaddress import ip_address
+
+import draccus
+from lerobot.async_inference.configs import PolicyServerConfig
 from lerobot.async_inference.constants import SUPPORTED_POLICIES
 from lerobot.async_inference.policy_server import serve
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 
-__all__ = ["serve"]
+__all__ = ["main"]
 
 # LeRobot asks a list of its own, which plugins are not put into
 if TPGMMConfig.get_choice_name(TPGMMConfig) not in SUPPORTED_POLICIES:
     SUPPORTED_POLICIES.append(TPGMMConfig.get_choice_name(TPGMMConfig))
 
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Serve until interrupted.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        By default those of the command line.
+
+    Raises
+    ------
+    SystemExit
+        If other machines could connect, and are not allowed to.
+    """
+    given = [*(sys.argv[1:] if arguments is None else arguments)]
+    others = [one for one in given if one != "--allow-remote"]
+    config = draccus.parse(PolicyServerConfig, args=others)
+    if others == given and not _is_loopback(config.host):
+        raise SystemExit(
+            f"--host={config.host}: other machines could connect, and whoever connects can run "
+            "code here, as LeRobot's protocol unpickles what it receives. Give "
+            "--host=127.0.0.1 (with a tunnel, ssh -L, if the client is elsewhere), or "
+            "--allow-remote in a network in which you trust everyone"
+        )
+    serve(config)
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether only this machine can connect; IPv6 addresses are in brackets."""
+    try:
+        return host == "localhost" or ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
 if __name__ == "__main__":
-    serve()
+    main()

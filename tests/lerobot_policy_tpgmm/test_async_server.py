@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import threading
 import time
 from concurrent import futures
@@ -28,13 +29,12 @@ def address(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where it is imported it writes a log
     from lerobot.async_inference.policy_server import PolicyServer
 
-    from lerobot_policy_tpgmm import async_server
+    import lerobot_policy_tpgmm.async_server  # noqa: F401  (puts tpgmm among LeRobot's policies)
 
     policy = changed(
         fitted(), control_fps=20.0, chunk_size=20, state_names=NAMES + POSE, action_names=NAMES
     )
     policy.save_pretrained(tmp_path / "policy")
-    assert async_server.serve
     server = grpc.server(futures.ThreadPoolExecutor(2))
     config = PolicyServerConfig(host="127.0.0.1", port=8080, fps=20)
     services_pb2_grpc.add_AsyncInferenceServicer_to_server(PolicyServer(config), server)
@@ -42,6 +42,40 @@ def address(tmp_path, monkeypatch):
     server.start()
     yield f"127.0.0.1:{port}"
     server.stop(None)
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    """``main`` of the server, and the addresses at which it would have listened."""
+    monkeypatch.chdir(tmp_path)
+    from lerobot_policy_tpgmm import async_server
+
+    found = []
+    monkeypatch.setattr(async_server, "serve", lambda config: found.append(config.host))
+    return async_server.main, found
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1", "127.8.0.1", "[::1]"])
+def test_it_serves_this_machine(served, host):
+    main, found = served
+    main([f"--host={json.dumps(host)}", "--port=8090"])  # YAML
+    assert found == [host]
+
+
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "192.168.0.7", "[::]", "", "robot.local", "localhost.evil.org"]
+)
+def test_other_machines_are_refused_unless_allowed(served, host, tmp_path):
+    main, found = served
+    with pytest.raises(SystemExit, match=rf"^--host={re.escape(host)}: .*--allow-remote"):
+        main([f"--host={json.dumps(host)}"])
+    file = tmp_path / "server.yaml"
+    file.write_text(f"host: {json.dumps(host)}\n")
+    with pytest.raises(SystemExit, match="unpickles"):
+        main([f"--config_path={file}"])
+    assert found == []
+    main([f"--host={json.dumps(host)}", "--allow-remote"])
+    assert found == [host]
 
 
 def observed(state):
