@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any, Self
 
 import numpy as np
@@ -34,6 +35,8 @@ __all__ = ["HoldWatch", "Holds", "Rest"]
 LOST, LOST_TURN, LOST_TIME = 0.05, math.radians(25), 0.3
 #: Time between tests whether an object is lost [s].
 LOST_PERIOD = 0.1
+#: A link so near to an object that is not seen any more hides or holds it [m].
+HIDES = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,7 @@ class HoldWatch:
         holding: Holding,
         dt: float | Tensor,
         free_yet: Mapping[str, Tensor],
+        lost: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> tuple[Self, Holding, dict[str, Frame]]:
         """The watch and the held objects after a tick, and the poses of free objects.
 
@@ -116,6 +120,8 @@ class HoldWatch:
             Since the last tick [s].
         free_yet : mapping of str to Tensor of bool, of shape (...)
             Of objects that the skill holds, for which robots it does not yet.
+        lost : mapping of str to Tensor of bool, of shape (...)
+            Of objects that are not seen now, by which robots.
         """
         rests, places = dict(self.rests), dict(frames)
         holding = self._ungiven(holding, free_yet)
@@ -125,10 +131,12 @@ class HoldWatch:
         for name in names - known:
             seen, yet = frames[name], free_yet.get(name, torch.tensor(True))
             rest = rests.get(name) or Rest.at(seen, joints)
+            gone = lost.get(name, torch.tensor(False))
             if rest.seen is not seen:
-                rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet)
+                rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet & ~gone)
             elif rest.pose is seen:  # it has not moved
-                rest = replace(rest, joints=joints)
+                stood = torch.where(gone.unsqueeze(-1), rest.joints, joints)
+                rest = replace(rest, joints=stood)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
         return replace(self, rests=rests), holding, places
@@ -231,12 +239,16 @@ class Holds:
         Start of the first hold of each object in the skill [s].
     given : frozenset of str
         Objects whose holds were given at run time.
+    hidden : mapping of str to Tensor of bool, of shape (...)
+        Of objects that are not seen now, for which robots that is no reason to stand: a hand
+        was at it, or held it since. It is where it was, or where it was let go.
     """
 
     holding: Holding
     watch: HoldWatch
     first: Mapping[str, float]
     given: frozenset[str] = frozenset()
+    hidden: Mapping[str, Tensor] = MappingProxyType({})
 
     @classmethod
     def start(cls, skill: Skill, frames: Mapping[str, Frame]) -> Self:
@@ -275,24 +287,65 @@ class Holds:
         """
         given, watch, holding = self.given.union(holds or ()), self.watch, self.holding
         shares: Mapping[str, Tensor] = {}
+        lost: Mapping[str, Tensor] = {}
         if inputs is not None:
-            shares = inputs.shares
+            shares, lost = inputs.shares, inputs.lost
             if inputs.poses and not holds:
                 now = time.expand(joints.shape[:-1])
                 told = self.first.keys() & given
                 watch, holding, frames = watch.update(
                     inputs.poses.keys() - told, inputs.frames, joints, holding, dt,
-                    {name: now < begin for name, begin in self.first.items()},
+                    {name: now < begin for name, begin in self.first.items()}, lost,
                 )  # fmt: skip
+        if frames is not None:
+            frames = _seen_frames(frames, holding, lost)
         holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
-        return replace(self, holding=holding, watch=watch, given=given)
+        new = replace(self, holding=holding, watch=watch, given=given)
+        if not (lost or self.hidden):
+            return new
+        assert inputs is not None
+        return replace(new, hidden=new._hidden(joints, lost, inputs, dt))
+
+    def _hidden(
+        self, joints: Tensor, lost: Mapping[str, Tensor], inputs: Inputs, dt: float | Tensor
+    ) -> dict[str, Tensor]:
+        """Of objects that are not seen now, for which robots a hand is the reason."""
+        hidden = {}
+        for name, gone in lost.items():
+            known = self.hidden.get(name, gone & False) | ~self.holding.free(name, gone)
+            now = torch.from_numpy(np.asarray(inputs.poses[name].age)) <= dt
+            if bool((gone & now & ~known).any()):
+                state, place = self.watch.kinematics.state(joints), inputs.frames[name].position
+                links = [state.position(link) for link in self.watch.kinematics.links]
+                away = torch.stack([(link - place).norm(dim=-1) for link in links])
+                known = known | (now & (away.amin(0) < HIDES))
+            hidden[name] = gone & known
+        return hidden
 
     def known(self, like: Tensor) -> dict[str, Any]:
-        """For which robots (...) the hand knows where each object is."""
-        one, free = like[..., 0], self.holding.free
-        return {n: np.asarray(~free(n, one).numpy(force=True)) for n in self.holding.held}
+        """For which robots (...) it is known where each object is, seen or not."""
+        one = like[..., 0]
+        known = {name: ~self.holding.free(name, one) for name in self.holding.held}
+        for name, where in self.hidden.items():
+            known[name] = where | known.get(name, where)
+        return {name: np.asarray(where.numpy(force=True)) for name, where in known.items()}
 
     def busy(self, like: Tensor) -> Any:
         """Robots (B,) that hold something."""
         busy = self.holding.busy(torch.zeros(like.shape[:-1]))
         return busy.numpy(force=True).reshape(-1)
+
+
+def _seen_frames(
+    frames: Mapping[str, Frame], holding: Holding, lost: Mapping[str, Tensor]
+) -> Mapping[str, Frame]:
+    """Frames in which objects that were taken, and are not seen, are where they were taken.
+
+    For :meth:`Holding.advance` they then count as not seen.
+    """
+    seen = dict(frames)
+    for name in lost.keys() & seen.keys() & holding.held.keys():
+        taken = holding.held[name].taken
+        if taken is not None:
+            seen[name] = choose(lost[name], taken, seen[name])
+    return seen

@@ -112,8 +112,9 @@ class Holding:
     is where it is seen. Afterwards the grasp settles to where it is seen within seconds, while
     the link hardly moves: two hands that come together may have moved alike, and an object may
     slip. While it is seen to rest although the link moves, the joints do not move it: it is
-    not held yet, whatever the skill's time says. Filters make its pose late: joints become as
-    late from when it is taken on, since the grasp is between poses of one moment.
+    not held yet, whatever the skill's time says, until it is not seen any more. Filters make
+    its pose late: joints become as late from when it is taken on, since the grasp is between
+    poses of one moment.
 
     Parameters
     ----------
@@ -369,7 +370,10 @@ class Holding:
         """An object after it was seen, by robots that held it before."""
         if seen is None or before.taken is None or before.apart is None:
             return held
-        live = held.is_held & (held.carrier == before.carrier) & ~_same(seen, before.taken)
+        unseen = _same(seen, before.taken)
+        live = held.is_held & (held.carrier == before.carrier) & ~unseen
+        if bool((held.rests & unseen).any()):  # it may be lifted by now
+            held = replace(held, rests=held.rests & ~unseen)
         return self._observed(held, seen, live, state_now(), dt) if bool(live.any()) else held
 
     def _observed(

@@ -17,6 +17,7 @@ from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.sensing.pose_filter import OneEuro, PoseFilter
 from tpgmm_torch.sensing.trust import (
     DEAD,
+    FLIPPED,
     IMPOSSIBLE,
     JUMPED,
     LOST,
@@ -38,6 +39,7 @@ FAULTS = {
     JUMPED: "has jumped further than it can have moved",
     OTHER_UNIT: "is in another unit than before (degrees for radians?)",
     DEAD: "is 0 in all joints at once",
+    FLIPPED: "has turned in place further than it can have (a flip of the tracker?)",
 }
 
 
@@ -169,13 +171,19 @@ class Inputs:
         like = self.kinematics.lower
         return {n: torch.from_numpy(s).to(like) for n, s in shares.items() if (s < 1).any()}
 
+    @property
+    def lost(self) -> dict[str, Tensor]:
+        """Robots (...) that do not see an object now, of objects that some do not see."""
+        lost = {name: ~reading.accepted for name, reading in self.poses.items()}
+        return {name: torch.as_tensor(where) for name, where in lost.items() if where.any()}
+
     def untrusted(self, held: Mapping[str, Mask]) -> Mask:
         """Robots (...) without an accepted input for too long.
 
         Parameters
         ----------
         held : mapping of str to ndarray of bool, of shape (...)
-            Robots that hold an object, and so know where it is.
+            Robots that know where an object is without seeing it.
         """
         old = np.zeros(tuple(self.start.shape[:-1]), dtype=bool)
         for name, reading in self._readings().items():

@@ -18,14 +18,14 @@ from tpgmm_torch.exceptions import DataError
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
 
 #: Whether a reading was accepted, and why not.
-ACCEPTED, LOST, IMPOSSIBLE, JUMPED, OTHER_UNIT, DEAD = range(6)
+ACCEPTED, LOST, IMPOSSIBLE, JUMPED, OTHER_UNIT, DEAD, FLIPPED = range(7)
 
 #: Speed that no joint of a robot without limits of speed exceeds [rad/s].
 UNKNOWN_SPEED = 10.0
 #: Share of its limit of speed by which a joint may be seen to move faster.
 SPEED_MARGIN = 1.5
 #: Speeds that no object exceeds [m/s, rad/s].
-OBJECT_SPEED, OBJECT_TURN_RATE = 3.0, 10.0
+OBJECT_SPEED, OBJECT_TURN_RATE = 3.0, 3.0
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,7 +38,8 @@ class Trust:
     A reading that is not finite is lost; one beyond the limits is impossible; one too far from
     the last one has jumped. None of them is used. A jump is accepted once readings that live,
     which differ in the last bit, have stayed there for ``settling_time``; a jump to the last
-    reading in degrees, or of all joints to 0, never is. A robot without an accepted reading for
+    reading in degrees, of all joints to 0, or of an object's orientation alone, as trackers
+    flip, never is. A robot without an accepted reading for
     longer than a timeout is held until there is one.
 
     Parameters
@@ -59,7 +60,7 @@ class Trust:
     frame_jump : float
         The same as ``joint_jump`` of an object's position, on top of 3 m/s [m].
     turn_jump : float
-        The same of its orientation, on top of 10 rad/s [rad].
+        The same of its orientation, on top of 3 rad/s [rad].
 
     Raises
     ------
@@ -211,7 +212,7 @@ class Reading:
         return np.ones(seen.shape[:-1], dtype=bool)
 
     def _small(self, seen: Floats) -> Mask:
-        """Jumps that are accepted wherever they lead."""
+        """Jumps that are accepted once they stay."""
         return np.ones(seen.shape[:-1], dtype=bool)
 
     def _small_change(self) -> float:
@@ -290,6 +291,24 @@ class JointReading(Reading):
 @dataclass(frozen=True, eq=False)
 class PoseReading(Reading):
     """An object's pose, shape (..., 7): position [m] and unit quaternion (w, x, y, z)."""
+
+    def update(self, seen: Floats | None, dt: float | Floats) -> Self:
+        """The next reading; an object that flips is where it is seen, turned as before."""
+        new = super().update(seen, dt)
+        flipped = new.fault == JUMPED
+        if seen is None or not flipped.any():
+            return new
+        flipped &= ~self._small(seen)
+        kept = np.concatenate((seen[..., :3], new.value[..., 3:]), -1)
+        return replace(
+            new,
+            value=np.where(flipped[..., None], kept, new.value),
+            fault=np.where(flipped, FLIPPED, new.fault).astype(np.int8),
+        )
+
+    def _small(self, seen: Floats) -> Mask:
+        moved = np.linalg.norm(seen[..., :3] - self.value[..., :3], axis=-1)
+        return np.asarray(moved > self.trust.frame_jump)
 
     def _small_change(self) -> float:
         return 0.5 * min(self.trust.frame_jump, self.trust.turn_jump / 2)

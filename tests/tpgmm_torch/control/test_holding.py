@@ -1,6 +1,7 @@
 """Objects in the hands of running skills: as places, and as things."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -441,6 +442,106 @@ def test_hands_do_not_run_away_with_what_they_take_too_early(early):
     assert fastest < 3  # of 4 rad/s
     # from when to when the skill holds it counts as ever
     assert bool(controller.holding.free("bottle", controller.time.expand(4)).all())
+
+
+def carried(model, seen, rows=slice(None), seconds=9.0):
+    """Errors at the tray [m], statuses and the last reason, of bottles seen at each tick.
+
+    ``seen(time, pose)`` says what a tracker makes of their poses; they are held as is shown.
+    """
+    scene, rng = scenes(2, seed=9), np.random.default_rng(0)
+    controller = Controller(model.skill, scene.start[rows], scene[rows].frames)
+    bottle, grasp, statuses = scene[rows].bottle, None, []
+    while statuses[-1:] != [["finished"] * len(bottle.position)]:
+        if len(statuses) > seconds / 0.02:
+            break
+        now, at = float(controller.time.max()), hand(controller.reference)
+        if HELD.begin <= now < HELD.end:
+            grasp = bottle.seen_from(at) if grasp is None else grasp
+            bottle = at.compose(grasp)
+        pose = torch.cat((bottle.position, bottle.orientation), -1)
+        jitter = np.pad(1e-6 * rng.standard_normal((2, 3)), ((0, 0), (0, 4)))
+        pose = seen(now, pose + torch.from_numpy(jitter)[rows])
+        frames = {"tray": scene[rows].tray} | ({} if pose is GONE else {"bottle": pose})
+        command = controller.step(0.02, controller.reference, frames)
+        assert float(command.velocity.abs().max()) < 3  # of 4 rad/s
+        statuses.append(command.status)
+    errors = (bottle.position - scene[rows].tray.position).norm(dim=-1)
+    return errors, statuses, command.reasons
+
+
+GONE = "no entry"
+
+
+@cache
+def seen_to_the_end():
+    """The errors of those whose trackers lose nothing."""
+    return carried(carrying_model(), lambda now, pose: pose)[0]
+
+
+@pytest.mark.parametrize("lost", [torch.nan, None, GONE])
+def test_what_is_held_needs_not_be_seen_to_the_end(lost):
+    def seen(now, pose):
+        if now < HELD.begin:
+            return pose
+        return pose * lost if lost is torch.nan else lost
+
+    errors, statuses, _ = carried(carrying_model(), seen)
+    torch.testing.assert_close(errors, seen_to_the_end(), rtol=0, atol=2e-3)
+    assert statuses[-1] == ["finished"] * 2
+    assert not any("holding" in each for each in statuses)
+
+
+def test_what_a_hand_hides_needs_not_be_seen_whether_or_not_the_skill_holds_it():
+    def seen(now, pose):
+        return pose * torch.nan if now >= HELD.begin else pose
+
+    _, statuses, _ = carried(carrying_model(PLACES, holds=False), seen)
+    assert statuses[-1] == ["finished"] * 2
+    assert not any("holding" in each for each in statuses)
+
+
+def test_what_is_lost_far_from_the_hands_is_waited_for():
+    def seen(now, pose):
+        return pose * torch.nan if now > 0.3 else pose
+
+    _, statuses, reasons = carried(carrying_model(), seen, seconds=3.0)
+    assert statuses[-1] == ["holding"] * 2
+    assert "frame 'bottle' is missing" in reasons[(0,)]
+
+
+def test_who_sees_what_it_holds_and_who_does_not_are_each_as_if_alone():
+    def seen(now, pose):
+        if HELD.begin <= now:
+            pose = pose.clone()
+            pose[..., -1, :] = torch.nan
+        return pose
+
+    together, _, _ = carried(carrying_model(), seen)
+    alone, _, _ = carried(carrying_model(), seen, slice(1, 2))
+    torch.testing.assert_close(together[1:], alone, rtol=0, atol=1e-9)
+    torch.testing.assert_close(together[:1], seen_to_the_end()[:1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize(("begin", "lasts"), [(0.4, 0.6), (0.4, 1.6), (3.0, 1.0)])
+def test_a_tracker_that_flips_is_not_followed(begin, lasts, axis):
+    flip, ticks = torch.eye(4, dtype=torch.float64)[axis + 1], []
+
+    def seen(now, pose):
+        ticks.append(now)
+        since = len(ticks) - sum(t < begin for t in ticks)
+        if not 0 < since <= lasts / 0.02:
+            return pose
+        turned = quaternions.product(pose[..., 3:], flip.expand_as(pose[..., 3:]))
+        return torch.cat((pose[..., :3], turned), -1)
+
+    errors, statuses, _ = carried(carrying_model(), seen)
+    torch.testing.assert_close(errors, seen_to_the_end(), rtol=0, atol=2e-3)
+    assert statuses[-1] == ["finished"] * 2
+    held = [each for each in statuses if "holding" in each]
+    # free, it is not known after a second; in the hand it is
+    assert bool(held) == (lasts > 1 and begin < HELD.begin)
 
 
 def test_a_prediction_carries_what_it_holds():

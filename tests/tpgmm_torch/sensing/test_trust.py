@@ -6,6 +6,7 @@ import pytest
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.sensing.trust import (
     ACCEPTED,
+    FLIPPED,
     IMPOSSIBLE,
     JUMPED,
     LOST,
@@ -142,7 +143,7 @@ def test_a_robot_of_a_batch_does_not_know_of_the_others():
         (POSE + 0.01, ACCEPTED),
         (turned(0.5), ACCEPTED),
         (turned(0.1 + 2 * np.pi), ACCEPTED),
-        (turned(1.2), JUMPED),
+        (turned(1.2), FLIPPED),
         (POSE + np.array([0.3, 0, 0, 0, 0, 0, 0]), JUMPED),
         (POSE * 1000, IMPOSSIBLE),
         (POSE * np.nan, LOST),
@@ -164,6 +165,27 @@ def test_an_object_that_was_moved_is_found_where_it_stays():
     for _ in range(10):
         reading = reading.update(there, DT)
     assert reading.value.tolist() == there.tolist()
+
+
+@pytest.mark.parametrize("axis", [4, 5, 6])
+def test_a_flip_is_not_accepted_however_long_it_lasts_and_the_object_moves(axis):
+    reading, flipped = PoseReading.first(TRUST, POSE), np.array(POSE)
+    flipped[3:] = 0
+    flipped[axis] = 1
+    step = np.array([0.01, 0, 0, 0, 0, 0, 0])
+    for k in range(100):
+        reading = reading.update(flipped + k * step, DT)
+        assert reading.fault == FLIPPED
+        assert reading.age == pytest.approx((k + 1) * DT)
+    assert reading.value[3:].tolist() == POSE[3:].tolist()
+    assert reading.update(POSE + 100 * step, DT).accepted
+
+
+def test_what_was_lost_while_it_was_turned_is_accepted():
+    reading = PoseReading.first(TRUST, POSE)
+    for _ in range(50):
+        reading = reading.update(None, DT)
+    assert reading.update(turned(2.0), DT).accepted
 
 
 @pytest.mark.parametrize("name", vars(TRUST))
