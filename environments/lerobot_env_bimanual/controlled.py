@@ -203,6 +203,7 @@ class ControlledEnv(StateEnv):
             part.drawn(rng, self._course, self._usual)
             for part, rng in zip(self.disturbances, self._rngs, strict=True)
         )
+        self._sag = sum(part.sag(len(self.joint_names)) for part in self._drawn)
         self._returns = any(part.shove(-math.inf, math.inf) < 0 for part in self._drawn)
         self._past: list[tuple[float, Any]] = []
         self._shown = self._seen = self._perceived(start.misperception.reshape(-1, 6))
@@ -287,9 +288,9 @@ class ControlledEnv(StateEnv):
         way = last + (goal - last) * np.minimum(np.arange(1, n + 1) / usual, 1.0)[:, None]
         self._reference = way[-1]
         if self.mode == "kinematic":
-            self._scene.place(self._reference, n / 1000)
+            self._scene.place(self._reference + self._sag, n / 1000)
             return n / 1000
-        self._queue = np.concatenate((self._queue, way))
+        self._queue = np.concatenate((self._queue, way + self._sag))
         torques = self._start.torques(round(1000 * self._time), n) if self.pushes else None
         self._scene.follow(self._queue[: n + 1], torques)
         self._queue = self._queue[n:]

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 
 __all__ = [
-    "CONDITIONS", "NOMINAL", "Course", "Displaced", "Disturbance", "IrregularTicks", "Live",
-    "Moved", "NoisyPose", "PoseLost", "StartedMidway", "Stopped", "displaced", "generators",
-    "parse_condition",
+    "CONDITIONS", "NOMINAL", "Biased", "Course", "Displaced", "Disturbance", "IrregularTicks",
+    "Live", "Moved", "NoisyPose", "PoseLost", "Sagging", "StartedMidway", "Stopped",
+    "displaced", "generators", "parse_condition",
 ]  # fmt: skip
 
 Vector = NDArray[np.float64]
@@ -127,6 +127,10 @@ class Disturbance:
     def start(self) -> float:
         """Where in the task the episode begins [s]."""
         return 0.0
+
+    def sag(self, n_joints: int) -> Vector:
+        """By how much each joint stands off its reference (n_joints,) [rad]."""
+        return np.zeros(n_joints)
 
 
 @dataclass(frozen=True)
@@ -307,6 +311,68 @@ class NoisyPose(Disturbance):
 
 
 @dataclass(frozen=True)
+class _Lasting(Disturbance):
+    """Something that stays as it is for an episode.
+
+    Parameters
+    ----------
+    seed : int, default=0
+        Of what is random about it.
+    """
+
+    seed: int = 0
+
+    def drawn(
+        self, rng: np.random.Generator, course: Course, usual: Callable[[Vector], bool]
+    ) -> Self:
+        """With a seed of the episode."""
+        return dataclasses.replace(self, seed=int(rng.integers(2**32)))
+
+
+@dataclass(frozen=True)
+class Biased(_Lasting):
+    """Each object's pose is observed with an error of its own that stays: a wrong calibration.
+
+    Parameters
+    ----------
+    distance, angle : float
+        Along and about random axes [m, rad].
+    """
+
+    distance: float = 0.005
+    angle: float = math.radians(2)
+
+    def seen(
+        self, poses: Vector, last: Vector, time: float, rng: np.random.Generator
+    ) -> Vector:
+        """With the errors of the episode."""
+        biased, own = poses.copy(), np.random.default_rng(self.seed)
+        for pose in biased.reshape(-1, POSE):
+            axes = own.standard_normal((2, 3))
+            axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+            error = (self.distance * axes[0], self.angle * axes[1])
+            pose[:] = displaced(pose, np.concatenate(error))
+        return biased
+
+
+@dataclass(frozen=True)
+class Sagging(_Lasting):
+    """Each joint stands off its reference, to a side that is drawn: drives under load.
+
+    Parameters
+    ----------
+    angle : float
+        By so much [rad].
+    """
+
+    angle: float = math.radians(2)
+
+    def sag(self, n_joints: int) -> Vector:
+        """To the sides of the episode."""
+        return self.angle * np.random.default_rng(self.seed).choice((-1.0, 1.0), n_joints)
+
+
+@dataclass(frozen=True)
 class PoseLost(Disturbance):
     """The objects are not seen for a while, before the grasp.
 
@@ -383,6 +449,8 @@ _KINDS: Mapping[str, Disturbance] = MappingProxyType(
         "moved-slowly": Moved(seconds=1.0),
         "live": Live(),
         "pose-noise": NoisyPose(),
+        "biased": Biased(),
+        "sagging": Sagging(),
         "pose-lost": PoseLost(),
         "pose-stale": PoseLost(stale=True),
         "irregular-ticks": IrregularTicks(),
@@ -404,9 +472,9 @@ def parse_condition(condition: str | Sequence[Disturbance]) -> tuple[Disturbance
     condition : str or sequence of Disturbance
         ``"nominal"``, or names joined by ``+``: ``stopped``, ``pushed-back``,
         ``pushed-ahead``, ``started-midway``, ``moved``, ``moved-slowly``, ``live``,
-        ``pose-noise``, ``pose-lost``, ``pose-stale``, ``irregular-ticks``. A number behind a
-        name says how many seconds, ``stopped-3``, and one behind ``@`` when it happens, if that
-        is not to be drawn: ``pushed-back-1.5@6``.
+        ``pose-noise``, ``biased``, ``sagging``, ``pose-lost``, ``pose-stale``,
+        ``irregular-ticks``. A number behind a name says how many seconds, ``stopped-3``, and
+        one behind ``@`` when it happens, if that is not to be drawn: ``pushed-back-1.5@6``.
 
     Raises
     ------

@@ -7,6 +7,7 @@ import pytest
 
 from lerobot_env_bimanual.disturbances import (
     CONDITIONS,
+    Biased,
     Course,
     Displaced,
     IrregularTicks,
@@ -142,6 +143,22 @@ def test_noise_has_its_sizes_about_each_axis_and_differs_from_tick_to_tick():
     turns = 2 * np.degrees(seen[:, 4:7])  # small, from no rotation
     assert np.std(turns, axis=0) == pytest.approx(2.0, rel=0.06)
     assert np.linalg.norm(seen.reshape(-1, 2, 7)[..., 3:], axis=-1) == pytest.approx(1.0)
+
+
+def test_a_bias_is_one_of_each_object_and_stays_for_the_episode():
+    poses = np.concatenate((POSE, displaced(POSE, np.array([0.1, 0, 0, 0, 0, 0.5]))))
+    errors = []
+    for seed in range(30):
+        part = drawn(Biased(), seed)
+        error = part.seen(poses, poses, 0.0, None) - poses
+        np.testing.assert_array_equal(part.seen(poses, poses, 9.0, None) - poses, error)
+        errors += error.reshape(2, 7).tolist()
+    errors = np.array(errors)
+    assert np.linalg.norm(errors[:, :3], axis=1) == pytest.approx(0.005)
+    chords = np.linalg.norm(errors[:, 3:], axis=1)
+    assert 4 * np.degrees(np.arcsin(chords / 2)) == pytest.approx(2.0)
+    assert np.abs(errors.mean(axis=0)).max() < 0.003  # to all sides, 60 different ones
+    assert len(np.unique(errors[:, 0])) == 60
 
 
 @pytest.mark.parametrize("stale", [False, True])

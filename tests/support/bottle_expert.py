@@ -38,5 +38,5 @@ def perform(env, seed, looking=True):
         action = path[min(round(at) + 1, len(path) - 1)]
         if looking:  # at a bearable speed where it has some way to go
             action = joints + np.clip(action - joints, -3 / env.fps, 3 / env.fps)
-        observation, _, _, over, info = env.step(action)
+        observation, _, _, over, info = env.step(action - env._sag)  # knows how joints sag
     return info

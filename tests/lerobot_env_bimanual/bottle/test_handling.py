@@ -12,6 +12,7 @@ from lerobot_env_bimanual.disturbances import (
     Live,
     Moved,
     PoseLost,
+    Sagging,
     StartedMidway,
     Stopped,
     displaced,
@@ -59,6 +60,20 @@ def test_a_stopped_robot_stands_and_goes_on(mode):
     assert np.abs(path[4 * FPS] - path[2 * FPS]).max() > 0.2
     assert np.abs(joints[-1] - path[round(4.4 * FPS)]).max() < 0.02
     assert env._peaks[0] > 2.5  # it was far behind, and no controller slowed it down
+
+
+@pytest.mark.parametrize("mode", ["dynamic", "kinematic"])
+def test_joints_that_sag_stand_two_degrees_off_their_references(mode):
+    env = made(Sagging(), mode=mode)
+    sides = []
+    for seed in (0, 1):
+        _, path = follow(env, 1.0, seed)
+        for _ in range(FPS):  # it stands
+            observation, *_ = env.step(path[FPS])
+        off = observation["agent_pos"] - path[FPS]
+        np.testing.assert_allclose(np.abs(off), np.radians(2), atol=1e-3)
+        sides.append(np.sign(off).tolist())
+    assert sides[0] != sides[1] and {-1, 1} <= {*sides[0]}
 
 
 def test_hands_do_not_close_while_the_robot_is_stopped():
