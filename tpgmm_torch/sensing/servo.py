@@ -75,8 +75,6 @@ class Servo:
     lead : array of shape (B, n_joints)
         Size of the gap for the shortest lag that is possible, in units of what is usual then:
         how far the reference leads.
-    longest : int array of shape (1, B, n_joints)
-        Of the lags that are possible.
     """
 
     first: Array
@@ -97,7 +95,6 @@ class Servo:
     spread: Array
     usual: Array
     lead: Array
-    longest: NDArray[np.int_]
 
     @classmethod
     def at_rest(cls, posture: Array) -> Self:
@@ -109,7 +106,6 @@ class Servo:
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none, none, posture, 1e-6 * one, zero,
             16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
-            np.zeros((1, *posture.shape), int),
         )  # fmt: skip
 
     @property
@@ -163,8 +159,11 @@ class Servo:
         readings = np.stack((self.readings[1], self.readings[2], y))
         gaps = np.stack((self.gaps[1], self.gaps[2], y - expected))
         jumped = jumped | np.isnan(gaps[1])
+        slow, near = self.slow_reading, self.near_reading
         if jumped.any():
             gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
+            shift = np.where(jumped, gaps[2] - self.offset - self.gap, 0.0)  # is no motion
+            slow, near = slow + shift, near + shift
         bend = (gaps[2] - 2 * gaps[1] + gaps[0]) ** 2 / 6
         bend = np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
         noise = self.noise + np.minimum(dt / WASH_OUT, 1) * known * bend
@@ -175,14 +174,14 @@ class Servo:
         share = np.where(jumped, 1.0, 1 - np.exp(-dt / smooth))
         gap = self.gap + share * (_median(gaps) - self.offset - self.gap)
         gap = np.where(known, gap, 0.0)
-        wash, near = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
+        wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
         new = replace(
             self,
             first=reference + left * behind,
             second=second,
             slow=self.slow + wash * (second - self.slow),
-            slow_reading=self.slow_reading + wash * (y - self.slow_reading),
-            near_reading=self.near_reading + near * (y - self.near_reading),
+            slow_reading=slow + wash * (y - slow),
+            near_reading=near + soon * (y - near),
             readings=readings,
             gaps=gaps,
             reading=_median(readings),
@@ -205,11 +204,10 @@ class Servo:
         usual += MODEL_ERROR * np.abs(reference - self.expected)
         possible = weight > POSSIBLE * weight.max(0)
         shortest = np.take_along_axis(self.second, possible.argmax(0)[None], 0)[0]
-        longest = len(LAGS) - 1 - possible[::-1].argmax(0)[None]
         least = floor + 2 * np.sqrt(noise + self.variance)
         least += MODEL_ERROR * np.abs(reference - shortest)
         lead = np.abs(self.expected + self.gap - shortest) / least
-        return replace(self, usual=usual, lead=lead, longest=longest)
+        return replace(self, usual=usual, lead=lead)
 
     def _learned(
         self, reference: Array, motion: Array, dt: Array, learns: NDArray[np.bool_]
@@ -253,8 +251,8 @@ class Servo:
         )
 
     def asked(self, bank: Array) -> Array:
-        """How far joints have at least been asked to move since ``second`` was this bank."""
-        return np.abs(np.take_along_axis(self.second - bank, self.longest, 0)[0])
+        """How far joints of any lag have been asked to move since ``second`` was this bank."""
+        return np.abs(self.second - bank).min(0)
 
     def put(self, robots: NDArray[np.bool_]) -> Self:
         """Some robots (B, 1) were put to where they are."""
