@@ -72,6 +72,9 @@ class Servo:
         Expected position without offset, mean of the lag [s], variance of that position.
     usual : array of shape (B, n_joints)
         Size that gaps usually have at most.
+    excess : array of shape (B, n_joints)
+        Distance from what some possible lag explains, in units of what is usual: at 1 a joint
+        does not follow.
     lead : array of shape (B, n_joints)
         Size of the gap for the shortest lag that is possible, in units of what is usual then:
         how far the reference leads.
@@ -94,6 +97,7 @@ class Servo:
     lag: Array
     spread: Array
     usual: Array
+    excess: Array
     lead: Array
 
     @classmethod
@@ -105,18 +109,13 @@ class Servo:
         return cls(
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none, none, posture, 1e-6 * one, zero,
-            16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero,
+            16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero, zero,
         )  # fmt: skip
 
     @property
     def corrected(self) -> Array:
         """Where the joints are: readings less offsets."""
         return self.reading - self.offset
-
-    @property
-    def excess(self) -> Array:
-        """Size of the gaps in units of what is usual: at 1 a joint does not follow."""
-        return np.abs(self.gap) / self.usual
 
     @property
     def weight(self) -> Array:
@@ -200,14 +199,16 @@ class Servo:
         """How large the gaps are, beside their noise and what is not known."""
         # a part of an offset may be friction, which changes sides where a joint turns back
         floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
-        usual = floor + 2 * np.sqrt(noise + self.spread + self.variance)
-        usual += MODEL_ERROR * np.abs(reference - self.expected)
-        possible = weight > POSSIBLE * weight.max(0)
+        floor = floor + 2 * np.sqrt(noise + self.variance)
+        usual = floor + MODEL_ERROR * np.abs(reference - self.expected)
+        possible, here = weight > POSSIBLE * weight.max(0), self.expected + self.gap
+        low = np.where(possible, self.second, np.inf).min(0)
+        high = np.where(possible, self.second, -np.inf).max(0)
+        beyond = np.maximum(np.maximum(low - here, here - high), 0.0)
         shortest = np.take_along_axis(self.second, possible.argmax(0)[None], 0)[0]
-        least = floor + 2 * np.sqrt(noise + self.variance)
-        least += MODEL_ERROR * np.abs(reference - shortest)
-        lead = np.abs(self.expected + self.gap - shortest) / least
-        return replace(self, usual=usual, lead=lead)
+        lead = np.abs(here - shortest)
+        lead = lead / (floor + MODEL_ERROR * np.abs(reference - shortest))
+        return replace(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
         self, reference: Array, motion: Array, dt: Array, learns: NDArray[np.bool_]
