@@ -171,7 +171,9 @@ class Servo:
         noisy = np.minimum(3 * np.sqrt(noise) / FLOOR, 1.0)
         smooth = np.maximum(0.5 * lag * noisy, dt / 4)
         share = np.where(jumped, 1.0, 1 - np.exp(-dt / smooth))
-        gap = self.gap + share * (_median(gaps) - self.offset - self.gap)
+        # medians are a tick late: they are compared with what was expected then
+        median, then = _median(readings), (weight * self.second).sum(0)
+        gap = self.gap + share * (median - then - self.offset - self.gap)
         gap = np.where(known, gap, 0.0)
         wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
         new = replace(
@@ -183,7 +185,7 @@ class Servo:
             near_reading=near + soon * (y - near),
             readings=readings,
             gaps=gaps,
-            reading=_median(readings),
+            reading=median,
             noise=noise,
             gap=gap,
             expected=expected,
@@ -191,33 +193,38 @@ class Servo:
             spread=(weight * (second - expected) ** 2).sum(0),
         )
         noise = noise * np.minimum(1.0, dt / (2 * smooth))
-        new = new._judged(reference, weight, noise)
-        motion = self.second - self.slow  # a tick ago, as medians are
-        return new._learned(reference, motion, dt, known & learns)
+        new = new._judged(reference, self.second, weight, noise)
+        motion, ran = self.second - self.slow, median - slow
+        return new._learned(reference, motion, ran, dt, known & learns)
 
-    def _judged(self, reference: Array, weight: Array, noise: Array) -> Self:
-        """How large the gaps are, beside their noise and what is not known."""
+    def _judged(self, reference: Array, bank: Array, weight: Array, noise: Array) -> Self:
+        """How large the gaps to a bank are, beside their noise and what is not known."""
         # a part of an offset may be friction, which changes sides where a joint turns back
         floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
         floor = floor + 2 * np.sqrt(noise + self.variance)
         usual = floor + MODEL_ERROR * np.abs(reference - self.expected)
-        possible, here = weight > POSSIBLE * weight.max(0), self.expected + self.gap
-        low = np.where(possible, self.second, np.inf).min(0)
-        high = np.where(possible, self.second, -np.inf).max(0)
+        possible = weight > POSSIBLE * weight.max(0)
+        here = (weight * bank).sum(0) + self.gap
+        low = np.where(possible, bank, np.inf).min(0)
+        high = np.where(possible, bank, -np.inf).max(0)
         beyond = np.maximum(np.maximum(low - here, here - high), 0.0)
-        shortest = np.take_along_axis(self.second, possible.argmax(0)[None], 0)[0]
+        shortest = np.take_along_axis(bank, possible.argmax(0)[None], 0)[0]
         lead = np.abs(here - shortest)
         lead = lead / (floor + MODEL_ERROR * np.abs(reference - shortest))
         return replace(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
-        self, reference: Array, motion: Array, dt: Array, learns: NDArray[np.bool_]
+        self,
+        reference: Array,
+        motion: Array,
+        ran: Array,
+        dt: Array,
+        learns: NDArray[np.bool_],
     ) -> Self:
         """Lags and offsets of joints whose gaps are usual."""
         learns = learns & (self.excess < 1)
         # lags: from motion beside the slow one, in which offsets are gone, of joints that have
         # been asked to move lately, have moved, and do so now
-        ran = self.reading - self.slow_reading
         mean = motion.sum(0) / len(LAGS)
         moves = learns & (np.abs(mean) > FLOOR) & (np.abs(ran) > FLOOR / 2)
         now = np.abs(self.reading - self.near_reading)
