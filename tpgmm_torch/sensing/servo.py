@@ -58,16 +58,18 @@ class Servo:
         The same of the readings, and with a shorter time: a joint that is there stands.
     score : array of shape (K, B, n_joints)
         Logarithm of the likelihood of the lags, up to a constant.
-    readings, gaps : array of shape (3, B, n_joints)
-        The last ones, and the same less expected positions; NaN before the first.
+    readings : array of shape (3, B, n_joints)
+        The last ones.
+    gaps : array of shape (3, K, B, n_joints)
+        The same less the positions of the bank; NaN before the first.
     reading : array of shape (B, n_joints)
         Their median: without single outliers.
     noise : array of shape (B, n_joints)
         Variance of the readings.
     offset, variance : array of shape (B, n_joints)
         Estimate of the offset, and its variance.
-    gap : array of shape (B, n_joints)
-        What neither lag nor offset explains, smoothed over half a lag.
+    each, gap : arrays of shape (K, B, n_joints) and (B, n_joints)
+        What each lag and the offset do not explain, smoothed over half a lag; their mean.
     expected, lag, spread : array of shape (B, n_joints)
         Expected position without offset, mean of the lag [s], variance of that position.
     usual : array of shape (B, n_joints)
@@ -92,6 +94,7 @@ class Servo:
     noise: Array
     offset: Array
     variance: Array
+    each: Array
     gap: Array
     expected: Array
     lag: Array
@@ -105,11 +108,12 @@ class Servo:
         """Robots that stand at their references (B, n_joints)."""
         bank = np.broadcast_to(posture, (len(LAGS), *posture.shape))
         zero, one = np.zeros_like(posture), np.ones_like(posture)
-        none = np.full((3, *posture.shape), np.nan)
+        none = np.full((3, *bank.shape), np.nan)
         return cls(
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
-            none, none, posture, 1e-6 * one, zero,
-            16 * OFFSET_STD**2 * one, zero, posture, LAGS.mean() * one, zero, one, zero, zero,
+            none[:, 0], none, posture, 1e-6 * one, zero,
+            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, zero, one,
+            zero, zero,
         )  # fmt: skip
 
     @property
@@ -156,14 +160,14 @@ class Servo:
         known = np.isfinite(reading)
         y = np.where(known, reading, expected + self.offset + self.gap)
         readings = np.stack((self.readings[1], self.readings[2], y))
-        gaps = np.stack((self.gaps[1], self.gaps[2], y - expected))
-        jumped = jumped | np.isnan(gaps[1])
+        gaps = np.stack((self.gaps[1], self.gaps[2], y - second))
+        jumped = jumped | np.isnan(gaps[1, 0])
         slow, near = self.slow_reading, self.near_reading
         if jumped.any():
             gaps, readings = (np.where(jumped, x[2], x) for x in (gaps, readings))
-            shift = np.where(jumped, gaps[2] - self.offset - self.gap, 0.0)  # is no motion
+            shift = np.where(jumped, y - expected - self.offset - self.gap, 0.0)  # is no motion
             slow, near = slow + shift, near + shift
-        bend = (gaps[2] - 2 * gaps[1] + gaps[0]) ** 2 / 6
+        bend = (weight * (gaps[2] - 2 * gaps[1] + gaps[0])).sum(0) ** 2 / 6
         bend = np.minimum(bend, 9 * self.noise + 1e-6) - self.noise
         noise = self.noise + np.minimum(dt / WASH_OUT, 1) * known * bend
         lag = (weight * LAGS).sum(0)
@@ -171,10 +175,8 @@ class Servo:
         noisy = np.minimum(3 * np.sqrt(noise) / FLOOR, 1.0)
         smooth = np.maximum(0.5 * lag * noisy, dt / 4)
         share = np.where(jumped, 1.0, 1 - np.exp(-dt / smooth))
-        # medians are a tick late: they are compared with what was expected then
-        median, then = _median(readings), (weight * self.second).sum(0)
-        gap = self.gap + share * (median - then - self.offset - self.gap)
-        gap = np.where(known, gap, 0.0)
+        each = self.each + share * (_median(gaps) - self.offset - self.each)
+        each = np.where(known, each, 0.0)
         wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
         new = replace(
             self,
@@ -185,32 +187,35 @@ class Servo:
             near_reading=near + soon * (y - near),
             readings=readings,
             gaps=gaps,
-            reading=median,
+            reading=_median(readings),
             noise=noise,
-            gap=gap,
+            each=each,
+            gap=(weight * each).sum(0),
             expected=expected,
             lag=lag,
             spread=(weight * (second - expected) ** 2).sum(0),
         )
         noise = noise * np.minimum(1.0, dt / (2 * smooth))
-        new = new._judged(reference, self.second, weight, noise)
-        motion, ran = self.second - self.slow, median - slow
+        new = new._judged(reference, weight, noise)
+        motion, ran = self.second - self.slow, new.reading - slow  # medians are a tick late
         return new._learned(reference, motion, ran, dt, known & learns)
 
-    def _judged(self, reference: Array, bank: Array, weight: Array, noise: Array) -> Self:
-        """How large the gaps to a bank are, beside their noise and what is not known."""
+    def _judged(self, reference: Array, weight: Array, noise: Array) -> Self:
+        """How large the gaps are, beside their noise and what is not known."""
         # a part of an offset may be friction, which changes sides where a joint turns back
         floor = 2 * FLOOR + np.minimum(np.abs(self.offset), FLOOR)
         floor = floor + 2 * np.sqrt(noise + self.variance)
         usual = floor + MODEL_ERROR * np.abs(reference - self.expected)
         possible = weight > POSSIBLE * weight.max(0)
-        here = (weight * bank).sum(0) + self.gap
-        low = np.where(possible, bank, np.inf).min(0)
-        high = np.where(possible, bank, -np.inf).max(0)
-        beyond = np.maximum(np.maximum(low - here, here - high), 0.0)
-        shortest = np.take_along_axis(bank, possible.argmax(0)[None], 0)[0]
-        lead = np.abs(here - shortest)
-        lead = lead / (floor + MODEL_ERROR * np.abs(reference - shortest))
+        least = np.where(possible, self.each, np.inf).min(0)
+        most = np.where(possible, self.each, -np.inf).max(0)
+        beyond = np.maximum(np.maximum(least, -most), 0.0)
+        shortest = possible.argmax(0)[None]
+        own, gap = (
+            np.abs(np.take_along_axis(bank, shortest, 0)[0])
+            for bank in (reference - self.second, self.each)
+        )
+        lead = gap / (floor + MODEL_ERROR * own)
         return replace(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
@@ -245,6 +250,7 @@ class Servo:
             self,
             score=score,
             offset=self.offset + step,
+            each=self.each - step,
             gap=self.gap - step,
             variance=(1 - gain) * before,
         )
@@ -254,6 +260,7 @@ class Servo:
         return replace(
             self.moving_on(joints),
             offset=np.where(joints, self.offset + self.gap, self.offset),
+            each=np.where(joints, self.each - self.gap, self.each),
             gap=np.where(joints, 0.0, self.gap),
             variance=np.where(joints, FLOOR**2, self.variance),
         )
@@ -266,7 +273,7 @@ class Servo:
         """Some robots (B, 1) were put to where they are."""
         here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
         here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
-        here |= {"gaps": self.offset, "gap": 0 * self.gap}
+        here |= {"gaps": self.offset, "each": 0 * self.gap, "gap": 0 * self.gap}
         return replace(
             self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
         )
