@@ -4,16 +4,16 @@ Seen from the controller a joint is a servo of unknown lag, read with an unknown
 payload, an encoder that slipped):
 
     x_k = (1 + p lag_k / 2)^-2 r          for a bank of lags, exact over ticks of any length
-    y   = sum_k w_k x_k + b + g           w_k: posterior of the lag; b: offset, a random walk
+    y   = x_k + b + g_k                   b: offset, a random walk
 
-r is the reference that was sent, p the derivative over time, y the reading, and g the gap that
-neither lag nor offset explains. Its standard deviation is that of the readings' noise, of the
-bank, and of the offset: as long as the lag is not known, nothing is concluded from a gap that
-some lag explains. Gaps count in units of what is usual for this joint, whatever the rate of the
-loop.
+r is the reference that was sent, p the derivative over time, y the reading, and g_k the gap that
+a lag and the offset leave. A gap is judged against the readings' noise, what is not known of the
+offset, and a share of the servo's own gap, whatever the rate of the loop. Of the lags that are
+possible each may explain it: a joint does not follow if none does. How far the reference may
+lead is told by the shortest one.
 
 A robot that does not follow must not be explained by a long lag or by an offset: lags are
-learned while gaps are usual and the joint moves, offsets as well.
+learned while gaps are usual and the joint moves, offsets while gaps are usual.
 """
 
 from __future__ import annotations
