@@ -15,8 +15,8 @@ from tpgmm_torch.mixture.processes import ALONE, Processes
 
 __all__ = ["DemonstratedPeaks", "demonstrated_peaks"]
 
-#: Width of the windows in which polynomials of that degree are fitted [s], and in instants.
-WINDOW, FEWEST, DEGREE = 0.25, 9, 3
+#: Width of the windows in which polynomials are fitted [s], and in instants.
+WINDOW, FEWEST = 0.25, 9
 #: The share of demonstrations that are no outliers.
 DEMONSTRATIONS = 0.9
 
@@ -102,10 +102,7 @@ def _peaks(demonstration: Demonstration) -> Array:
     step = even[1] - even[0]
     joints = np.stack([np.interp(even, time, joint) for joint in joints.T], 1)
     width = min(max(FEWEST, round(WINDOW / step)), len(time)) // 2 * 2 - 1
-    derivatives = [
-        savgol_filter(joints, width, DEGREE, deriv=order, delta=step, axis=0)
-        for order in (2, 3)
-    ]
+    derivatives = [savgol_filter(joints, width, 3, n, delta=step, axis=0) for n in (2, 3)]
     # within half a window of the ends they are extrapolated
     half = min(width // 2, (len(time) - 1) // 2)
     return np.abs(np.stack(derivatives))[:, half : len(time) - half].max(1)

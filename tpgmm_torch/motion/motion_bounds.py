@@ -35,14 +35,13 @@ RISE_TIME, RISE_TIME_ALONE = 0.25, 0.1
 #: name greater limits may mean motors without load, 37 rad/s, which is no reason to go there in
 #: a quarter of a second.
 BELIEVABLE_SPEED = 4.0
-#: A smaller acceleration is rounding, that of a joint at constant speed [rad/s^2 or m/s^2].
-NO_ACCELERATION = 1e-6
 #: Seconds in which every joint may reach its greatest acceleration.
 ONSET = 0.025
-#: Share of a bound that rounding may add to it.
+#: Share of a bound that rounding may add to it, and what it makes of the acceleration of a
+#: joint at constant speed [rad/s^2 or m/s^2].
 ROUNDING = 1e-9
-#: Seconds or metres that are longer than any motion.
-LONG = 1e6
+#: In place of an infinite bound where numbers have to be finite.
+ENDLESS = 1e9
 
 
 class LimitArrays(NamedTuple):
@@ -154,38 +153,11 @@ class MotionBounds:
             demonstrated = demonstrated or kinematics.peaks
             kinematics = kinematics.kinematics
         names = [field.name for field in fields(cls)]
-        for name in given:
-            if name not in names:
-                raise UnknownNameError("bound", name, "the bounds of a motion", names)
-        unlimited = torch.full_like(kinematics.lower, torch.inf, dtype=torch.float64)
-        bound = {}
-        for name in names:
-            own = getattr(kinematics, name)
-            own = unlimited if own is None else own.double()
-            bound[name] = _tightened(name, own, given.get(name), kinematics.joint_names)
+        if unknown := [name for name in given if name not in names]:
+            raise UnknownNameError("bound", unknown[0], "the bounds of a motion", names)
+        bound = {name: _tightened(name, kinematics, given.get(name)) for name in names}
         _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
-        peaks = jerks = torch.zeros_like(unlimited)
-        if demonstrated is not None:
-            peaks, jerks = (as_tensor(x, "demonstrated peaks") for x in demonstrated)
-            for found in (peaks, jerks):
-                if found.shape != unlimited.shape:
-                    raise ShapeError(
-                        f"demonstrated peaks have shape {tuple(unlimited.shape)}, got "
-                        f"{tuple(found.shape)}"
-                    )
-            peaks, jerks = peaks.to(unlimited), jerks.to(unlimited)
-        seconds = RISE_TIME_ALONE if demonstrated is None else RISE_TIME
-        most = max(BELIEVABLE_SPEED / seconds, MARGIN * float(peaks.max()))
-        quick = (bound["velocity"] / seconds).clamp(max=most)
-        # of a joint without limit of speed, what was demonstrated is all that is known
-        unknown = torch.where(peaks > NO_ACCELERATION, 0.0, torch.inf)
-        quick = torch.where(bound["velocity"].isinf(), unknown, quick)
-        acceleration, jerk = bound["acceleration"], bound["jerk"]
-        usual = torch.maximum(quick, MARGIN * peaks)
-        acceleration = torch.where(acceleration.isfinite(), acceleration, usual)
-        usual = torch.maximum(MARGIN * jerks, acceleration / ONSET)
-        jerk = torch.where(jerk.isfinite(), jerk, usual)
-        bound |= {"acceleration": acceleration, "jerk": jerk}
+        bound |= _completed(bound, demonstrated)
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
 
     @cached_property
@@ -202,7 +174,7 @@ class MotionBounds:
         # of 0 would be no number
         bounded = np.isfinite(lower) | np.isfinite(upper)
         stopping, distance = (
-            np.where(bounded, np.nan_to_num(x, nan=LONG, posinf=LONG), 0.0)
+            np.where(bounded, np.nan_to_num(x, nan=ENDLESS, posinf=ENDLESS), 0.0)
             for x in (stopping, distance)
         )
         room = 1 + ROUNDING
@@ -232,8 +204,40 @@ def _warn_of_missing_limits(kinematics: Kinematics, given: list[Tensor]) -> None
         )
 
 
-def _tightened(name: str, own: Tensor, given: Any, joints: tuple[str, ...]) -> Tensor:
+def _completed(
+    bound: Mapping[str, Tensor], demonstrated: tuple[Tensor, Tensor] | None
+) -> dict[str, Tensor]:
+    """Acceleration and jerk, also where they are infinite: of no robot and no user."""
+    velocity, acceleration, jerk = (bound[n] for n in ("velocity", "acceleration", "jerk"))
+    seconds, shown = RISE_TIME_ALONE, [torch.zeros_like(velocity)] * 2
+    if demonstrated is not None:
+        seconds = RISE_TIME
+        shown = [as_tensor(x, "demonstrated peaks").to(velocity) for x in demonstrated]
+    for found in shown:
+        if found.shape != velocity.shape:
+            raise ShapeError(
+                f"demonstrated peaks have shape {tuple(velocity.shape)}, got "
+                f"{tuple(found.shape)}"
+            )
+    peaks, jerks = (MARGIN * found for found in shown)
+    quick = (velocity / seconds).clamp(max=max(BELIEVABLE_SPEED / seconds, float(peaks.max())))
+    # of a joint without limit of speed, what was demonstrated is all that is known
+    unknown = torch.where(peaks > ROUNDING, 0.0, torch.inf)
+    usual = torch.maximum(torch.where(velocity.isinf(), unknown, quick), peaks)
+    acceleration = torch.where(acceleration.isfinite(), acceleration, usual)
+    usual = torch.maximum(jerks, acceleration / ONSET)
+    return {
+        "acceleration": acceleration,
+        "jerk": torch.where(jerk.isfinite(), jerk, usual),
+    }
+
+
+def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
     """The robot's own bound and the user's."""
+    own, joints = getattr(kinematics, name), kinematics.joint_names
+    if own is None:
+        own = torch.full_like(kinematics.lower, torch.inf)
+    own = own.double()
     if given is None:
         return own
     if isinstance(given, Mapping):

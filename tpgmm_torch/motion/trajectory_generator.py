@@ -19,11 +19,9 @@ from ruckig import (
 )
 
 from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.motion.motion_bounds import ENDLESS
 
 __all__ = ["first_part", "stopping_range"]
-
-#: In place of an infinite bound of speed or acceleration, which ruckig does not take.
-ENDLESS = 1e9
 
 
 def first_part(start: Array, target: Array, drift: Array, dt: Array, limits: Array) -> Array:

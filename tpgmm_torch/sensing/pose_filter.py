@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.data.frames import LEVER
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["OneEuro", "PoseFilter"]
@@ -61,10 +62,8 @@ class OneEuro:
                 raise DataError(f"{name} of OneEuro is positive, got {value!r}")
 
 
-#: A radian counts as that many metres of an object's motion: half the size of what hands hold.
-METRES_PER_RADIAN = 0.2
 #: A quaternion's coordinates change half as fast as it turns.
-METRIC = np.array([1.0] * 3 + [(2 * METRES_PER_RADIAN) ** 2] * 4)
+METRIC = np.array([1.0] * 3 + [(2 * LEVER) ** 2] * 4)
 #: Second differences that the noise is the median of.
 MEMORY = 15
 #: Of white noise of variance v in six coordinates, the median of the squared second
