@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from ipaddress import ip_address
 
 import draccus
 from lerobot.async_inference.configs import PolicyServerConfig
@@ -21,28 +20,30 @@ from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 
 __all__ = ["main"]
 
+#: Addresses that this machine alone can reach.
+LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
+
 # LeRobot asks a list of its own, which plugins are not put into
 if TPGMMConfig.get_choice_name(TPGMMConfig) not in SUPPORTED_POLICIES:
     SUPPORTED_POLICIES.append(TPGMMConfig.get_choice_name(TPGMMConfig))
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Serve until interrupted.
 
     Parameters
     ----------
-    arguments : sequence of str, optional
-        By default those of the command line.
+    arguments : sequence of str
+        Of the command line.
 
     Raises
     ------
     SystemExit
         If other machines could connect, and are not allowed to.
     """
-    given = [*(sys.argv[1:] if arguments is None else arguments)]
-    others = [one for one in given if one != "--allow-remote"]
+    others = [one for one in arguments if one != "--allow-remote"]
     config = draccus.parse(PolicyServerConfig, args=others)
-    if others == given and not _is_loopback(config.host):
+    if config.host not in LOOPBACK and "--allow-remote" not in arguments:
         raise SystemExit(
             f"--host={config.host}: other machines could connect, and whoever connects can run "
             "code here, as LeRobot's protocol unpickles what it receives. Give "
@@ -52,13 +53,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
     serve(config)
 
 
-def _is_loopback(host: str) -> bool:
-    """Whether only this machine can connect; IPv6 addresses are in brackets."""
-    try:
-        return host == "localhost" or ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
-
-
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

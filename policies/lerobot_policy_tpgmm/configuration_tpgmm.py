@@ -14,12 +14,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_policy_tpgmm.settings import (
-    ControlConfig,
-    EMConfig,
-    FusionConfig,
-    TrainingConfig,
-)
+from lerobot_policy_tpgmm.settings import ControlConfig, EMConfig, FusionConfig, TrainingConfig
 from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
@@ -35,12 +30,7 @@ from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.skills.via_point import ViaPoint
 from tpgmm_torch.structure.select_ways import SelectWays
 
-__all__ = [
-    "StatePolicyConfig",
-    "TPGMMConfig",
-    "state_features",
-]
-
+__all__ = ["StatePolicyConfig", "TPGMMConfig", "state_features"]
 
 #: Said of policies of earlier releases.
 OLD = (
@@ -245,12 +235,8 @@ class TPGMMConfig(StatePolicyConfig):
 
     def choices(self) -> Choices:
         """Structure that is found in the demonstrations, and what a fit is made of."""
-        return Choices(
-            self.operators == ["auto"],
-            self.n_components == "auto",
-            parse_parts(self.parts),
-            self.modes,
-        )
+        parts, found = parse_parts(self.parts), self.operators == ["auto"]
+        return Choices(found, self.n_components == "auto", parts, self.modes)
 
     @property
     def rate(self) -> float:
@@ -310,13 +296,8 @@ class TPGMMConfig(StatePolicyConfig):
     def estimator(self, kinematics: Kinematics | None, operators: Any) -> TaskParameterizedGMM:
         """An unfitted estimator of these hyper-parameters."""
         count: Any = 10 if self.n_components == "auto" else self.n_components
-        return TaskParameterizedGMM(
-            count,
-            operators,
-            kinematics,
-            fusion=self.fusion.value(),
-            **vars(self.em),
-        )
+        fusion, settings = self.fusion.value(), vars(self.em)
+        return TaskParameterizedGMM(count, operators, kinematics, fusion=fusion, **settings)
 
     def given_holds(self) -> tuple[Hold, ...] | None:
         """What ``holds`` describes; None if it is found."""
@@ -324,10 +305,8 @@ class TPGMMConfig(StatePolicyConfig):
 
     def validate_features(self) -> None:
         """Check that there are a state and an action."""
-        for key, feature in (
-            (OBS_STATE, self.robot_state_feature),
-            (ACTION, self.action_feature),
-        ):
+        needed = {OBS_STATE: self.robot_state_feature, ACTION: self.action_feature}
+        for key, feature in needed.items():
             if feature is None:
                 there = sorted({**(self.input_features or {}), **(self.output_features or {})})
                 raise DataError(f"a tpgmm policy needs {key}; there are {there}")

@@ -19,11 +19,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 
 __all__ = ["adopt", "check_dataset"]
 
-NAMES = {
-    OBS_STATE: "state_names",
-    ACTION: "action_names",
-    OBS_ENV_STATE: "environment_names",
-}
+NAMES = {OBS_STATE: "state_names", ACTION: "action_names", OBS_ENV_STATE: "environment_names"}
 
 
 def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]]:

@@ -49,10 +49,7 @@ class MixtureParameters(nn.Module):
     fitted: Tensor
 
     def __init__(
-        self,
-        n_components: int,
-        dimensions: Sequence[int],
-        dtype: torch.dtype = torch.float64,
+        self, n_components: int, dimensions: Sequence[int], dtype: torch.dtype = torch.float64
     ) -> None:
         super().__init__()
         widths = [1 + dimension for dimension in dimensions]

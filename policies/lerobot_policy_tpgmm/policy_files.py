@@ -35,6 +35,7 @@ PROCESSORS = tuple(
 #: names and statistics, so only what could change numbers counts.
 STEP = ("norm_map", "float_dtype")
 DIGESTS = "digests.json"
+COMPARED = (CONFIG_NAME, *PROCESSORS, f"{MODEL}/{CONFIG_NAME}")
 #: Files of a policy, as the hub selects them.
 PATTERNS = ("*.json", *(f"{MODEL}/{name}" for name in FILES))
 
@@ -49,12 +50,8 @@ def write_files(config: TPGMMConfig, model: Any, directory: Path) -> None:
         config.save_pretrained(folder)
         for processor in make_tpgmm_pre_post_processors(config):
             processor.save_pretrained(folder)
-        digests = {name: _digest(folder / name) for name in _compared()}
+        digests = {name: _digest(folder / name) for name in COMPARED}
         (folder / DIGESTS).write_text(json.dumps(digests, indent=1))
-
-
-def _compared() -> tuple[str, ...]:
-    return (CONFIG_NAME, *PROCESSORS, f"{MODEL}/{CONFIG_NAME}")
 
 
 def _digest(file: Path) -> str:
@@ -76,7 +73,7 @@ def _check_digests(directory: Path) -> None:
     """Refuse files that were not saved together, or were changed since."""
     try:
         digests = json.loads(read_whole(directory / DIGESTS))
-        expected = {name: digests[name] for name in _compared()}
+        expected = {name: digests[name] for name in COMPARED}
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ModelFileError(f"{directory / DIGESTS} cannot be read: {error!r}") from error
     changed = [name for name in expected if _digest(directory / name) != expected[name]]
@@ -97,11 +94,6 @@ def read_model(directory: Path) -> Any:
         If it is missing, damaged, or of release 0.1 or 0.2.
     """
     folder, config = directory / MODEL, directory / CONFIG_NAME
-    if config.exists():
-        try:
-            json.loads(read_whole(config))
-        except (OSError, ValueError, RecursionError) as error:
-            raise ModelFileError(f"{config} cannot be read: {error!r}") from error
     if folder.is_dir():
         model = load(folder)
         _check_digests(directory)

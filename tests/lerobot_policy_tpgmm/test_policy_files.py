@@ -164,7 +164,7 @@ def test_settings_of_a_fitted_policy_can_be_changed(directory):
 @pytest.mark.parametrize("name", ["config.json", "model/config.json"])
 def test_json_that_cannot_be_read_is_refused(directory, name):
     (directory / name).write_text("[" * 100_000)
-    with pytest.raises(ModelFileError, match=r"config\.json cannot be read"):
+    with pytest.raises(ModelFileError, match=r"config\.json"):
         TPGMMPolicy.from_pretrained(directory)
 
 
