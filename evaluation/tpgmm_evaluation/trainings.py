@@ -26,12 +26,7 @@ from tpgmm_evaluation.policies.primitives import DMPPolicy, ProMPPolicy
 from tpgmm_evaluation.policies.replay import NearestPolicy
 from tpgmm_evaluation.policies.situated import KeyPosesPolicy, MeanPolicy
 from tpgmm_evaluation.settings import Settings
-from tpgmm_torch import (
-    Canonical,
-    Demonstration,
-    TaskParameterizedGMM,
-    attach_holds,
-)
+from tpgmm_torch import Canonical, Demonstration, TaskParameterizedGMM, attach_holds
 from tpgmm_torch.alignment import DynamicTimeWarping
 from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.text import format_operator
@@ -42,11 +37,7 @@ __all__ = ["ABLATIONS", "TRAININGS", "operators_of"]
 #: TP-GMM with one of its parts removed, or with its operators chosen by itself.
 ABLATIONS = ("tpgmm-places", "tpgmm-position-only", "tpgmm-no-joints", "tpgmm-auto")
 #: How nearest-neighbour regression is set; chosen as all recipes, on other seeds.
-NEIGHBOURS: dict[str, Any] = {
-    "n_neighbours": 3,
-    "environment_weight": 3.0,
-    "n_action_steps": 8,
-}
+NEIGHBOURS: dict[str, Any] = {"n_neighbours": 3, "environment_weight": 3.0, "n_action_steps": 8}
 NEIGHBOURS_RATE, TIME_WEIGHT = 10, 30.0
 
 

@@ -15,22 +15,15 @@ import argparse
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from itertools import batched, chain
-from multiprocessing import get_context
 
 import numpy as np
-import torch
 
 from tpgmm_evaluation.faults.drawing import HALVES, Run
-from tpgmm_evaluation.faults.measures import false_status, measure
+from tpgmm_evaluation.faults.measures import Measures, false_status, measure, measured
 from tpgmm_evaluation.faults.runs import simulate
 from tpgmm_evaluation.faults.skills import ROBOTS
 
-__all__ = ["main", "measured"]
-
-#: Robots whose servos are simulated together.
-TOGETHER = 16
+__all__ = ["main"]
 
 
 def _most(values: Sequence[float]) -> float:
@@ -46,26 +39,6 @@ COLUMNS: Mapping[str, tuple[Callable[..., float], float]] = {
     "gap": (_most, 0.05),
     "runaway": (np.max, 0.05),
 }
-Measures = Mapping[str, float]
-
-
-def measured(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
-    """Measures of runs."""
-    groups = defaultdict(list)
-    for run in runs:
-        groups[run.robot, run.rate].append(run)
-    parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
-    if workers == 1:
-        return list(chain.from_iterable(map(_measured, parts)))
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        return list(chain.from_iterable(pool.map(_measured, parts)))
-
-
-def _measured(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
-    torch.set_num_threads(1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return [(log.run, measure(log)) for log in simulate(runs)]
 
 
 def _table(found: Sequence[tuple[Run, Measures]]) -> str:
@@ -78,9 +51,8 @@ def _table(found: Sequence[tuple[Run, Measures]]) -> str:
     for kind, several in [*sorted(rows.items()), ("all", [each for _, each in found])]:
         ticks, false = (np.sum([each[name] for each in several]) for name in ("ticks", "false"))
         cells = [f"{pick([m[n] for m in several]):13.4g}" for n, (pick, _) in COLUMNS.items()]
-        lines.append(
-            f"{kind:12}{len(several):6}{100 - 100 * false / ticks:8.2f}{''.join(cells)}"
-        )
+        true = 100 - 100 * false / ticks
+        lines.append(f"{kind:12}{len(several):6}{true:8.2f}{''.join(cells)}")
     return "\n".join(lines)
 
 
@@ -88,9 +60,7 @@ def _worst(found: Sequence[tuple[Run, Measures]]) -> str:
     """Seeds of the worst runs of each measure."""
     lines = []
     for name, (_, most) in COLUMNS.items():
-        worst = sorted(
-            ((m[name], run.seed) for run, m in found if m[name] > most), reverse=True
-        )
+        worst = sorted(((m[name], run.seed) for run, m in found if m[name] > most))[::-1]
         seeds = ", ".join(f"{seed} ({size:.3g})" for size, seed in worst[:8])
         lines.append(f"{name:13}{len(worst):4} runs > {most:g}   {seeds}")
     return "\n".join(lines)
@@ -98,8 +68,7 @@ def _worst(found: Sequence[tuple[Run, Measures]]) -> str:
 
 def _show(run: Run) -> None:
     """One run, every tenth of a second."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with warnings.catch_warnings(action="ignore"):
         [log] = simulate([run])
     ticks, wrong = log.ticks, false_status(log)
     every = max(1, round(run.rate / 10))
@@ -113,10 +82,8 @@ def _show(run: Run) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command line."""
-    form = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
-        prog="python -m tpgmm_evaluation.faults", description=__doc__, formatter_class=form
-    )
+    prog, form = "python -m tpgmm_evaluation.faults", argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog, description=__doc__, formatter_class=form)
     parser.add_argument("--half", choices=HALVES, default=HALVES[0], help="of the seeds")
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
@@ -125,14 +92,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--robots", default=",".join(ROBOTS), help="with commas")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     given = parser.parse_args(arguments)
-    seeds = range(given.seed, given.seed + given.runs) if given.run is None else [given.run]
-    rates = [float(rate) for rate in given.rates.split(",")]
-    runs = [Run.draw(given.half, seed, rates, given.robots.split(",")) for seed in seeds]
-    if given.run is None:
-        found = measured(runs, given.workers)
-        print(_table(found), _worst(found), sep="\n")
-    else:
-        _show(*runs)
+    rates, robots = [float(rate) for rate in given.rates.split(",")], given.robots.split(",")
+    if given.run is not None:
+        _show(Run.draw(given.half, given.run, rates, robots))
+        return
+    seeds = range(given.seed, given.seed + given.runs)
+    runs = [Run.draw(given.half, seed, rates, robots) for seed in seeds]
+    found = measured(runs, given.workers)
+    print(_table(found), _worst(found), sep="\n")
 
 
 if __name__ == "__main__":

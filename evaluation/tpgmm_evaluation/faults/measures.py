@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import batched
+from multiprocessing import get_context
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from tpgmm_evaluation.faults.drawing import KINDS, POSES
-from tpgmm_evaluation.faults.runs import Log, Tick
+from tpgmm_evaluation.faults.drawing import KINDS, POSES, Run
+from tpgmm_evaluation.faults.runs import Log, Tick, simulate
 
-__all__ = ["false_status", "measure"]
+__all__ = ["Measures", "false_status", "measure", "measured"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Measures = Mapping[str, float]
 #: Share by which rounding may exceed a bound.
 ROOM = 1.01
+#: Robots whose servos are simulated together.
+TOGETHER = 16
 
 
-def measure(log: Log) -> Mapping[str, float]:
+def measured(runs: Sequence[Run], workers: int = 1) -> list[tuple[Run, Measures]]:
+    """Measures of runs."""
+    groups = defaultdict(list)
+    for run in runs:
+        groups[run.robot, run.rate].append(run)
+    parts = [part for group in groups.values() for part in batched(group, TOGETHER)]
+    if workers == 1:
+        return [one for part in parts for one in _measured(part)]
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        return [one for part in pool.map(_measured, parts) for one in part]
+
+
+def _measured(runs: Sequence[Run]) -> list[tuple[Run, Measures]]:
+    torch.set_num_threads(1)
+    with warnings.catch_warnings(action="ignore"):
+        return [(log.run, measure(log)) for log in simulate(runs)]
+
+
+def measure(log: Log) -> Measures:
     """Measure one run.
 
     Returns

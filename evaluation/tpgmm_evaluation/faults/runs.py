@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,34 +49,29 @@ class Log:
     Parameters
     ----------
     run : Run
-    controller : Controller
-    reference : ndarray of shape (n_joints,)
-        The last one.
-    reading : ndarray of shape (n_joints,)
-        The last one.
     done : float
         When it finished [s].
     error : str
         An exception, which ends the run.
     reason : str
         Of the last status.
+
+    Attributes
+    ----------
+    reference, reading : ndarray of shape (n_joints,)
+        The last ones.
     """
 
     run: Run
-    controller: Controller
-    reference: Array
-    reading: Array
     done: float = np.inf
     error: str = ""
     reason: str = ""
     rows: list[Tick] = field(default_factory=list)
 
-    @classmethod
-    def start(cls, run: Run, **options: Any) -> Self:
-        """Nothing has happened yet."""
-        at = run.situation
-        controller = Controller(at.skill, at.joints, at.frames, **options)
-        return cls(run, controller, at.joints, at.joints)
+    def __post_init__(self) -> None:
+        at = self.run.situation
+        self.reference = self.reading = at.joints
+        self._controller = Controller(at.skill, at.joints, at.frames)
 
     @property
     def ticks(self) -> Tick:
@@ -89,28 +84,26 @@ class Log:
             return
         expected, self.reading = _read(self.run, joints[0], self.reading, now)
         try:
-            command = self.controller.step(told, self.reading, _seen(self.run, now))
+            command = self._controller.step(told, self.reading, _seen(self.run, now))
         except Exception as error:
             self.error, self.done = f"{type(error).__name__}: {error}", now
             return
         self.reference, self.reason = command.reference.numpy(), command.reason()
-        self.done = min(self.done, now if self.controller.finished else np.inf)
+        self.done = min(self.done, now if self._controller.finished else np.inf)
         ours = self.reference, joints[0], joints[1], load, expected
         answer = self.reading, float(command.time), str(command.status)
         self.rows.append(Tick(told, now, *ours, *answer))
 
 
-def simulate(runs: Sequence[Run], **options: Any) -> list[Log]:
+def simulate(runs: Sequence[Run]) -> list[Log]:
     """Run controllers, each alone, beside servos that are simulated together.
 
     Parameters
     ----------
     runs : sequence of Run
         Of one robot and one rate.
-    **options
-        Of the controllers.
     """
-    logs = [Log.start(run, **options) for run in runs]
+    logs = [Log(run) for run in runs]
     starts, limits = np.array([log.reference for log in logs]), runs[0].situation.limits
     n_ticks = len(runs[0].true)
     servos = Servos([run.servo for run in runs], starts, limits[:2], n_ticks)

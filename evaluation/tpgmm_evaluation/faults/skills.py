@@ -62,10 +62,8 @@ def _rise(share: Any) -> Any:
 
 def _arm(axes: str, gripper: bool = False) -> tuple[Model, Sequence[Demonstration]]:
     """Joints about these axes reach a cup, rest while a gripper closes, and leave it."""
-    text, links = (
-        ['<robot name="arm"><link name="base"/>'],
-        ["base", *range(1, len(axes)), "hand"],
-    )
+    text = ['<robot name="arm"><link name="base"/>']
+    links = ["base", *range(1, len(axes)), "hand"]
     for number, axis in enumerate(axes, 1):
         way = " ".join("1" if axis == name else "0" for name in "xyz")
         text.append(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from tpgmm_evaluation.faults.__main__ import measured
 from tpgmm_evaluation.faults.drawing import HALVES, Fault, Run
+from tpgmm_evaluation.faults.measures import measured
 from tpgmm_evaluation.faults.servos import Servo
 
 ALL, ONE = np.ones(4), np.eye(4)[1]
