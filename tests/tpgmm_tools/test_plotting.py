@@ -85,9 +85,7 @@ def test_local_coordinates_are_those_of_the_operator():
 def test_quaternions_are_drawn_on_the_side_of_the_components():
     [demonstration], [axes] = handlings(1), figure(1, "").axes
     flipped = Demonstration(
-        demonstration.time,
-        OnPoses().flipped_answer(demonstration.joints),
-        demonstration.frames,
+        demonstration.time, OnPoses().flipped_answer(demonstration.joints), demonstration.frames
     )
     plot_local(axes, hands(), 0, 3, [demonstration, flipped])
     one, other = (line.get_ydata() for line in axes.lines)

@@ -17,12 +17,7 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
-from tpgmm_torch.exceptions import (
-    DataError,
-    MissingLimitsWarning,
-    ShapeError,
-    UnknownNameError,
-)
+from tpgmm_torch.exceptions import DataError, MissingLimitsWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = ["MotionBounds"]
@@ -115,10 +110,7 @@ class MotionBounds:
 
     @classmethod
     def of(
-        cls,
-        kinematics: Any,
-        demonstrated: tuple[Tensor, Tensor] | None = None,
-        **given: Any,
+        cls, kinematics: Any, demonstrated: tuple[Tensor, Tensor] | None = None, **given: Any
     ) -> Self:
         """Bounds of a robot, of what was demonstrated, and of the user.
 
@@ -226,10 +218,7 @@ def _completed(
     usual = torch.maximum(torch.where(velocity.isinf(), unknown, quick), peaks)
     acceleration = torch.where(acceleration.isfinite(), acceleration, usual)
     usual = torch.maximum(jerks, acceleration / ONSET)
-    return {
-        "acceleration": acceleration,
-        "jerk": torch.where(jerk.isfinite(), jerk, usual),
-    }
+    return {"acceleration": acceleration, "jerk": torch.where(jerk.isfinite(), jerk, usual)}
 
 
 def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:

@@ -353,11 +353,7 @@ class Regression:
         return (most - self.log_density(times, local, self.n_samples)).reshape(batch)
 
     def candidates(
-        self,
-        time: Tensor,
-        state: RobotState,
-        frames: Mapping[str, Frame],
-        estimate: Estimate,
+        self, time: Tensor, state: RobotState, frames: Mapping[str, Frame], estimate: Estimate
     ) -> tuple[Candidate, ...]:
         """Eq. (1) for each operator, mixed over the components, and each one's share.
 

@@ -166,11 +166,7 @@ def gather_evidence(
 
 
 def _term(
-    operator: Operator,
-    local: Tensor,
-    index: int,
-    kinematics: Kinematics,
-    motion: Motion,
+    operator: Operator, local: Tensor, index: int, kinematics: Kinematics, motion: Motion
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Jacobian, residual, precision and vector of an operator, one demonstration left out."""
     number, state, frames = len(local), motion.state, motion.frames

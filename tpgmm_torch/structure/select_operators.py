@@ -15,11 +15,7 @@ from torch import Tensor
 
 from tpgmm_torch.checks.report import in_columns
 from tpgmm_torch.constraints import DemonstrationEstimator, Interval, check_parameters
-from tpgmm_torch.data.demonstrations import (
-    FEWEST,
-    Demonstration,
-    check_demonstrations,
-)
+from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, check_demonstrations
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import (
     AbsoluteOrientation,

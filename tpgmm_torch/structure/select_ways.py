@@ -14,11 +14,7 @@ from sklearn.base import clone
 
 from tpgmm_torch.constraints import DemonstrationEstimator, Interval, Options, check_parameters
 from tpgmm_torch.data.arrays import Array, as_array
-from tpgmm_torch.data.demonstrations import (
-    FEWEST,
-    Demonstration,
-    check_demonstrations,
-)
+from tpgmm_torch.data.demonstrations import FEWEST, Demonstration, check_demonstrations
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.exceptions import DataError
 from tpgmm_torch.operators import Operator

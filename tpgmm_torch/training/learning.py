@@ -190,7 +190,7 @@ def _of_mixture(
 ) -> dict[str, Any]:
     """Parameters of the mixture of the local data of all operators."""
     return {name: settings[name] for name in SHARED} | {
-        "blocks": block_widths(operators, kinematics),
+        "blocks": block_widths(operators, kinematics)
     }
 
 

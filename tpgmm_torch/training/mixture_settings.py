@@ -19,12 +19,7 @@ from tpgmm_torch.operators.stack import POSE_OPERATORS, leaves
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import Kinematics
 
-__all__ = [
-    "block_widths",
-    "check_operators",
-    "kinematics_for",
-    "regularization",
-]
+__all__ = ["block_widths", "check_operators", "kinematics_for", "regularization"]
 
 #: Of these, equal ones say the same; of a user's own operators nobody knows.
 COMPARED = (Canonical, *POSE_OPERATORS)

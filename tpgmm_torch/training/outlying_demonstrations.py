@@ -109,11 +109,7 @@ def outlying_demonstrations(
 
 
 def outlying_rows(
-    rows: TrainingRows,
-    kinematics: Kinematics,
-    *,
-    threshold: float = 8.0,
-    duration: float = 0.5,
+    rows: TrainingRows, kinematics: Kinematics, *, threshold: float = 8.0, duration: float = 0.5
 ) -> tuple[Outlying, ...]:
     """:func:`outlying_demonstrations` of rows that are read, of all batches and processes.
 

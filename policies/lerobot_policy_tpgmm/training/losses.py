@@ -89,9 +89,7 @@ def local_points(model: Regression, samples: Samples) -> list[Tensor]:
 
 
 def likelihood_loss(
-    mixture: MixtureParameters,
-    points: Sequence[Tensor],
-    prior: CovariancePrior | None = None,
+    mixture: MixtureParameters, points: Sequence[Tensor], prior: CovariancePrior | None = None
 ) -> Tensor:
     """Negative mean log-likelihood per frame, over all local data sets.
 

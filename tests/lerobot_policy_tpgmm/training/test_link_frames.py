@@ -122,11 +122,7 @@ def test_columns_of_events_are_read_from_the_set_unless_a_detector_is_given(tmp_
     data = dataset(tmp_path / "set", episodes=[1, 2, 3])
     policy = trained(data, link_frames=AT_LINKS, events=told, operators=OPERATORS, **OPTIONS)
     read = load_lerobot(
-        data.root,
-        episodes=[1, 2, 3],
-        robot=robot(),
-        frames=AT_LINKS,
-        events=told,
+        data.root, episodes=[1, 2, 3], robot=robot(), frames=AT_LINKS, events=told
     )
     when = CLOSINGS if told else flags
     assert [one.events["close"] for one in read] == pytest.approx(list(when[1:]), abs=0.11)

@@ -56,11 +56,7 @@ def test_a_grasp_is_found_whatever_the_signal_does_besides(kind):
     assert min(confidences) > 0.4
 
 
-@given(
-    scale=st.floats(1e-3, 1e3),
-    offset=st.floats(-1, 1),
-    shift=st.floats(-2, 2),
-)
+@given(scale=st.floats(1e-3, 1e3), offset=st.floats(-1, 1), shift=st.floats(-2, 2))
 def test_units_and_clocks_do_not_matter(scale, offset, shift):
     signal = opening() + noise(0.01)
     one = SignalEvent(("finger_0",))

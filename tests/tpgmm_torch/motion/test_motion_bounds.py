@@ -8,12 +8,7 @@ import torch
 from tests.support.robot_zoo import ZOO, upper_body, zoo
 from tpgmm_datasets.robots import upper_body_urdf
 from tpgmm_torch import Robot
-from tpgmm_torch.exceptions import (
-    DataError,
-    MissingLimitsWarning,
-    ShapeError,
-    UnknownNameError,
-)
+from tpgmm_torch.exceptions import DataError, MissingLimitsWarning, ShapeError, UnknownNameError
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 from tpgmm_torch.robots.joint_space import JointSpace
 

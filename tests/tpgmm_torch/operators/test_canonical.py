@@ -110,10 +110,7 @@ def test_every_operator_has_a_tolerance_in_its_unit():
     position = RelativePosition("left", "cup", tolerance=0.003)
     orientation = RelativeOrientation("left", "cup", tolerance=0.02)
     model = hands_model(
-        operators=[position, orientation],
-        n_components=1,
-        covariance_type="diag",
-        reg_covar=0.0,
+        operators=[position, orientation], n_components=1, covariance_type="diag", reg_covar=0.0
     )
     exact = clone(model).set_params(
         operators=[replace(position, tolerance=0.0), replace(orientation, tolerance=0.0)]

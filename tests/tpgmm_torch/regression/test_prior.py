@@ -17,11 +17,7 @@ from tpgmm_torch import (
     rollout,
     save,
 )
-from tpgmm_torch.exceptions import (
-    DataError,
-    ShapeError,
-    UnknownNameError,
-)
+from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.regression.fusion_forms import InformationFusion
 from tpgmm_torch.regression.prior import prior_widths
