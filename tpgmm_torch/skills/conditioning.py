@@ -59,9 +59,8 @@ FIRST, LATER = 8, 1
 LARGEST = 0.2
 #: What is asked for without a tolerance leaves this share of the variance that was there.
 EXACT = 1e-8
-#: Times are the same within this [s]; what is further away than this, and than three times the
-#: tolerance, is missed [m, rad].
-SAME, MISSED = 1e-6, 1e-3
+#: What is further away than this, and than three times the tolerance, is missed [m, rad].
+MISSED = 1e-3
 
 
 def wendland(distance: Tensor) -> Tensor:
@@ -250,7 +249,7 @@ class Conditioning:
         found = []
         for point in self.points:
             step = int((time - point.time).abs().argmin())
-            if abs(float(time[step]) - point.time) > SAME:
+            if not torch.isclose(time[step], time.new_tensor(point.time)):
                 continue
             here = {n: f[step] if f.batch_shape else f for n, f in frames.items()}
             state = self.regression.kinematics.state(joints[step])

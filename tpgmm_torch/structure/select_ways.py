@@ -32,8 +32,6 @@ __all__ = ["SelectWays"]
 SMALLEST_RANGE = 0.2
 #: Stretches of the skill of which each is looked at by itself.
 STRETCHES = 20
-#: Modes are so many times farther apart than the farthest next neighbour of one mode.
-APART = 3.0
 #: A partition that where demonstrations begin shows as well, to so large a share of what it
 #: gains in likelihood later, is one of situations.
 SITUATION = 0.5
@@ -295,7 +293,7 @@ class SelectWays(DemonstrationEstimator):
         distances = np.linalg.norm(values[:, None, now] - values[None, :, now], axis=-1)
         others = same & ~np.eye(len(labels), dtype=bool)
         nearest = np.where(others, distances, np.inf).min(1)
-        return bool(shifted[~same].min() <= APART * max(nearest.max(), split.view.near))
+        return bool(shifted[~same].min() <= max(nearest.max(), split.view.near))
 
 
 def _divided(

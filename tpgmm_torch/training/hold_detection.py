@@ -33,8 +33,6 @@ __all__ = ["attach_holds", "demonstrated_holds", "find_holds", "with_holds"]
 TRAVEL = 3.0
 #: A grasp is steady to this share of the tolerance, at best.
 FINEST = 0.1
-#: A link that held an object for a smaller share of the time than another is not its holder.
-LONG = 0.8
 #: How far poses are from others, in units of the tolerances: at least 0, at most 1 if alike.
 Change = Callable[[Frame, Frame], Tensor]
 
@@ -259,11 +257,9 @@ class _Motion:
                 carried.append((link, first, last, slip))
         if not carried:
             return None
-        # of several that hold it, the steadiest; the first, if there is no difference
-        longest = max(last - first for _, first, last, _ in carried)
-        carried = [one for one in carried if one[2] - one[1] >= LONG * longest]
-        slips = [float(slip[first : last + 1].mean()) for _, first, last, slip in carried]
-        steady = next(i for i, one in enumerate(slips) if one <= min(slips) + FINEST)
+        # of several that hold it, the longest and steadiest; the first, if there is no difference
+        scores = [float((1 - slip[first : last + 1]).sum()) for _, first, last, slip in carried]
+        steady = next(i for i, one in enumerate(scores) if one >= (1 - FINEST) * max(scores))
         link, first, last, slip = carried[steady]
         finest = 2 * float(slip[first : last + 1].quantile(0.9))
         finest = min(max(finest, FINEST), 1.0)
