@@ -26,6 +26,7 @@ __all__ = [
 ]  # fmt: skip
 
 _PACKAGE = "lerobot_env_bimanual"
+_KEYS = {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 _ENVIRONMENTS = {
     "BottleShaking-v0": "bottle.shaking:BottleShakingEnv",
@@ -55,13 +56,7 @@ class _StateEnvConfig(EnvConfig):
     render_width: int = 320
     render_height: int = 240
     features: dict[str, PolicyFeature] = field(default_factory=dict)
-    features_map: dict[str, str] = field(
-        default_factory=lambda: {
-            ACTION: ACTION,
-            "agent_pos": OBS_STATE,
-            "environment_state": OBS_ENV_STATE,
-        }
-    )
+    features_map: dict[str, str] = field(default_factory=_KEYS.copy)
 
     @property
     def package_name(self) -> str:

@@ -118,14 +118,10 @@ DIFFUSION = Recipe(
     "MIN_MAX",
 )
 PERCEPTRON = Recipe(PerceptronConfig, {}, "MEAN_STD")
+PLAIN = {"act": ACT, "act-large": ACT_LARGE, "diffusion": DIFFUSION, "mlp": PERCEPTRON}
 RECIPES = {
     name: recipe
-    for kind, plain in (
-        ("act", ACT),
-        ("act-large", ACT_LARGE),
-        ("diffusion", DIFFUSION),
-        ("mlp", PERCEPTRON),
-    )
+    for kind, plain in PLAIN.items()
     for name, recipe in ((kind, plain), (f"{kind}-phase", replace(plain, phase=True)))
 }
 

@@ -9,11 +9,6 @@ from tpgmm_torch.checks.summary import FrameSummary, Region, TrainingSummary
 from tpgmm_torch.checks.training import EpisodeSummary, check
 
 __all__ = [
-    "EpisodeSummary",
-    "Finding",
-    "FrameSummary",
-    "Region",
-    "Report",
-    "TrainingSummary",
+    "EpisodeSummary", "Finding", "FrameSummary", "Region", "Report", "TrainingSummary",
     "check",
-]
+]  # fmt: skip

@@ -22,14 +22,9 @@ from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots.kinematics import Kinematics
 
 __all__ = [
-    "FAR",
-    "IMPOSSIBLE",
-    "EpisodeSummary",
-    "PathSummary",
-    "check",
-    "summarize",
+    "FAR", "IMPOSSIBLE", "EpisodeSummary", "PathSummary", "check", "summarize",
     "unit_findings",
-]
+]  # fmt: skip
 
 #: Nothing turns a joint so far beyond its limits [rad]: the values are in another unit.
 IMPOSSIBLE = 2 * math.pi
@@ -303,10 +298,8 @@ def _clock(episodes: Sequence[EpisodeSummary]) -> Iterator[Finding]:
     tolerance = ONE_CLOCK * float(np.median(ends - begins))
     segment = (begins > np.median(begins) + tolerance) & (ends < np.median(ends) + tolerance)
     begins, durations = begins[~segment], (ends - begins)[~segment]
-    values, message = (
-        durations,
-        "last from {:.4g} to {:.4g} s: at one time they show other things",
-    )
+    values = durations
+    message = "last from {:.4g} to {:.4g} s: at one time they show other things"
     if np.ptp(durations) <= tolerance:
         values, message = begins, "begin at different times, from {:.6g} to {:.6g} s"
     if np.ptp(values) > tolerance:

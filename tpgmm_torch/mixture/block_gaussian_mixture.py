@@ -430,10 +430,7 @@ class BlockGaussianMixture(DensityMixin, BaseEstimator):  # type: ignore[misc]
             raise NotFittedError(
                 f"this {type(self).__name__} is not fitted yet; call fit before this method"
             )
-        own = (
-            tuple(x.double() for x in self.means_),
-            tuple(x.double() for x in self.covariances_),
-        )
+        own = (tuple(x.double() for x in each) for each in (self.means_, self.covariances_))
         return Parameters(self.weights_.double(), *own)
 
     def _evaluate(self, X: Any, reduce: Callable[[Tensor], Tensor]) -> NDArray[Any]:

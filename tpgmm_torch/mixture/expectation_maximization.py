@@ -237,12 +237,9 @@ def e_step(parameters: Parameters, points: Points, least: Tensor | None = None) 
     """
     maps, peaks = whiten(parameters)
     ceilings = _ceilings(parameters, peaks, points.spans)
-    limits = (
-        torch.full_like(ceilings[:, 0], -math.inf)
-        if least is None
-        else least - (NEGLIGIBLE + MARGIN)
-    )
-    limits = torch.minimum(limits, ceilings.amax(1) - (NEGLIGIBLE + MARGIN))
+    if least is None:
+        least = torch.full_like(ceilings[:, 0], -math.inf)
+    limits = torch.minimum(least, ceilings.amax(1)) - (NEGLIGIBLE + MARGIN)
     needed = ceilings > limits[:, None]
     chosen = needed.nonzero()[:, 1].split(needed.sum(1).tolist())
     rounded, heights = [own.to(points.dtype) for own in maps], peaks.to(points.dtype)

@@ -246,11 +246,8 @@ def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
         values = values.expand_as(own)
     wider = values < own if name == "lower" else values > own
     if bool(wider.any()):
-        listed = [
-            f"{joint} {values[i]:g} (robot: {own[i]:g})"
-            for i, joint in enumerate(joints)
-            if wider[i]
-        ]
+        which = wider.nonzero()[:, 0].tolist()
+        listed = [f"{joints[i]} {values[i]:g} (robot: {own[i]:g})" for i in which]
         raise DataError(
             f"{name} is wider than the robot's own limit: {', '.join(listed)}; give a tighter "
             "one, or correct the description of the robot"

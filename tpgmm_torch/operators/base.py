@@ -47,10 +47,8 @@ class Linearization:
         """``J`` and ``M``, identities written out."""
         like = self.displacement
         eye = torch.eye(like.shape[-1], dtype=like.dtype, device=like.device)
-        return (
-            eye if self.jacobian is None else self.jacobian,
-            eye if self.matrix is None else self.matrix,
-        )
+        jacobian, matrix = (eye if x is None else x for x in (self.jacobian, self.matrix))
+        return jacobian, matrix
 
     def without(self, rigid: Tensor) -> Linearization:
         """The rows as ``0 = 0``, where the joints cannot change what the operator measures.

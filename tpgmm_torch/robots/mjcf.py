@@ -161,18 +161,14 @@ class _Translation:
         for servo in np.flatnonzero(is_servo):
             constant, stiffness, damping = map(float, model.actuator_biasprm[servo, :3])
             gain, gear = model.actuator_gainprm[servo, 0], model.actuator_gear[servo, 0]
-            commands, limited = (
-                model.actuator_ctrlrange[servo],
-                model.actuator_ctrllimited[servo],
-            )
+            commands = model.actuator_ctrlrange[servo]
+            limited = model.actuator_ctrllimited[servo]
             if model.actuator_dyntype[servo] == mujoco.mjtDyn.mjDYN_INTEGRATOR:
                 if stiffness and limited:  # the control is the speed of what is commanded
                     speeds = gain * commands / (stiffness * gear)
                     velocity = min(velocity, float(np.abs(speeds).max()))
-                commands, limited = (
-                    model.actuator_actrange[servo],
-                    model.actuator_actlimited[servo],
-                )
+                commands = model.actuator_actrange[servo]
+                limited = model.actuator_actlimited[servo]
             ends = -(gain * commands + constant) / gear
             if limited and stiffness:
                 low, high = sorted(map(float, ends / stiffness))
@@ -215,11 +211,8 @@ class _Translation:
         return visuals
 
     def _solids(self, geom: Any) -> Iterator[tuple[ElementTree.Element, Array]]:
-        pose, kinds, element = (
-            _pose(geom.pos, geom.quat),
-            self.mujoco.mjtGeom,
-            ElementTree.Element,
-        )
+        pose = _pose(geom.pos, geom.quat)
+        kinds, element = self.mujoco.mjtGeom, ElementTree.Element
         radius, length = numbers(geom.size[:1]), numbers(2 * geom.size[1:2])
         mesh, model = int(geom.dataid[0]), self.model
         match int(geom.type[0]):

@@ -91,11 +91,8 @@ class Evidence:
         """
         _, step = self._fused(others)
         of_others = (self.jacobians[operator] @ step)[..., 0]
-        own, other = (
-            each.square().sum(-1).mean(0).sqrt()
-            for each in (self.residuals[operator], of_others)
-        )
-        return own, other
+        own, other = (x.square().sum(-1).mean(0) for x in (self.residuals[operator], of_others))
+        return own.sqrt(), other.sqrt()
 
 
 def gather_evidence(
@@ -153,16 +150,8 @@ def gather_evidence(
     gap = joints.mean((0, 1)) - joints[left_out]
     prior = (1 / spread).diag().expand(*gap.shape, -1), gap / spread
     instants = time[((len(time) - 1) * phase).round().long()]
-    return Evidence(
-        instants,
-        jacobians,
-        residuals,
-        precisions,
-        vectors,
-        prior,
-        floor,
-        max(number - 2.0, 1.0),
-    )
+    freedom = max(number - 2.0, 1.0)
+    return Evidence(instants, jacobians, residuals, precisions, vectors, prior, floor, freedom)
 
 
 def _term(

@@ -257,7 +257,7 @@ class _Motion:
                 carried.append((link, first, last, slip))
         if not carried:
             return None
-        # of several that hold it, the longest and steadiest; the first, if there is no difference
+        # of several that hold it, the longest and steadiest; the first of those alike
         scores = [float((1 - slip[first : last + 1]).sum()) for _, first, last, slip in carried]
         steady = next(i for i, one in enumerate(scores) if one >= (1 - FINEST) * max(scores))
         link, first, last, slip = carried[steady]

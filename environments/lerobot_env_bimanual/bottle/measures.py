@@ -71,11 +71,8 @@ def successful(values: Mapping[str, float], figures: Mapping[str, Figure] = FIGU
     figures : mapping of str to Figure
         What was asked for.
     """
-    return all(
-        figure.low <= values[name] <= figure.high
-        for name, figure in figures.items()
-        if figure.limited
-    )
+    limited = {name: figure for name, figure in figures.items() if figure.limited}
+    return all(figure.low <= values[name] <= figure.high for name, figure in limited.items())
 
 
 @dataclass

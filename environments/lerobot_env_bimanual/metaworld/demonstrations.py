@@ -99,10 +99,5 @@ def _episode(env: MetaworldStateEnv, expert: object, seed: int) -> Recorded:
         references.append(np.append(env.target, opening(action[3])))
         actions.append(np.asarray(action, dtype=np.float64))
         left -= bool(info["is_success"])
-    return Recorded(
-        seed,
-        np.array(observed),
-        np.array(references),
-        np.array(actions),
-        bool(info["is_success"]),
-    )
+    states, targets, given = map(np.array, (observed, references, actions))
+    return Recorded(seed, states, targets, given, bool(info["is_success"]))

@@ -135,11 +135,8 @@ class Lid(SuiteTask):
                 strict=True,
             )
         )
-        left = [
-            Leg("reach", beside, free=True),
-            Leg("close", attached(box, SIDE)),
-            Leg("away", beside),
-        ]
+        close = Leg("close", attached(box, SIDE))
+        left = [Leg("reach", beside, free=True), close, Leg("away", beside)]
         right = [
             Leg("reach", above, free=True),
             Leg("close", shut),

@@ -162,40 +162,6 @@ def test_noise_does_not_hide_how_a_hand_holds_what_it_lifts(seed):
     assert float(torch.stack(wrong[-1:]).max()) < 2.5e-3
 
 
-def test_robots_whose_objects_are_seen_late_are_each_as_if_alone():
-    start, joints = begun(3)
-    path = [joints + 0.003 * k for k in range(60)]
-    begins = torch.tensor([3, 20, 45])  # so that they are taken and carried in turns
-    place, random = start.frames["bottle"], torch.Generator().manual_seed(0)
-    grasps = [place[row].seen_from(hand(path[int(begins[row])][row])) for row in range(3)]
-
-    def looks(rows):
-        """What is held in the end."""
-        random.manual_seed(0)
-        first = joints[rows], {n: f[rows] for n, f in start.frames.items()}
-        inputs = Inputs(upper_body(), *first, Trust(), OneEuro())
-        holding = Holding.start(upper_body(), CARRIED, [HELD], first[1])
-        for k, now in enumerate(path):
-            taken = HELD.begin * (k >= begins).double()
-            bottle = Frame.stack(
-                [
-                    hand(now[row]).compose(grasps[row]) if k >= begins[row] else place[row]
-                    for row in range(3)
-                ]
-            )
-            noise = 1e-3 * torch.randn(3, 3, generator=random, dtype=torch.float64)
-            seen = Frame(bottle.position + noise, bottle.orientation)[rows]
-            inputs = inputs.update(0.01, now[rows], {"bottle": seen})
-            holding = holding.advance(
-                taken[rows], now[rows], inputs.frames, dt=0.01, shares=inputs.shares
-            )
-        return holding.held["bottle"].grasp
-
-    together = looks(slice(None))
-    for row in range(3):
-        assert_at(together[row], looks(row))
-
-
 def test_what_does_not_move_with_the_hand_is_not_moved_by_the_joints():
     holding, joints = begun(2)
     lean = Frame([1e-3, 0.0, 0.0], [np.cos(0.01), np.sin(0.01), 0.0, 0.0])
@@ -331,28 +297,39 @@ def test_from_hand_to_hand_each_row_is_the_derivative_of_what_it_measures():
 
 
 def test_robots_at_their_own_times_are_each_as_if_alone():
-    times = torch.tensor([1.0, 2.5, 5.5, 3.0])
+    """Whose objects are seen with noise, and late: taken, carried and put down in turns."""
+    times, random = torch.tensor([1.0, 2.5, 5.5, 3.0]), torch.Generator().manual_seed(0)
     holding, joints = begun(4)
-    path = [joints + 0.05 * k for k in range(4)]
-    ticks = [torch.minimum(times, torch.tensor(at)) for at in (1.0, 2.4, 4.0, 6.0)]
-    seen = [holding.frames, None, {"bottle": LATER.expand((4,))}, None]
-    for k in range(4):
-        holding = holding.advance(ticks[k], path[k], seen[k])
-    state = holding.state(upper_body().state(path[3]))
-    for row in range(4):
-        alone = Holding.start(upper_body(), CARRIED, [HELD], scenes(4, 3)[row].frames)
-        for k in range(4):
-            frames = None if seen[k] is None else {n: f[row] for n, f in seen[k].items()}
-            alone = alone.advance(float(ticks[k][row]), path[k][row], frames)
-        for name in ("bottle", "tray"):
-            assert_at(holding.frames[name][row], alone.frames[name])
-        single = alone.state(upper_body().state(path[3][row]))
-        if alone.carries:
-            assert_at(state[row].pose("bottle"), single.pose("bottle"))
-            assert state[row].carrier("bottle") == single.carrier("bottle")
-        else:
-            assert_at(state[row].pose("bottle"), alone.frames["bottle"])
-            assert (state.jacobians[row, -1] == 0).all()
+    start = holding.frames
+    alone = [
+        Holding.start(upper_body(), CARRIED, [HELD], scenes(4, 3)[i].frames) for i in range(4)
+    ]
+    inputs = Inputs(upper_body(), joints, dict(start), Trust(), OneEuro())
+    for k in range(60):
+        now, ticks = joints + 0.005 * k, torch.minimum(times, torch.tensor(0.1 * k))
+        noise = 1e-3 * torch.randn(4, 3, generator=random, dtype=torch.float64)
+        bottle = (
+            holding.state(upper_body().state(now)).pose("bottle") if k > 25 else start["bottle"]
+        )
+        inputs = inputs.update(
+            0.01, now, {"bottle": Frame(bottle.position + noise, bottle.orientation)}
+        )
+        seen, shares = inputs.frames if k % 9 else None, inputs.shares
+        holding = holding.advance(ticks, now, seen, dt=0.01, shares=shares)
+        state = holding.state(upper_body().state(now))
+        for i, one in enumerate(alone):
+            frames = seen and {name: frame[i] for name, frame in seen.items()}
+            own = {name: share[i] for name, share in shares.items()}
+            one = one.advance(float(ticks[i]), now[i], frames, dt=0.01, shares=own)
+            alone[i], single = one, one.state(upper_body().state(now[i]))
+            for name in ("bottle", "tray"):
+                assert_at(holding.frames[name][i], one.frames[name])
+            if one.carries:
+                assert_at(state[i].pose("bottle"), single.pose("bottle"))
+                assert state[i].carrier("bottle") == single.carrier("bottle")
+            elif holding.carries:
+                assert_at(state[i].pose("bottle"), one.frames["bottle"])
+                assert (state.jacobians[i, -1] == 0).all()
 
 
 def test_what_is_told_counts_from_then_on_for_those_of_whom_it_is_told():
