@@ -11,10 +11,8 @@ USUAL = 0.01
 def told(*timestamps: float) -> list[float]:
     """For how long the reference of each tick of one robot is."""
     ticks = TickDurations()
-    return [
-        float(ticks.next(torch.tensor([[now]], dtype=torch.float64), USUAL))
-        for now in timestamps
-    ]
+    seen = torch.tensor(timestamps, dtype=torch.float64).reshape(-1, 1, 1)
+    return [float(ticks.next(now, USUAL)) for now in seen]
 
 
 def times(*durations: float) -> list[float]:

@@ -54,11 +54,7 @@ def assert_same(found, expected):
 
 
 @settings(deadline=None, max_examples=30)
-@given(
-    lengths=st.lists(st.integers(2, 9), min_size=1, max_size=4),
-    named=st.booleans(),
-    event=st.booleans(),
-)
+@given(st.lists(st.integers(2, 9), min_size=1, max_size=4), st.booleans(), st.booleans())
 def test_to_a_table_and_back_is_the_identity(lengths, named, event):
     made = [demonstration(i, n, NAMES if named else None) for i, n in enumerate(lengths)]
     if event:

@@ -55,10 +55,8 @@ def test_identity_over_lengths_names_and_rates(
 
 
 def test_actions_are_the_references_that_were_given(tmp_path):
-    first, second = (
-        demonstration(0),
-        demonstration(1).reordered(["joint_2", "joint_0", "joint_1"]),
-    )
+    first = demonstration(0)
+    second = demonstration(1).reordered(["joint_2", "joint_0", "joint_1"])
     references = [motion.joints + 0.5 for motion in (first, second)]
     root = save_lerobot(
         [first, second], tmp_path / "set", fps=FPS, task="reach", actions=references

@@ -47,11 +47,8 @@ while code == 7:
     print(code, *(file.read_text() for file in files))
 """
 #: What may be there: the old or the new, of all files.
-WHOLE = {
-    "file": ["old", "new"],
-    "folder": ["old old", "new new"],
-    "kept": ["mine old old", "mine new new"],
-}
+WHOLE = {"file": ["old", "new"], "folder": ["old old", "new new"]}
+WHOLE["kept"] = [f"mine {text}" for text in WHOLE["folder"]]
 
 
 def names(folder: Path) -> list[str]:

@@ -75,10 +75,8 @@ def shown_to(model: TaskParameterizedGMM) -> Demonstration:
 def test_a_model_is_what_it_was(name, tmp_path):
     model = MODELS[name]()
     save(model, tmp_path / "model")
-    assert sorted(file.name for file in (tmp_path / "model").iterdir()) == [
-        "config.json",
-        "model.safetensors",
-    ]
+    files = sorted(file.name for file in (tmp_path / "model").iterdir())
+    assert files == ["config.json", "model.safetensors"]
     again, shown = load_model(tmp_path / "model"), shown_to(model)
     [one], [other] = (each.predict([Situation.of(shown)]) for each in (model, again))
     assert torch.equal(one.joints, other.joints)

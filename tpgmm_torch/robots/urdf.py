@@ -43,14 +43,8 @@ __all__ = [
 ]
 
 #: Degrees of freedom by type of joint. Joints of several are read, but move no :class:`Robot`.
-FREEDOMS = {
-    "fixed": 0,
-    "revolute": 1,
-    "continuous": 1,
-    "prismatic": 1,
-    "planar": 3,
-    "floating": 6,
-}
+SINGLE = dict.fromkeys(("revolute", "continuous", "prismatic"), 1)
+FREEDOMS = {"fixed": 0, **SINGLE, "planar": 3, "floating": 6}
 XACRO = "the URDF holds xacro macros: expand them first (xacro FILE > ROBOT.urdf)"
 #: What may stand before the first element of a text: a byte order mark, and space.
 BEFORE_XML = "\ufeff \t\r\n"

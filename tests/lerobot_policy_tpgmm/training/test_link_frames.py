@@ -72,10 +72,8 @@ def test_a_running_policy_is_told_the_object_and_computes_the_start(policy, grip
     [read, *_] = load_lerobot(grips.root, robot=robot(), frames=AT_LINKS)
     bottle = read.frames["bottle"]
     pose = torch.cat((bottle.position, bottle.orientation))
-    observation = {
-        "observation.state": read.joints[:1],
-        "observation.environment_state": pose[None],
-    }
+    observation = {"observation.state": read.joints[:1]}
+    observation["observation.environment_state"] = pose[None]
     [expected] = rollout(policy.to_estimator().skill, [read], bounds="robot", blend=1.0)
     loaded = TPGMMPolicy.from_pretrained(tmp_path / "policy")
     for one in (policy, loaded, TPGMMPolicy.from_estimator(loaded.to_estimator())):

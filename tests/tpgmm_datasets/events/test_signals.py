@@ -123,10 +123,8 @@ def test_signals_that_are_not_there_are_named():
 
 def test_grippers_are_known_by_name_and_side():
     g1 = ["kLeftElbow", "kLeftHandPinky", "kRightHandPinky", "kRightHandThumbBend"]
-    assert gripper_signals(g1, "right_rubber_hand") == (
-        "kRightHandPinky",
-        "kRightHandThumbBend",
-    )
+    right = "kRightHandPinky", "kRightHandThumbBend"
+    assert gripper_signals(g1, "right_rubber_hand") == right
     assert gripper_signals(g1, "l_hand") == ("kLeftHandPinky",)
     assert gripper_signals(["elbow", "gripper.pos"], "left_hand") == ("gripper.pos",)
     assert gripper_signals(["elbow", "gripper.pos"]) == ("gripper.pos",)

@@ -54,11 +54,7 @@ def test_a_missing_file_can_be_relaxed(root, tmp_path):
 
 @pytest.mark.parametrize(
     "damage",
-    [
-        lambda root: (root / DATA).unlink(),
-        lambda root: (root / DATA).write_bytes(b""),
-        cut_file,
-    ],
+    [lambda at: (at / DATA).unlink(), lambda at: (at / DATA).write_bytes(b""), cut_file],
 )
 def test_a_file_that_is_missing_or_cut_off_is_named(root, damage):
     damage(root)

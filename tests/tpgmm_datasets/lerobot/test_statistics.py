@@ -41,10 +41,8 @@ def test_parts_merge_into_the_whole(lengths):
 def test_the_stated_range_is_that_of_all_episodes_in_either_layout(tmp_path):
     (tmp_path / "meta").mkdir()
     assert stated_range(tmp_path, "state", 2) is None
-    lines = [
-        {"episode_index": n, "stats": {"state": {"min": [-n, 0], "max": [1, 2 * n]}}}
-        for n in range(3)
-    ]
+    extremes = [{"min": [-n, 0], "max": [1, 2 * n]} for n in range(3)]
+    lines = [{"episode_index": n, "stats": {"state": x}} for n, x in enumerate(extremes)]
     text = "\n".join(map(json.dumps, lines))
     (tmp_path / "meta" / "episodes_stats.jsonl").write_text(text)
     assert stated_range(tmp_path, "state", 2).tolist() == [[-2, 0], [1, 4]]

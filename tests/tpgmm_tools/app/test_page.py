@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from tests.support.worlds import upper_body
 from tpgmm_datasets import save_lerobot
 from tpgmm_datasets.tables import demonstrations_to_frame, read_table, write_table
 from tpgmm_tools.app import page
-from tpgmm_torch import Demonstration, Frame, Situation, quaternions
+from tpgmm_torch import Frame, Situation, quaternions
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.persistence import load_model
@@ -37,16 +38,8 @@ def table(tmp_path_factory, bottles):
 
 
 def learned(shown, n_components=4):
-    return page.learn(
-        "mine",
-        None,
-        "none",
-        None,
-        "",
-        "",
-        n_components,
-        {"mine": lambda: (shown, upper_body())},
-    )
+    given = {"mine": lambda: (shown, upper_body())}
+    return page.learn("mine", None, "none", None, "", "", n_components, given)
 
 
 def test_a_table_becomes_a_moving_picture_and_files(table, tmp_path):
@@ -99,10 +92,7 @@ def test_without_links_or_a_skill_there_is_nothing_to_show(table):
 
 
 def test_what_cannot_be_is_an_error_and_what_is_unlikely_a_remark(bottles, recwarn):
-    degrees = [
-        Demonstration(d.time, d.joints.rad2deg(), dict(d.frames), d.joint_names)
-        for d in bottles
-    ]
+    degrees = [replace(d, joints=d.joints.rad2deg()) for d in bottles]
     skill, report = learned(degrees)
     assert skill is None and "degrees" in report
     _, report = learned([*bottles, bottles[0]])

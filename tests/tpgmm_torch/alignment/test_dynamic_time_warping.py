@@ -98,11 +98,7 @@ def test_the_reference_is_recovered_exactly():
 
 
 @settings(max_examples=15)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    scale=st.floats(0.6, 1.6),
-    rate=st.sampled_from([60.0, 100.0]),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(0.6, 1.6), st.sampled_from([60.0, 100.0]))
 def test_a_time_warped_copy_is_recovered(seed, scale, rate):
     rng = np.random.default_rng(seed)
     start, goal = rng.uniform(-0.3, 0.3, 5), rng.uniform(0.5, 1.0, 5)

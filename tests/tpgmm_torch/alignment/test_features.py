@@ -47,13 +47,13 @@ def variance(rows):
 
 @pytest.mark.parametrize(
     "name, weight",
-    [
-        ("joints", 1.0),
-        ("speed", 5.0),
-        ("directions", 4.5),
-        ("hand", 1.0),
-        ("hand in bottle", 1.0),
-    ],
+    {
+        "joints": 1.0,
+        "speed": 5.0,
+        "directions": 4.5,
+        "hand": 1.0,
+        "hand in bottle": 1.0,
+    }.items(),
 )
 def test_a_group_has_the_square_of_its_weight_as_variance(name, weight):
     family = DEMONSTRATIONS[:3]

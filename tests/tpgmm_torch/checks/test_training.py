@@ -105,10 +105,8 @@ def test_segments_in_the_time_of_the_skill_are_on_its_clock():
     shown = waves(4)
     middle = replace(shown[0], time=shown[0].time * 0.4 + 0.6)
     assert found([*shown, middle]) == []
-    for short in (
-        replace(shown[0], time=shown[0].time * 0.5),
-        replace(middle, time=middle.time + 2),
-    ):
+    for one, time in ((shown[0], shown[0].time * 0.5), (middle, middle.time + 2)):
+        short = replace(one, time=time)
         assert [f.check for f in found([*shown, short])] == ["alignment"]
 
 

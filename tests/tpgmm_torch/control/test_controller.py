@@ -88,11 +88,8 @@ def test_after_the_end_the_last_reference_is_held():
 
 def test_objects_are_where_they_were_last_seen():
     problem = Problem.of(CASES["the paper's"], 3, 2)
-    elsewhere = {
-        OBJECT: Frame(
-            problem.frames[OBJECT].position + 0.05, problem.frames[OBJECT].orientation
-        )
-    }
+    pose = problem.frames[OBJECT]
+    elsewhere = {OBJECT: Frame(pose.position + 0.05, pose.orientation)}
     told, follows = begun(problem), begun(problem)
     told.step(DT)
     follows.step(DT)

@@ -216,11 +216,7 @@ WIDER = demonstration(joints=np.zeros((5, 3)), joint_names=None)
         ([demonstration(), None], DataError, "item 1 is NoneType"),
         (np.zeros((2, 3)), DataError, "item 0 is ndarray"),
         ([demonstration(), WIDER], ShapeError, "demonstration 1 has 3 joints, the first has 2"),
-        (
-            [demonstration(), demonstration(frames={})],
-            DataError,
-            r"1 has frames \[\], .*'tray'",
-        ),
+        ([demonstration(), demonstration(frames={})], DataError, r"1 has frames \[\]"),
     ],
     ids=["one", "number", "empty", "other type", "array", "joints", "frames"],
 )

@@ -75,10 +75,7 @@ def test_holds_are_put_in_the_order_of_time():
 @pytest.mark.parametrize(
     ("hold", "message"),
     [
-        (
-            Hold("cup", "l_hand", 1),
-            r"frame 'cup' is not in the demonstration \(hold cup@l_hand",
-        ),
+        (Hold("cup", "l_hand", 1), r"frame 'cup' is not in the demonstration \(hold cup@"),
         (Hold("tray", "tail"), r"link 'tail' is not in the robot .*\['l_hand', 'r_hand'\]"),
     ],
 )

@@ -41,10 +41,8 @@ globals().update(laws_in_places(KINDS, (row, row), OrientationLaws, PLACES, geom
 
 
 class TestInAStackOnRobot(OnRobot, RelativeLaws, OrientationLaws):
-    operator = Stack(
-        RelativeOrientation(RIGHT, OBJECT),
-        RelativeOrientation(LEFT, OBJECT, geometry="tangent"),
-    )
+    tangent = RelativeOrientation(LEFT, OBJECT, geometry="tangent")
+    operator = Stack(RelativeOrientation(RIGHT, OBJECT), tangent)
 
     def row(self, at):
         other = oracles.relative_orientation(at, RIGHT, OBJECT)

@@ -87,20 +87,11 @@ def test_float32_is_float64_to_its_own_precision():
     problem = Problem.of(CASES["the paper's"], 4, 3)
     double = problem.regression()
     robot = problem.case.world.kinematics.to(torch.float32)
-    conditionals = [
-        type(m)(*(getattr(m, f).float() for f in m.__annotations__))
-        for m in double.conditionals
-    ]
-    single = replace(
-        double,
-        kinematics=robot,
-        conditionals=conditionals,
-        log_weights=double.log_weights.float(),
-    )
-    frames = {
-        name: Frame(f.position.float(), f.orientation.float())
-        for name, f in problem.frames.items()
-    }
+    old, weights = double.conditionals, double.log_weights.float()
+    new = [type(m)(*(getattr(m, f).float() for f in m.__annotations__)) for m in old]
+    single = replace(double, kinematics=robot, conditionals=new, log_weights=weights)
+    shown = problem.frames.items()
+    frames = {name: Frame(f.position.float(), f.orientation.float()) for name, f in shown}
     state = robot.state(problem.state.joints.float())
     expected = double.estimate(times(3), problem.state, problem.frames)
     actual = single.estimate(times(3).float(), state, frames)

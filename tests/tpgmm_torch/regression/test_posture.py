@@ -129,10 +129,8 @@ def test_between_two_components_what_cannot_be_reached_is_approached_too():
 
     def mean(joints):
         of_each = [costs(frame, joints[0], time, i)(joints) for i in weights.nonzero()[:, 0]]
-        return [
-            sum(w * c[k] for w, c in zip(weights[weights > 0], of_each, strict=True))
-            for k in range(3)
-        ]
+        own = weights[weights > 0]
+        return [sum(w * c[k] for w, c in zip(own, of_each, strict=True)) for k in range(3)]
 
     joints, damping = here[None, None], torch.zeros(1, 1, dtype=torch.float64)
     for _ in range(40):

@@ -192,14 +192,8 @@ def test_without_canonical_the_step_tends_to_the_pseudo_inverse():
     linear, offset = problem.rows()[0].linear_and_offset(problem.state.joints.numpy())
     mu = conditionals_of(problem.mixtures[0]).at(now[0])[0].numpy()
     limit = torch.from_numpy(linear @ mu + offset)
-    distances = [
-        float(
-            (
-                problem.regression(fusion=InformationFusion(std)).estimate(*now).joints - limit
-            ).norm()
-        )
-        for std in (10.0, 100.0, 1000.0)
-    ]
+    forms = [problem.regression(fusion=InformationFusion(std)) for std in (10.0, 100.0, 1000.0)]
+    distances = [float((one.estimate(*now).joints - limit).norm()) for one in forms]
     for near, nearer in itertools.pairwise(distances):
         assert nearer == pytest.approx(near / 100, rel=0.2)
     printed = problem.regression(fusion=CovarianceFusion()).estimate(*now).joints

@@ -116,11 +116,8 @@ class TestSettings:
         locked = robot.config()["locked"]
         assert {value for name, value in locked.items() if "elbow" in name} == {0.2}
         assert (locked["waist_yaw"], locked["waist_roll"]) == (0.3, 0.1)
-        assert upper_body(locked={"?_*": 0.0}).joint_names == (
-            "waist_roll",
-            "waist_pitch",
-            "waist_yaw",
-        )
+        waist = upper_body(locked={"?_*": 0.0}).joint_names
+        assert waist == ("waist_roll", "waist_pitch", "waist_yaw")
         with pytest.raises(UnknownNameError, match=r"joint 'm_\*' is not in the movable"):
             upper_body(locked={"m_*": 0.0})
 

@@ -19,11 +19,8 @@ from tpgmm_torch.sensing.trust import (
 DEGREES = np.degrees(1.0)
 DT = 0.02
 TRUST = Trust()
-LIMITS = {
-    "lower": np.array([-2.0, -1.0]),
-    "upper": np.array([2.0, 1.0]),
-    "velocity": np.array([1.0, 2.0]),
-}
+UPPER = np.array([2.0, 1.0])
+LIMITS = {"lower": -UPPER, "upper": UPPER, "velocity": np.array([1.0, 2.0])}
 START = np.array([0.5, -0.3])
 POSE = np.array([0.4, 0.1, 0.2, 1.0, 0.0, 0.0, 0.0])
 

@@ -189,10 +189,8 @@ def test_tracked_poses_have_via_points():
     [before] = hands().predict([start], candidates=False)
     pose = hands().kinematics_.state(before.joints[50]).pose("left")
     turn = quaternions.exp(torch.tensor([0.2, 0.0, 0.0], dtype=torch.float64))
-    pose = Frame(
-        pose.position + torch.tensor([0.0, 0.05, 0.0]),
-        quaternions.product(turn, pose.orientation),
-    )
+    place = pose.position + torch.tensor([0.0, 0.05, 0.0])
+    pose = Frame(place, quaternions.product(turn, pose.orientation))
     model = ViaPoints(hands().skill, [ViaPoint(1.0, "pose:left", pose)], fade=0.5)
     [bent] = rollout(model, start)
     there = model.kinematics.state(bent.joints[50]).pose("left")
@@ -214,10 +212,8 @@ def test_a_warning_names_via_points_out_of_reach():
 
 
 def test_loaded_via_points_give_the_same_references(tmp_path):
-    points = [
-        ViaPoint(1.0, "canonical", {"b": 0.5}),
-        ViaPoint(0.5, "canonical", [0, 1, 0], 0.01),
-    ]
+    first = ViaPoint(1.0, "canonical", {"b": 0.5})
+    points = [first, ViaPoint(0.5, "canonical", [0, 1, 0], 0.01)]
     model = TaskParameterizedGMM(n_components=4).fit(waves())
     bent = ViaPoints(model.skill, points, fade=0.4)
     save(bent, tmp_path / "model")

@@ -39,10 +39,8 @@ def test_robots_of_a_batch_each_go_their_own_way():
     selection = fitted(Handles)
     situations = [*another_handle_each(), *Handles().situations(4, 3)]
     starts = torch.stack([one.joints for one in situations])
-    frames = {
-        name: Frame.stack([one.frames[name] for one in situations])
-        for name in situations[0].frames
-    }
+    names = situations[0].frames
+    frames = {name: Frame.stack([one.frames[name] for one in situations]) for name in names}
     begun = selection.skill_.start(starts, frames)
     choices = [selection.skill_.choose(one.joints, one.frames)[0] for one in situations]
     assert begun.chosen.tolist() == [one.way for one in choices]

@@ -21,12 +21,8 @@ def pick_and_place(n=5, seed=0, noise=0.0, names=("hand.x", "hand.y", "hand.z", 
         lengths = np.array([2.0, 1.0, 2.0, 0.6, 1.5, 1.0, 1.0]) * rng.uniform(0.85, 1.15, 7)
         ends = lengths.cumsum()
         time = np.arange(0, ends[-1], 0.04)
-        places = rng.uniform(0.2, 0.4, (4, 3)) * [
-            [1, 1, 1],
-            [-1, 1, 1],
-            [1, -1, 1],
-            [-1, 1, -1],
-        ]
+        signs = [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, 1, -1]]
+        places = rng.uniform(0.2, 0.4, (4, 3)) * signs
         legs = [(0, ends[0]), (ends[1], ends[2]), (ends[3], ends[4]), (ends[5], ends[6])]
         path = motion(time, [(*leg, place) for leg, place in zip(legs, places, strict=True)])
         path += noise * rng.normal(size=path.shape)

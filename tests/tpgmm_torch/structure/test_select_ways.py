@@ -31,10 +31,8 @@ def paths(offsets, seed=0, noise=0.01):
     """Joints that go 0, 1, ... and are off by offsets in the middle."""
     rng = np.random.default_rng(seed)
     bump = np.sin(np.pi * TIME / TIME[-1])
-    return [
-        Demonstration(TIME, np.stack((TIME, (o + noise * rng.normal()) * bump), axis=1))
-        for o in offsets
-    ]
+    ways = [(o + noise * rng.normal()) * bump for o in offsets]
+    return [Demonstration(TIME, np.stack((TIME, way), axis=1)) for way in ways]
 
 
 @pytest.mark.parametrize("task", [Obstacle, Handles])

@@ -54,19 +54,18 @@ def test_the_bottle_is_held_from_the_grasp_until_it_is_let_go():
     assert abs(hold.begin - ARRIVES) < 0.1 and abs(hold.end - HELD.end) < 0.1
 
 
+def changed(change):
+    """Demonstrations in which what moves is changed."""
+    return [
+        replace(d, frames={n: change(f) if f.batch_shape else f for n, f in d.frames.items()})
+        for d in carries()
+    ]
+
+
 @pytest.mark.parametrize("noise", [0.0005, 0.002])
 def test_trackers_are_noisy(noise):
     rng = np.random.default_rng(0)
-    noisy = [
-        replace(
-            d,
-            frames={
-                n: seen(f, rng, noise) if f.batch_shape else f for n, f in d.frames.items()
-            },
-        )
-        for d in carries()
-    ]
-    [hold] = find_holds(noisy, upper_body())
+    [hold] = find_holds(changed(lambda frame: seen(frame, rng, noise)), upper_body())
     assert (hold.frame, hold.link) == ("bottle", HAND)
     # to within the time it takes to move by the tolerance
     assert ARRIVES - 0.4 <= hold.begin <= LIFTS + 0.4
@@ -76,15 +75,7 @@ def test_trackers_are_noisy(noise):
 def test_what_never_moves_is_never_held():
     assert find_holds(few_bottles(), upper_body()) == ()
     assert find_holds([at_first(d) for d in carries()], upper_body()) == ()
-    still = [
-        replace(
-            d,
-            frames={
-                n: f[:1].expand((121,)) if f.batch_shape else f for n, f in d.frames.items()
-            },
-        )
-        for d in carries()
-    ]
+    still = changed(lambda frame: frame[:1].expand((121,)))
     assert find_holds(still, upper_body()) == ()
 
 
@@ -146,10 +137,8 @@ def test_of_two_hands_one_is_the_holder_in_all_demonstrations():
     x = 0.3 * ramp(1, 3)
     near = {"left": along(x, 0.2), "right": along(x, -0.2)}
     rng, count = np.random.default_rng(0), 6
-    noisy = [
-        shown({n: seen(f, rng, 2e-4) for n, f in near.items()}, cup=along(x))
-        for _ in range(count)
-    ]
+    looks = [{n: seen(f, rng, 2e-4) for n, f in near.items()} for _ in range(count)]
+    noisy = [shown(look, cup=along(x)) for look in looks]
     [hold] = find_holds([one for one, _ in noisy], noisy[0][1])
     assert hold.link == "left"
     # the right one slips

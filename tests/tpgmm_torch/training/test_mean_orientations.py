@@ -1,7 +1,7 @@
 """Models whose orientations are deviations from the demonstrations' mean, on the sphere."""
 
 import math
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -216,13 +216,8 @@ def test_the_time_of_a_product_is_refused():
 @cache
 def handling():
     """Where the whole of a skill is in tangent space: two arms, and a bottle that is new."""
-    hands = [
-        Stack(
-            RelativePosition(hand, "bottle"),
-            RelativeOrientation(hand, "bottle", geometry="tangent"),
-        )
-        for hand in ("l_hand", "r_hand")
-    ]
+    turn = partial(RelativeOrientation, frame="bottle", geometry="tangent")
+    hands = [Stack(RelativePosition(n, "bottle"), turn(n)) for n in ("l_hand", "r_hand")]
     skill = TaskParameterizedGMM(8, [Stack(*hands), Canonical()], upper_body())
     return skill.fit(few_bottles())
 
@@ -238,10 +233,8 @@ def test_the_likelihood_of_a_time_is_that_of_the_coordinates_then():
         got = likelihood(state, dict(shown.frames))
         for row, joints in zip(got, state.joints, strict=True):
             alone = HAND.state(joints)
-            local = [
-                operator.at(time).coordinates(alone, shown.frames)
-                for operator in regression.operators
-            ]
+            every = [operator.at(time) for operator in regression.operators]
+            local = [operator.coordinates(alone, shown.frames) for operator in every]
             joint = regression.log_density(time, local)
             weights = marginals.log_activation(time[:, None]).logsumexp(-1)
             expected = (joint - weights).numpy()

@@ -97,10 +97,8 @@ def test_four_are_too_few_and_two_ways_are_no_mistake():
 
 def test_demonstrations_of_other_lengths_are_compared_at_equal_phase():
     shown = some_misplaced(8, [5])
-    shown = [
-        replace(d, time=d.time[: 30 - m], joints=d.joints[: 30 - m])
-        for m, d in enumerate(shown)
-    ]
+    cut = zip(shown, range(30, 0, -1), strict=False)
+    shown = [replace(d, time=d.time[:n], joints=d.joints[:n]) for d, n in cut]
     assert episodes(shown) == [5]
 
 
