@@ -14,12 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tpgmm_torch.control.locate import HELD, Flags, Progress
+from tpgmm_torch.control.locate import HELD, Progress
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.impedance.stiffness import Impedance
 from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.sensing.inputs import Inputs
+from tpgmm_torch.sensing.servo import Flags
 
 __all__ = ["Command", "Status", "refused", "statuses"]
 

@@ -51,7 +51,7 @@ from tpgmm_torch.control.command import Command
 from tpgmm_torch.control.estimate import choose, estimate
 from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.locate import LONGEST_TICK, Flags, Progress, Seen
+from tpgmm_torch.control.locate import LONGEST_TICK, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
 from tpgmm_torch.control.situations import completed_frames, report_start
@@ -66,6 +66,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.robots.kinematics import RobotState
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.sensing.pose_filter import OneEuro
+from tpgmm_torch.sensing.servo import Flags
 from tpgmm_torch.sensing.trust import Trust
 from tpgmm_torch.skills.skill import Skill
 

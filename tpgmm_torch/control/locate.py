@@ -31,11 +31,10 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.data.arrays import Array
-from tpgmm_torch.sensing.servo import FLOOR, Servo
+from tpgmm_torch.sensing.servo import FLOOR, Flags, Servo
 
 __all__ = ["LONGEST_TICK", "Progress", "Seen"]
 
-Flags = NDArray[np.bool_]
 #: A time of the skill for a robot (row) at a posture, if one explains it.
 Find = Callable[[int, Array], float | None]
 
@@ -51,10 +50,9 @@ OFF, DWELL = 0.85, 0.04
 #: Motion that tells something: whether a joint runs along with its reference, that it does not
 #: rest (half of it), and that somebody else moves it (three times) [rad or m].
 MOTION = FLOOR
-#: Time in which the lead of a held robot's reference grows by MOTION, up to 0.05 [s].
-LEAD_TIME = 1.5
-#: A probe that tells nothing ends after that time [s].
-LONGEST_PROBE = 2.0
+#: Time after which a probe that tells nothing ends, and in which the lead of a held robot's
+#: reference grows by MOTION [s].
+PROBE_TIME = 2.0
 #: Share of the lead of robots that hold an object, which they would lose with a jerk.
 CAREFUL = 1 / 3
 #: Time that a stopped robot has missed, from when on it is done again [s].
@@ -226,7 +224,7 @@ class Progress:
     @property
     def _lead(self) -> Array:
         """Of the references of robots that are held (B, 1)."""
-        return MOTION * np.minimum(0.75 + self.since / LEAD_TIME, 2.5)[:, None]
+        return MOTION * np.minimum(0.75 + self.since / PROBE_TIME, 2.5)[:, None]
 
     # Running
 
@@ -363,7 +361,7 @@ class Progress:
         closed = probing & ~off.any(-1)
         came = closed & (moved | self.told)
         arrived = probing & ~came & near & (closed | (self.since > DWELL + 4 * lag))
-        came |= closed & (self.since > LONGEST_PROBE)
+        came |= closed & (self.since > PROBE_TIME)
         new = self._switched(came | (arrived & self.placed), RUNNING, self.target)
         held = arrived & ~self.placed
         if not held.any():

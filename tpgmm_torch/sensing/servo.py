@@ -6,11 +6,11 @@ payload, an encoder that slipped):
     x_k = (1 + p lag_k / 2)^-2 r          for a bank of lags, exact over ticks of any length
     y   = x_k + b + g_k                   b: offset, a random walk
 
-r is the reference that was sent, p the derivative over time, y the reading, and g_k the gap that
-a lag and the offset leave. A gap is judged against the readings' noise, what is not known of the
-offset, and a share of the servo's own gap, whatever the rate of the loop. Of the lags that are
-possible each may explain it: a joint does not follow if none does. How far the reference may
-lead is told by the shortest one.
+r is the reference that was sent, p the derivative over time, y the reading, and g_k the gap
+that a lag and the offset leave. A gap is judged against the readings' noise, what is not known
+of the offset, and a share of the servo's own gap, whatever the rate of the loop. Of the lags
+that are possible each may explain it: a joint does not follow if none does. How far the
+reference may lead is told by the shortest one.
 
 A robot that does not follow must not be explained by a long lag or by an offset: lags are
 learned while gaps are usual and the joint moves, offsets while gaps are usual.
@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.data.arrays import Array
 
-__all__ = ["Servo"]
+__all__ = ["Flags", "Servo"]
 
+Flags = NDArray[np.bool_]
 #: Lags of position servos, from stiff industrial drives to soft hobby servos [s].
 LAGS = np.geomspace(0.01, 0.64, 7)[:, None, None]
 #: A gap that means nothing: friction, backlash, compliance [rad or m].
@@ -70,8 +71,8 @@ class Servo:
         Estimate of the offset, and its variance.
     each, gap : arrays of shape (K, B, n_joints) and (B, n_joints)
         What each lag and the offset do not explain, smoothed over half a lag; their mean.
-    expected, lag, spread : array of shape (B, n_joints)
-        Expected position without offset, mean of the lag [s], variance of that position.
+    expected, lag : array of shape (B, n_joints)
+        Expected position without offset, mean of the lag [s].
     usual : array of shape (B, n_joints)
         Size that gaps usually have at most.
     excess : array of shape (B, n_joints)
@@ -98,7 +99,6 @@ class Servo:
     gap: Array
     expected: Array
     lag: Array
-    spread: Array
     usual: Array
     excess: Array
     lead: Array
@@ -112,7 +112,7 @@ class Servo:
         return cls(
             bank, bank, bank, posture, posture, np.zeros(bank.shape),
             none[:, 0], none, posture, 1e-6 * one, zero,
-            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, zero, one,
+            16 * OFFSET_STD**2 * one, 0 * bank, zero, posture, LAGS.mean() * one, one,
             zero, zero,
         )  # fmt: skip
 
@@ -130,12 +130,7 @@ class Servo:
         return weight / weight.sum(0)
 
     def update(
-        self,
-        reference: Array,
-        reading: Array,
-        dt: Array,
-        jumped: NDArray[np.bool_],
-        learns: NDArray[np.bool_],
+        self, reference: Array, reading: Array, dt: Array, jumped: Flags, learns: Flags
     ) -> Self:
         """The model after a tick.
 
@@ -193,7 +188,6 @@ class Servo:
             gap=(weight * each).sum(0),
             expected=expected,
             lag=lag,
-            spread=(weight * (second - expected) ** 2).sum(0),
         )
         noise = noise * np.minimum(1.0, dt / (2 * smooth))
         new = new._judged(reference, weight, noise)
@@ -219,12 +213,7 @@ class Servo:
         return replace(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
-        self,
-        reference: Array,
-        motion: Array,
-        ran: Array,
-        dt: Array,
-        learns: NDArray[np.bool_],
+        self, reference: Array, motion: Array, ran: Array, dt: Array, learns: Flags
     ) -> Self:
         """Lags and offsets of joints whose gaps are usual."""
         learns = learns & (self.excess < 1)
@@ -242,7 +231,7 @@ class Servo:
             score = np.maximum(score - score.max(0), -10.0)
         # offsets: a Kalman filter to which the servo's own motion is noise
         own = (MODEL_ERROR * (reference - self.expected)) ** 2
-        noise = (SERVO_STD**2 + self.noise + self.spread + own) * self.lag
+        noise = (SERVO_STD**2 + self.noise + own) * self.lag
         before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
         gain = learns * before * dt / (before * dt + noise)
         step = gain * self.gap
@@ -255,7 +244,7 @@ class Servo:
             variance=(1 - gain) * before,
         )
 
-    def with_offsets(self, joints: NDArray[np.bool_]) -> Self:
+    def with_offsets(self, joints: Flags) -> Self:
         """The gaps of some joints (B, n_joints) are offsets."""
         return replace(
             self.moving_on(joints),
@@ -269,7 +258,7 @@ class Servo:
         """How far joints of any lag have been asked to move since ``second`` was this bank."""
         return np.abs(self.second - bank).min(0)
 
-    def put(self, robots: NDArray[np.bool_]) -> Self:
+    def put(self, robots: Flags) -> Self:
         """Some robots (B, 1) were put to where they are."""
         here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
         here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
@@ -278,7 +267,7 @@ class Servo:
             self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
         )
 
-    def moving_on(self, joints: NDArray[np.bool_]) -> Self:
+    def moving_on(self, joints: Flags) -> Self:
         """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
         motion = (self.weight * (self.second - self.slow)).sum(0)
         slow = np.where(joints, self.reading - motion, self.slow_reading)

@@ -59,7 +59,7 @@ def test_an_offset_that_stays_is_no_reason_to_stop(size, begin):
 def test_a_stopped_robot_is_not_led_far(lag, begin):
     found = measures(50, Servo(lag=lag), [Fault("stop", begin, begin + 3, ALL)])
     # of which braking from 0.8 rad/s within the bound of 8 rad/s^2 takes 0.04
-    assert found["gap"] <= 0.11
+    assert found["gap"] <= 0.12
 
 
 @pytest.mark.parametrize("robot", ["four joints", "gripper"])
