@@ -8,6 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from tpgmm_torch.data.frames import LEVER
 from tpgmm_torch.exceptions import DataError
@@ -68,7 +69,7 @@ METRIC = np.array([1.0] * 3 + [(2 * LEVER) ** 2] * 4)
 MEMORY = 15
 #: Of white noise of variance v in six coordinates, the median of the squared second
 #: differences: 6 v times that of the chi-squared distribution.
-MEDIAN = 6 * 5.348
+MEDIAN = 6 * 2 * float(gammaincinv(6 / 2, 0.5))
 
 
 @dataclass(frozen=True, eq=False)

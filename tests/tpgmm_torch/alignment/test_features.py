@@ -45,16 +45,10 @@ def variance(rows):
     return np.average([one.var(axis=0).sum() for one in rows], weights=sizes)
 
 
-@pytest.mark.parametrize(
-    "name, weight",
-    {
-        "joints": 1.0,
-        "speed": 5.0,
-        "directions": 4.5,
-        "hand": 1.0,
-        "hand in bottle": 1.0,
-    }.items(),
-)
+WEIGHTS = {"joints": 1.0, "speed": 5.0, "directions": 4.5, "hand": 1.0, "hand in bottle": 1.0}
+
+
+@pytest.mark.parametrize("name, weight", WEIGHTS.items())
 def test_a_group_has_the_square_of_its_weight_as_variance(name, weight):
     family = DEMONSTRATIONS[:3]
     assert variance(scaled(family, name, Arm())) == pytest.approx(weight**2)
