@@ -71,10 +71,8 @@ def in_skill_time(
     (0.5, 1.5)
     """
     skill: Any = model.skill
-    return [
-        _placed(skill, one, number, max_slope, n_steps)
-        for number, one in enumerate(demonstrations)
-    ]
+    shown = enumerate(demonstrations)
+    return [_placed(skill, one, number, max_slope, n_steps) for number, one in shown]
 
 
 def _placed(

@@ -474,10 +474,8 @@ def _outside(
 
 def _first_poses(paths: Sequence[PathSummary]) -> Frame:
     """The first pose of a frame in each demonstration, (N,)."""
-    return Frame(
-        np.stack([path.position for path in paths]),
-        np.stack([path.orientation for path in paths]),
-    )
+    positions = np.stack([path.position for path in paths])
+    return Frame(positions, np.stack([path.orientation for path in paths]))
 
 
 def _rotation_vectors(mean: Array, orientations: Array) -> Array:

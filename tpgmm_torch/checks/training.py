@@ -109,6 +109,7 @@ class EpisodeSummary:
         """Summarise a demonstration."""
         time, joints = as_array(demonstration.time), as_array(demonstration.joints)
         begin, duration = float(time[0]), float(time[-1] - time[0])
+        whole = duration or math.inf
         return cls(
             begin,
             duration,
@@ -118,10 +119,7 @@ class EpisodeSummary:
             joints.min(axis=0),
             joints.max(axis=0),
             {name: PathSummary.of(frame) for name, frame in demonstration.frames.items()},
-            {
-                name: (at - begin) / duration if duration else 0.0
-                for name, at in demonstration.events.items()
-            },
+            {name: (at - begin) / whole for name, at in demonstration.events.items()},
         )
 
 

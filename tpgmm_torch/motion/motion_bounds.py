@@ -230,11 +230,10 @@ def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
     if given is None:
         return own
     if isinstance(given, Mapping):
-        for joint in given:
-            if joint not in joints:
-                raise UnknownNameError("joint", joint, "the robot", joints)
         values = own.clone()
         for joint, value in given.items():
+            if joint not in joints:
+                raise UnknownNameError("joint", joint, "the robot", joints)
             values[joints.index(joint)] = as_tensor(value, f"{name} of {joint!r}")
     else:
         values = as_tensor(given, name).to(own)
