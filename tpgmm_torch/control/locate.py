@@ -238,13 +238,13 @@ class Progress:
         rate = np.clip(2 - waits * 2 * np.maximum(excess, lead), 0.0, 1.0)
         if waits:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
-        rate = np.where(stands, 0.0, rate)
+        rate = np.where(stands, seen.halted * self.rate, rate)
         usual = np.where(self.usual_dt > 0, self.usual_dt, seen.dt)
         usual = usual + 0.1 * (np.minimum(seen.dt, 2 * usual) - usual)
         owed = np.where(stands, 0.0, self.owed + seen.dt)
         step = np.minimum(owed, CATCH_UP * usual)
         owed = np.where(rate < 1, 0.0, owed - step)
-        step = self.clock.speed * rate * step
+        step = np.where(stands, 0.0, self.clock.speed * rate * step)
         time = self._arrived(self._until_end(step), known)
         servo = self.servo
         moved = np.where(known, np.abs(servo.reading - self.rest), 0.0)
