@@ -13,8 +13,8 @@ probing
     is an *offset*, which is taken in. If the gap closes because the joint moves, it *came
     back*. If it closes because the reference has come to it, somebody or something *holds* it.
 held
-    The reference leads the robot by a little. Once that moves, time goes on, from when it came
-    to rest.
+    The reference leads the robot by a little, the more the longer it lasts. Once the robot
+    moves, time goes on, from when it came to rest; and where no more than that is wanted.
 
 Where several joints are off, and the skill explains the posture at another time, the robot was
 displaced, and time goes there; one joint that is off is an offset sooner than another place.
@@ -110,7 +110,7 @@ class Progress:
         Expected positions and readings from when on motion is compared.
     compared : bool array of shape (B,)
         Whether these are known: what opened the gap has to be over.
-    told : bool array of shape (B,)
+    explained : bool array of shape (B,)
         Robots of which a gap was found to be an offset at this tick.
     followed : array of shape (2, B, n_joints)
         Readings and expected positions when a robot last followed.
@@ -143,7 +143,7 @@ class Progress:
     model: Array
     reading: Array
     compared: Flags
-    told: Flags
+    explained: Flags
     followed: Array
     rest: Array
     rest_bank: Array
@@ -314,7 +314,7 @@ class Progress:
             model=model,
             reading=reading,
             compared=(self.compared | begins) & (asked | held),
-            told=along.any(-1),
+            explained=along.any(-1),
             displaced=self.displaced & ~along.any(-1),
         )
 
@@ -359,7 +359,7 @@ class Progress:
         way = np.where(stuck, np.abs(servo.corrected - self.target), 0.0)
         moved = (way > MOTION + 3 * np.sqrt(servo.noise)).any(-1)
         closed = probing & ~off.any(-1)
-        came = closed & (moved | self.told)
+        came = closed & (moved | self.explained)
         arrived = probing & ~came & near & (closed | (self.since > DWELL + 4 * lag))
         came |= closed & (self.since > PROBE_TIME)
         new = self._switched(came | (arrived & self.placed), RUNNING, self.target)
