@@ -364,6 +364,8 @@ class Controller:
             return
         servo = progress.servo
         postures = _rows(reading.rival) - servo.offset
+        if self._gripping is not None:  # of which readings tell nothing
+            postures = np.where(as_array(self._gripping), servo.expected, postures)
         away = np.abs(postures - servo.expected) - servo.usual
         explained = away.max(-1) <= reading.trust.joint_jump
         pending = reading.pending.reshape(-1)

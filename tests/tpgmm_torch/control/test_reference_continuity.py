@@ -44,6 +44,12 @@ def test_references_are_continuous_and_the_skill_ends(case):
     assert found["runaway"] < 0.05
 
 
+@pytest.mark.parametrize("rate", [50, 200])
+def test_a_gripper_of_which_readings_tell_nothing_keeps_no_robot_held(rate):
+    dead = Fault("zeros", 3.77, 5.09, np.ones(3))
+    assert not measures(rate, Servo(lag=0.04), [dead], "gripper")["open"]
+
+
 @pytest.mark.parametrize("size", [0.05, -0.1, 0.2, -0.35])
 @pytest.mark.parametrize("begin", [0.3, 1.5, 3.0])
 def test_an_offset_that_stays_is_no_reason_to_stop(size, begin):
