@@ -51,7 +51,7 @@ from tpgmm_torch.control.command import Command
 from tpgmm_torch.control.estimate import choose, estimate
 from tpgmm_torch.control.hold import Holds
 from tpgmm_torch.control.holding import Holding
-from tpgmm_torch.control.locate import LONGEST_TICK, Progress, Seen
+from tpgmm_torch.control.locate import LONGEST_TICK, RUNNING, Progress, Seen
 from tpgmm_torch.control.places import Places
 from tpgmm_torch.control.reach import Fade, nearest
 from tpgmm_torch.control.situations import completed_frames, report_start
@@ -347,7 +347,7 @@ class Controller:
             measured = self._checked(joints)
         else:
             self._inputs = self._inputs.update(tick.seconds, joints, frames, ages)
-            self._accept_places(tick)
+            self._accept_places()
             self._frames, measured = self._inputs.frames, self._inputs.measured
             halted = self._inputs.untrusted(self._holds.known(self.reference))
             tick.halted = halted.reshape(-1) if halted.any() else None
@@ -356,7 +356,7 @@ class Controller:
             measured = torch.where(self._gripping, torch.nan, measured)
         tick.joints = measured
 
-    def _accept_places(self, tick: _Tick) -> None:
+    def _accept_places(self) -> None:
         """Readings that have jumped far, to the reference or to where the skill leads."""
         assert self._inputs is not None
         reading, progress = self._inputs.joints, self._progress
@@ -397,7 +397,7 @@ class Controller:
                 still = still | self._inputs.jumping.reshape(-1)
             seen = Seen(passed, readings, jumped, still)
             self._progress = before.advance(reference, seen, self._find)
-            self._resume((before.mode != 0) & (self._progress.mode == 0))
+            self._resume((before.mode != RUNNING) & (self._progress.mode == RUNNING))
         over = (self._progress.time >= before.end) & (before.time >= before.end)
         tick.ended = self._tensor(over) if over.any() else None
 
@@ -468,10 +468,10 @@ class Controller:
     ) -> None:
         """The next references, within the bounds."""
         self._found, goal, progress = found, wanted, self._progress
-        if progress.mode.any() and tick.joints is not None:
+        if (progress.mode != RUNNING).any() and tick.joints is not None:
             busy = self._holds.busy(wanted)
             self._progress, led = progress.led(_rows(as_array(wanted)), busy)
-            alone = self._tensor(progress.mode == 0).unsqueeze(-1)
+            alone = self._tensor(progress.mode == RUNNING).unsqueeze(-1)
             alone = alone | tick.joints.isnan()
             goal = torch.where(alone, wanted, self._tensor(led).to(wanted))
         halted, late = (

@@ -33,7 +33,7 @@ from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.sensing.servo import FLOOR, Flags, Servo
 
-__all__ = ["LONGEST_TICK", "Progress", "Seen"]
+__all__ = ["LONGEST_TICK", "RUNNING", "Progress", "Seen"]
 
 #: A time of the skill for a robot (row) at a posture, if one explains it.
 Find = Callable[[int, Array], float | None]
@@ -196,7 +196,7 @@ class Progress:
         new = replace(self, servo=servo, relocalized=np.zeros_like(self.placed))
         new = new._timed(seen)
         if self.clock.kind == "even" or not (
-            self.mode.any() or self.compared.any() or (new.off_for > 0).any()
+            (self.mode != RUNNING).any() or self.compared.any() or (new.off_for > 0).any()
         ):
             return new
         new = new._compared(seen)._noticed(reference, seen, find)

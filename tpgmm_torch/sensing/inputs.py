@@ -147,22 +147,22 @@ class Inputs:
     @property
     def jumped(self) -> Mask:
         """Robots (...) whose joints have jumped to where they are now."""
-        batch = tuple(self.start.shape[:-1])
-        return np.zeros(batch, bool) if self.joints is None else self.joints.jumped
+        return self._nobody if self.joints is None else self.joints.jumped
 
     @property
     def jumping(self) -> Mask:
         """Robots (...) whose joints are read elsewhere, which is not accepted yet."""
-        if self.joints is None:
-            return np.zeros(tuple(self.start.shape[:-1]), bool)
-        return self.joints.fault == JUMPED
+        return self._nobody if self.joints is None else self.joints.fault == JUMPED
 
     @property
     def frozen(self) -> Mask:
         """Robots (...) whose joints have been the same to the last bit for too long."""
-        if self.joints is None:
-            return np.zeros(tuple(self.start.shape[:-1]), bool)
-        return self.joints.same_for > self.trust.joint_timeout
+        joints, longest = self.joints, self.trust.joint_timeout
+        return self._nobody if joints is None else joints.same_for > longest
+
+    @property
+    def _nobody(self) -> Mask:
+        return np.zeros(tuple(self.start.shape[:-1]), bool)
 
     @property
     def shares(self) -> dict[str, Tensor]:
@@ -185,7 +185,7 @@ class Inputs:
         held : mapping of str to ndarray of bool, of shape (...)
             Robots that know where an object is without seeing it.
         """
-        old = np.zeros(tuple(self.start.shape[:-1]), dtype=bool)
+        old = self._nobody
         for name, reading in self._readings().items():
             old |= (reading.age > self._timeout(name)) & ~held.get(name, np.False_)
         for name, age in self.ages.items():

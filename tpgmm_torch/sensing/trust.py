@@ -39,8 +39,8 @@ class Trust:
     the last one has jumped. None of them is used. A jump is accepted once readings that live,
     which differ in the last bit, have stayed there for ``settling_time``; a jump to the last
     reading in degrees, of all joints to 0, or of an object's orientation alone, as trackers
-    flip, never is. A robot without an accepted reading for
-    longer than a timeout is held until there is one.
+    flip, never is. A robot without an accepted reading for longer than a timeout is held until
+    there is one.
 
     Parameters
     ----------
