@@ -39,6 +39,7 @@ for place, length in enumerate(LENGTHS):
     <joint name="joint_{place + 1}" type="{"revolute" if place < 3 else "fixed"}">
       <parent link="{LINKS[place]}"/><child link="{LINKS[place + 1]}"/>
       <origin xyz="{length} 0 0"/><axis xyz="0 0 1"/>
+      <limit lower="-3" upper="3" velocity="3" effort="1"/>
     </joint>"""
 robot = Robot.from_urdf(urdf + "</robot>", links=["tip"])
 

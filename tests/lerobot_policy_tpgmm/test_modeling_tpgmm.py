@@ -174,7 +174,10 @@ def test_joints_alone_need_no_robot_and_no_frames():
     assert set(acting.config.input_features) == {STATE}
     start = waves()[1].joints[0]
     actions = act(acting, {STATE: start[None].float()}, len(model.time_))
-    assert_close(actions[0], predicted(model, [Situation(start.float().double())])[0])
+    # from rest, accelerated as was demonstrated at most three times over
+    expected = predicted(model, [Situation(start.float().double())])[0]
+    assert (actions[0, 1] - start).abs().max() < 0.1 < (expected[1] - start).abs().max()
+    assert_close(actions[0, 10:], expected[10:])
 
 
 def test_tracked_bodies_are_moved_on_their_manifold():

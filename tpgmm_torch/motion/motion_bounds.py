@@ -139,7 +139,7 @@ class MotionBounds:
         -----
         MissingLimitsWarning
             If the description of the robot lacks limits of position or speed that are not
-            given either.
+            given either; not where it has none of speed at all, as an MJCF.
         """
         if not isinstance(kinematics, Kinematics):  # a skill
             demonstrated = demonstrated or kinematics.peaks
@@ -148,7 +148,8 @@ class MotionBounds:
         if unknown := [name for name in given if name not in names]:
             raise UnknownNameError("bound", unknown[0], "the bounds of a motion", names)
         bound = {name: _tightened(name, kinematics, given.get(name)) for name in names}
-        _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
+        if bound["velocity"].isfinite().any():
+            _warn_of_missing_limits(kinematics, [bound[n] for n in names[:3] if n in given])
         bound |= _completed(bound, demonstrated)
         return cls(**{name: value.to(kinematics.lower) for name, value in bound.items()})
 
@@ -226,7 +227,7 @@ def _tightened(name: str, kinematics: Kinematics, given: Any) -> Tensor:
     own, joints = getattr(kinematics, name), kinematics.joint_names
     if own is None:
         own = torch.full_like(kinematics.lower, torch.inf)
-    own = own.double()
+    own = own.double().clone()  # a file does not share them
     if given is None:
         return own
     if isinstance(given, Mapping):

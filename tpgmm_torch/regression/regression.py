@@ -143,7 +143,7 @@ class Regression:
             Whether joints give way by what the demonstrations leave unknown.
         """
         mixture, kinematics = learned.mixture, learned.kinematics
-        limited = bool(kinematics.velocity.isfinite().any())
+        bounded = not kinematics.quaternion_starts
         return cls(
             kinematics,
             learned.operators,
@@ -154,7 +154,7 @@ class Regression:
             begin=float(learned.time[0]),
             end=float(learned.time[-1]),
             holds=learned.holds,
-            motion_bounds=MotionBounds.of(kinematics, learned.peaks) if limited else None,
+            motion_bounds=MotionBounds.of(kinematics, learned.peaks) if bounded else None,
             peaks=learned.peaks,
             summary=learned.summary,
             time=learned.time,

@@ -1,5 +1,6 @@
 """A running skill, tick by tick: its beginning, its end, its inputs."""
 
+import re
 from dataclasses import fields
 from datetime import timedelta
 
@@ -9,9 +10,12 @@ import torch
 
 from tests.support.damage import FULL
 from tests.support.mixtures import CASES, Case, Problem, assert_close
-from tests.support.skills import bottle_demonstrations, generator, small_bottle
+from tests.support.robot_zoo import HANDS
+from tests.support.skills import bottle_demonstrations, few_bottles, generator, small_bottle
 from tests.support.worlds import OBJECT
-from tpgmm_torch import Frame, Situation
+from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_torch import Frame, Robot, Situation, TaskParameterizedGMM
 from tpgmm_torch.control.controller import Controller
 from tpgmm_torch.control.rollout import rollout
 from tpgmm_torch.exceptions import DataError, ShapeError
@@ -249,6 +253,26 @@ def test_a_robot_that_somebody_moves_is_approached_within_bounds():
     assert {first for first, _ in statuses} == {"running", "displaced"}
     assert {second for _, second in statuses} == {"running"}
     assert controller.time[0] < controller.time[1] - 1.0
+
+
+def test_a_robot_without_limits_of_speed_moves_as_it_was_shown():
+    urdf = re.sub(r'velocity="[^"]*"', "", upper_body_urdf())
+    robot = Robot.from_urdf(urdf, HANDS)
+    assert not robot.velocity.isfinite().any()
+    model = TaskParameterizedGMM(8, bottle_operators(), robot, tol=1e-2)
+    skill = model.fit(few_bottles()).skill
+    shown = few_bottles()[0]
+    bottle, away = shown.frames["bottle"], torch.tensor([0.6, 0.0, 0.0])
+    controller = Controller(skill, shown.joints[0], shown.frames)
+    speed, peak = torch.zeros(robot.n_joints), torch.zeros(robot.n_joints)
+    while not controller.finished:
+        share = (float(controller.time) - 1.0) / (skill.end - 1.0)
+        pulled = Frame(bottle.position + min(max(share, 0), 1) * away, bottle.orientation)
+        before = controller.reference
+        command = controller.step(0.05, before, {"bottle": pulled})
+        after = (command.reference - before) / 0.05
+        speed, peak = after, torch.maximum(peak, (after - speed).abs() / 0.05)
+    assert bool((peak <= 3 * skill.peaks[0] * 1.001).all())
 
 
 def test_a_tracker_that_loses_what_a_hand_holds_stops_nobody():
