@@ -147,7 +147,7 @@ def normalize(q: Tensor) -> Tensor:
         If a quaternion is zero or not finite, so that it has no direction.
     """
     norm = torch.linalg.vector_norm(q, dim=-1, keepdim=True)
-    if not bool(((norm > 0) & torch.isfinite(norm)).all()):
+    if not bool(((norm > 0) & (norm < torch.inf)).all()):
         raise DataError("a quaternion is zero or not finite: it cannot be brought to unit norm")
     return q / norm
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from tpgmm_torch.control.holding import (
     MOVED,
+    NO,
     PERHAPS,
     SETTLING,
     TURNED,
@@ -25,6 +26,7 @@ from tpgmm_torch.control.holding import (
     choose,
 )
 from tpgmm_torch.data.frames import Frame
+from tpgmm_torch.data.states import changed
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.skills.skill import Skill
@@ -129,17 +131,16 @@ class HoldWatch:
         for name in known:  # the skill knows where it is
             rests.pop(name, None)
         for name in names - known:
-            seen, yet = frames[name], free_yet.get(name, torch.tensor(True))
+            seen, yet, gone = frames[name], free_yet.get(name, ~NO), lost.get(name, NO)
             rest = rests.get(name) or Rest.at(seen, joints)
-            gone = lost.get(name, torch.tensor(False))
             if rest.seen is not seen:
                 rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet & ~gone)
             elif rest.pose is seen:  # it has not moved
                 stood = torch.where(gone.unsqueeze(-1), rest.joints, joints)
-                rest = replace(rest, joints=stood)
+                rest = changed(rest, joints=stood)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
-        return replace(self, rests=rests), holding, places
+        return changed(self, rests=rests), holding, places
 
     def _ungiven(self, holding: Holding, free_yet: Mapping[str, Tensor]) -> Holding:
         """The skill's holds count again for robots for which they have begun."""
@@ -160,7 +161,7 @@ class HoldWatch:
         yet: Tensor,
     ) -> tuple[Rest, Holding]:
         """After a new reading of an object."""
-        rest = replace(rest, seen=seen, since=rest.since + dt)
+        rest = changed(rest, seen=seen, since=rest.since + dt)
         rest, holding = self._taken(name, rest, joints, holding, dt, yet)
         if rest.found and bool((due := rest.since >= LOST_PERIOD).any()):
             rest, holding = self._lost(name, rest, joints, holding, due, yet)
@@ -178,7 +179,11 @@ class HoldWatch:
         """After a link may have taken an object along, or somebody else moved it."""
         moved = rest.pose.change(rest.seen, MOVED, TURNED)
         free = holding.free(name, moved) & yet
+        settled = (torch.as_tensor(dt).to(moved) / SETTLING).clamp(max=1.0)
         rests = free & (moved < 0.1)
+        if bool(rests.all()):
+            pose = between(rest.pose, rest.seen, settled)
+            return changed(rest, pose=pose, joints=joints), holding
         settles, elsewhere, found = rests, torch.zeros_like(rests), rest.found
         if bool((asked := free & ~rests).any()):
             before, now = self.kinematics.state(rest.joints), self.kinematics.state(joints)
@@ -197,11 +202,10 @@ class HoldWatch:
                 if bool(where.any()):
                     holding = holding.taken(name, index, where, rest.pose, grasp)
                     found = True
-        settled = (torch.as_tensor(dt).to(moved) / SETTLING).clamp(max=1.0)
         share = torch.where(settles, settled, elsewhere.to(moved))
         stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
         pose = between(rest.pose, rest.seen, share)
-        return replace(rest, pose=pose, joints=stood, found=found), holding
+        return changed(rest, pose=pose, joints=stood, found=found), holding
 
     def _lost(
         self,
@@ -223,7 +227,7 @@ class HoldWatch:
         pose = choose(lost, rest.seen, rest.pose)
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
         since = rest.since.masked_fill(due, 0.0)
-        return replace(rest, pose=pose, joints=stood, away=away, since=since), holding
+        return changed(rest, pose=pose, joints=stood, away=away, since=since), holding
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,10 +290,9 @@ class Holds:
             Which objects are seen at each tick, and how late.
         """
         given, watch, holding = self.given.union(holds or ()), self.watch, self.holding
-        shares: Mapping[str, Tensor] = {}
         lost: Mapping[str, Tensor] = {}
         if inputs is not None:
-            shares, lost = inputs.shares, inputs.lost
+            lost = inputs.lost
             if inputs.poses and not holds:
                 now = time.expand(joints.shape[:-1])
                 told = self.first.keys() & given
@@ -299,12 +302,13 @@ class Holds:
                 )  # fmt: skip
         if frames is not None:
             frames = _seen_frames(frames, holding, lost)
+        shares = inputs.shares if inputs is not None and holding.held else {}
         holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
-        new = replace(self, holding=holding, watch=watch, given=given)
+        new = changed(self, holding=holding, watch=watch, given=given)
         if not (lost or self.hidden):
             return new
         assert inputs is not None
-        return replace(new, hidden=new._hidden(joints, lost, inputs, dt))
+        return changed(new, hidden=new._hidden(joints, lost, inputs, dt))
 
     def _hidden(
         self, joints: Tensor, lost: Mapping[str, Tensor], inputs: Inputs, dt: float | Tensor

@@ -23,7 +23,7 @@ displaced, and time goes there; one joint that is off is an offset sooner than a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from tpgmm_torch.control.clock import Clock
 from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.states import changed
 from tpgmm_torch.sensing.servo import FLOOR, Flags, Servo
 
 __all__ = ["LONGEST_TICK", "RUNNING", "Progress", "Seen"]
@@ -193,7 +194,7 @@ class Progress:
         servo = self.servo.update(
             reference, seen.joints, dt, seen.jumped[:, None], running[:, None]
         )
-        new = replace(self, servo=servo, relocalized=np.zeros_like(self.placed))
+        new = changed(self, servo=servo, relocalized=np.zeros_like(self.placed))
         new = new._timed(seen)
         if self.clock.kind == "even" or not (
             (self.mode != RUNNING).any() or self.compared.any() or (new.off_for > 0).any()
@@ -204,7 +205,7 @@ class Progress:
 
     def even(self, dt: float | Array) -> Self:
         """Progress where nothing is measured."""
-        return replace(self, time=self._until_end(self.clock.speed * dt))
+        return changed(self, time=self._until_end(self.clock.speed * dt))
 
     def led(self, wanted: Array, careful: Flags) -> tuple[Self, Array]:
         """Where references go: of robots that run, the wanted postures (B, n_joints).
@@ -219,7 +220,7 @@ class Progress:
         lead = np.where((self.mode == HELD)[:, None] & self.stuck, lead, 0.0)
         led = self.target + np.clip(np.nan_to_num(wanted - self.target), -lead, lead)
         goal = np.where((self.mode == RUNNING)[:, None], wanted, led)
-        return replace(self, wanted=wanted), goal
+        return changed(self, wanted=wanted), goal
 
     @property
     def _lead(self) -> Array:
@@ -235,7 +236,7 @@ class Progress:
         stands = seen.halted | (self.mode != RUNNING)
         waits = self.clock.kind != "even"
         lead = np.where(known, self.servo.lead, 0.0).max(-1)
-        rate = np.clip(2 - waits * 2 * np.maximum(excess, lead), 0.0, 1.0)
+        rate = np.minimum(np.maximum(2 - waits * 2 * np.maximum(excess, lead), 0.0), 1.0)
         if waits:
             rate = np.minimum(rate, self.rate + seen.dt / RESTART)
         rate = np.where(stands, seen.halted * self.rate, rate)
@@ -253,8 +254,8 @@ class Progress:
         asked = np.where(known, asked, 0.0).max(-1)
         stalled = waits & ~stands & ~left & (asked > 2 * FLOOR)
         off = ~stands & (excess > OFF) | stalled
-        now = np.stack((servo.reading, servo.expected))
-        return replace(
+        now = np.array((servo.reading, servo.expected))
+        return changed(
             self,
             time=time,
             rate=rate,
@@ -308,7 +309,7 @@ class Progress:
         along = off & tells & (np.abs(ran - moved) < 0.5 * np.abs(moved))
         along &= (asked & self.compared)[:, None]
         held = self.mode == HELD
-        return replace(
+        return changed(
             self,
             servo=servo.with_offsets(along) if along.any() else servo,
             model=model,
@@ -337,7 +338,7 @@ class Progress:
         off |= moved[:, None] & known  # who was displaced is met in all joints
         target = np.where(off, servo.corrected, reference)
         new = self._switched(rows, PROBING, target)
-        new = replace(
+        new = changed(
             new,
             stuck=np.where(rows[:, None], off, self.stuck),
             opened=np.where(rows[:, None], np.abs(servo.gap), self.opened),
@@ -367,7 +368,7 @@ class Progress:
         if not held.any():
             return new
         target = np.where(known, servo.corrected, reference)
-        new = replace(
+        new = changed(
             new._switched(held, HELD, target),
             reading=np.where(held[:, None], servo.reading, new.reading),
         )
@@ -388,7 +389,7 @@ class Progress:
         back &= (np.abs(self.rest_time - self.resumed) > NEARBY) & ~self.displaced
         back &= self.clock.kind == "localizing"
         new = self._switched(rows, RUNNING, self.target)
-        return replace(
+        return changed(
             new,
             time=np.where(back, self.rest_time, self.time),
             resumed=np.where(back, self.rest_time, self.resumed),
@@ -405,7 +406,7 @@ class Progress:
         for row, place in found.items():
             if place is not None and abs(place - time[row]) > NEARBY:
                 time[row], placed[row], moved[row] = place, True, True
-        return replace(
+        return changed(
             self,
             time=time,
             placed=placed,
@@ -428,7 +429,7 @@ class Progress:
                 servo = servo.put((self.displaced & rows)[:, None])
             rest = np.where(rows[:, None], servo.reading, rest)
             bank = np.where(rows[:, None], servo.second, bank)
-        return replace(
+        return changed(
             self,
             servo=servo,
             rest=rest,

@@ -17,7 +17,7 @@ with the velocity it has had for a while, and its first ``dt`` is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
+from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import ROUNDING, MotionBounds
 from tpgmm_torch.motion.trajectory_generator import first_part, stopping_range
@@ -101,7 +102,7 @@ class Follower:
         where = robots.unsqueeze(-1)
         reference = torch.where(where, before.reference, self.reference)
         moment = before.moment.choose(where.numpy(force=True), self.moment)
-        return replace(self, reference=reference, moment=moment)
+        return changed(self, reference=reference, moment=moment)
 
     @property
     def velocity(self) -> Tensor:
@@ -125,7 +126,7 @@ class Follower:
         """
         exact = self.moment.taken(as_array(wanted), _column(dt))
         return (
-            replace(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
+            changed(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
         )
 
     def fits(self, wanted: Tensor, dt: Seconds) -> Tensor:
@@ -165,7 +166,7 @@ class Follower:
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
         as_wanted = torch.from_numpy(fits & (raw == target)).to(wanted.device)
         reached = torch.from_numpy(following.motion[0]).to(wanted)
-        return replace(
+        return changed(
             self, reference=torch.where(as_wanted, wanted, reached), moment=following
         )
 

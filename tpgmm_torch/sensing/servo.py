@@ -18,13 +18,14 @@ learned while gaps are usual and the joint moves, offsets while gaps are usual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tpgmm_torch.data.arrays import Array
+from tpgmm_torch.data.states import changed
 
 __all__ = ["Flags", "Servo"]
 
@@ -154,8 +155,8 @@ class Servo:
         expected = (weight * second).sum(0)
         known = np.isfinite(reading)
         y = np.where(known, reading, expected + self.offset + self.gap)
-        readings = np.stack((self.readings[1], self.readings[2], y))
-        gaps = np.stack((self.gaps[1], self.gaps[2], y - second))
+        readings = np.concatenate((self.readings[1:], y[None]))
+        gaps = np.concatenate((self.gaps[1:], (y - second)[None]))
         jumped = jumped | np.isnan(gaps[1, 0])
         slow, near = self.slow_reading, self.near_reading
         if jumped.any():
@@ -173,7 +174,7 @@ class Servo:
         each = self.each + share * (_median(gaps) - self.offset - self.each)
         each = np.where(known, each, 0.0)
         wash, soon = 1 - np.exp(-dt / WASH_OUT), 1 - np.exp(-dt / STANDSTILL)
-        new = replace(
+        new = changed(
             self,
             first=reference + left * behind,
             second=second,
@@ -204,13 +205,10 @@ class Servo:
         least = np.where(possible, self.each, np.inf).min(0)
         most = np.where(possible, self.each, -np.inf).max(0)
         beyond = np.maximum(np.maximum(least, -most), 0.0)
-        shortest = possible.argmax(0)[None]
-        own, gap = (
-            np.abs(np.take_along_axis(bank, shortest, 0)[0])
-            for bank in (reference - self.second, self.each)
-        )
-        lead = gap / (floor + MODEL_ERROR * own)
-        return replace(self, usual=usual, excess=beyond / usual, lead=lead)
+        shortest = possible.argmax(0)
+        own = np.abs(reference - shortest.choose(self.second))
+        lead = np.abs(shortest.choose(self.each)) / (floor + MODEL_ERROR * own)
+        return changed(self, usual=usual, excess=beyond / usual, lead=lead)
 
     def _learned(
         self, reference: Array, motion: Array, ran: Array, dt: Array, learns: Flags
@@ -235,7 +233,7 @@ class Servo:
         before = np.minimum(self.variance + noise * dt / DRIFT**2, OFFSET_STD**2)
         gain = learns * before * dt / (before * dt + noise)
         step = gain * self.gap
-        return replace(
+        return changed(
             self,
             score=score,
             offset=self.offset + step,
@@ -246,7 +244,7 @@ class Servo:
 
     def with_offsets(self, joints: Flags) -> Self:
         """The gaps of some joints (B, n_joints) are offsets."""
-        return replace(
+        return changed(
             self.moving_on(joints),
             offset=np.where(joints, self.offset + self.gap, self.offset),
             each=np.where(joints, self.each - self.gap, self.each),
@@ -263,7 +261,7 @@ class Servo:
         here = {name: self.corrected for name in ("first", "second", "slow", "expected")}
         here |= dict.fromkeys(("slow_reading", "near_reading"), self.reading)
         here |= {"gaps": self.offset, "each": 0 * self.gap, "gap": 0 * self.gap}
-        return replace(
+        return changed(
             self, **{n: np.where(robots, value, getattr(self, n)) for n, value in here.items()}
         )
 
@@ -271,7 +269,7 @@ class Servo:
         """The motion of some joints (B, n_joints) teaches from now on, not what was before."""
         motion = (self.weight * (self.second - self.slow)).sum(0)
         slow = np.where(joints, self.reading - motion, self.slow_reading)
-        return replace(self, slow_reading=slow)
+        return changed(self, slow_reading=slow)
 
 
 def _median(three: Array) -> Array:

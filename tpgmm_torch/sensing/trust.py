@@ -7,12 +7,13 @@ numpy arrays: of few numbers numpy takes a quarter of the time that torch takes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["JointReading", "PoseReading", "Reading", "Trust"]
@@ -168,7 +169,7 @@ class Reading:
             change = np.abs(seen - self.value)
             if (change <= self._small_change()).all() and not self._faults(seen).any():
                 none = np.zeros_like(self.jumped)
-                return replace(self, value=seen, same_for=same_for, jumped=none, pending=none)
+                return changed(self, value=seen, same_for=same_for, jumped=none, pending=none)
         with np.errstate(invalid="ignore"):
             fault = self._faults(seen)
             known = np.maximum(np.minimum(self.age, self.trust.settling_time), self.lost_for)
@@ -183,7 +184,7 @@ class Reading:
         jumped = settled & lives & self._small(seen)
         accepted = near | jumped
         jumped |= near & (self.fault == JUMPED) & stays
-        return replace(
+        return changed(
             self,
             value=np.where(accepted[..., None], seen, self.value),
             age=np.where(accepted, 0.0, self.age + dt),
@@ -199,7 +200,7 @@ class Reading:
 
     def accept(self, robots: Mask) -> Self:
         """The readings to which the signal of some robots has jumped."""
-        return replace(
+        return changed(
             self,
             value=np.where(robots[..., None], self.rival, self.value),
             age=np.where(robots, 0.0, self.age),
@@ -300,7 +301,7 @@ class PoseReading(Reading):
             return new
         flipped &= ~self._small(seen)
         kept = np.concatenate((seen[..., :3], new.value[..., 3:]), -1)
-        return replace(
+        return changed(
             new,
             value=np.where(flipped[..., None], kept, new.value),
             fault=np.where(flipped, FLIPPED, new.fault).astype(np.int8),
@@ -316,8 +317,8 @@ class PoseReading(Reading):
     def _faults(self, seen: Floats) -> NDArray[np.int8]:
         turn = seen[..., 3:]
         unit = np.abs(np.einsum("...i,...i", turn, turn) - 1) < 2e-2
-        cases = [~np.isfinite(seen).all(-1), ~unit]
-        return np.select(cases, [LOST, IMPOSSIBLE], ACCEPTED).astype(np.int8)
+        impossible = np.where(unit, ACCEPTED, IMPOSSIBLE)
+        return np.where(np.isfinite(seen).all(-1), impossible, LOST).astype(np.int8)
 
     def _near(self, seen: Floats, other: Floats, elapsed: float | Floats) -> Mask:
         elapsed = np.asarray(elapsed)
