@@ -37,7 +37,7 @@ import copy
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -90,6 +90,8 @@ class _Tick:
     late : bool array of shape (B,), optional
         Robots whose time did not increase.
     first : bool
+    time : Tensor of shape () or (...)
+        Progress, from when each robot is located on [s].
     joints : Tensor of shape (..., n_joints), optional
         Accepted readings, NaN elsewhere.
     halted : bool array of shape (B,), optional
@@ -101,6 +103,7 @@ class _Tick:
     seconds: Seconds
     late: Flags | None
     first: bool
+    time: Tensor = field(init=False)
     joints: Tensor | None = None
     halted: Flags | None = None
     ended: Tensor | None = None
@@ -286,6 +289,7 @@ class Controller:
             return self.command
         self._sense(tick, joints, frames, ages)
         self._locate(tick)
+        tick.time = self.time
         if tick.ended is None or not bool(tick.ended.all()):
             self._hold(tick, frames, holds)
             self._follow(tick, *self._reach(tick, self._estimate(tick)))
@@ -333,7 +337,7 @@ class Controller:
         first = self.command is None
         if first:
             return _Tick(np.maximum(np.nan_to_num(seconds, posinf=1e-3), 1e-3), None, True)
-        if not np.all(np.asarray(seconds) > 0) and late is None:
+        if isinstance(seconds, float) and seconds == 0:
             return None
         if self._trusts:
             seconds = np.minimum(seconds, LONGEST_TICK)
@@ -381,17 +385,16 @@ class Controller:
         if tick.first:
             return
         before = self._progress
-        passed = np.broadcast_to(tick.seconds, self.reference.shape[:-1]).reshape(-1)
-        none = np.zeros(len(passed), bool)
-        still = np.any([r for r in (none, tick.halted, tick.late) if r is not None], axis=0)
+        none = np.zeros(len(before.time), bool)
+        passed = none + np.ravel(tick.seconds)
+        held = (robots for robots in (tick.halted, tick.late) if robots is not None)
+        still = functools.reduce(np.logical_or, held, none)
         if not self._trusts and tick.joints is None:
             self._progress = before.even(np.where(still, 0.0, passed))
         else:
             reference = _rows(as_array(self.reference))
-            readings = np.full_like(reference, np.nan)
-            if tick.joints is not None:
-                readings = _rows(as_array(tick.joints))
-            jumped = none
+            known, jumped = tick.joints, none
+            readings = reference * np.nan if known is None else _rows(as_array(known))
             if self._inputs is not None:
                 jumped = self._inputs.jumped.reshape(-1)
                 still = still | self._inputs.jumping.reshape(-1)
@@ -418,13 +421,13 @@ class Controller:
         """What the robots hold."""
         seen = None if frames is None else dict(self._frames)
         stands, seconds = self._postures(tick, measured=True), _each(tick.seconds)
-        self._holds = self._holds.advance(self.time, stands, seen, holds, seconds, self._inputs)
+        self._holds = self._holds.advance(tick.time, stands, seen, holds, seconds, self._inputs)
 
     def _estimate(self, tick: _Tick) -> Estimate:
         """What the skill says."""
         at = self._postures(tick, self._feedback == "measured")
         last = self.command.estimate if self.command is not None and self._trusts else None
-        found = estimate(self._skill, self.time, at, self.holding, self._limits, last)
+        found = estimate(self._skill, tick.time, at, self.holding, self._limits, last)
         self._skill = self._skill.advance(found)
         return found
 
@@ -456,7 +459,7 @@ class Controller:
         if fitting is not None:
             return wanted, fitting
         joints, self._search = nearest(
-            search, follower, wanted, tick.seconds, self.time,
+            search, follower, wanted, tick.seconds, tick.time,
             self._postures(tick, self._feedback == "measured"), self.holding.frames,
             found, self._limits, self._state if self.holding.carries else None,
             not self._trusts,
@@ -496,7 +499,7 @@ class Controller:
         self.command = Command(
             following.reference,
             following.velocity,
-            self.time,
+            tick.time,
             self._found,
             self._tensor(codes),
             reasons,
@@ -511,9 +514,8 @@ class Controller:
 
     def _tensor(self, rows: Any) -> Tensor:
         """Rows of robots (B, ...) in the batch's shape."""
-        reference = self._following.reference if hasattr(self, "_following") else self._start
-        batch, like = reference.shape[:-1], reference
-        tensor = torch.from_numpy(np.ascontiguousarray(rows)).view((*batch, *rows.shape[1:]))
+        like, tensor = self._start, torch.from_numpy(np.ascontiguousarray(rows))
+        tensor = tensor.view((*like.shape[:-1], *rows.shape[1:]))
         return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
 
     def _checked(self, joints: Any) -> Tensor | None:
@@ -553,21 +555,20 @@ class Controller:
         summary = self._skill.summary
         if summary is None:
             return None
-        first, start = self._first_frames, self._start
-        known = {
-            n: f for n, f in first.items() if n in summary.frames and summary.frames[n].moves
-        }
-        frames = {**self.holding.frames, **known}
-        return functools.partial(_novelty, summary, start, frames)
+        first, now = self._first_frames, self.holding.frames
+        return functools.partial(_novelty, summary, self._start, first, now)
 
 
 #: Why a robot is held.
 NOT_INCREASED, NO_ANSWER = "time did not increase", "the model has no finite answer here"
 
 
-def _novelty(summary: Any, start: Tensor, frames: Mapping[str, Frame]) -> Tensor:
+def _novelty(
+    summary: Any, start: Tensor, first: Mapping[str, Frame], now: Mapping[str, Frame]
+) -> Tensor:
     """Novelty of each robot (...) of a batch of start postures."""
-    novelty = torch.as_tensor(summary.novelty(start, frames)).to(start)
+    known = {n: f for n, f in first.items() if n in summary.frames and summary.frames[n].moves}
+    novelty = torch.as_tensor(summary.novelty(start, {**now, **known})).to(start)
     return novelty.expand(start.shape[:-1])
 
 
@@ -608,6 +609,8 @@ def _motion_bounds(
 
 def _durations(dt: Any) -> tuple[Seconds, Flags | None]:
     """Duration of a tick, of each robot or of all, and robots whose time did not increase."""
+    if isinstance(dt, float) and 0 < dt < math.inf:
+        return dt, None
     try:
         given = dt.numpy(force=True) if isinstance(dt, Tensor) else dt
         seconds = np.asarray(given, np.float64)

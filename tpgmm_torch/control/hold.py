@@ -328,8 +328,7 @@ class Holds:
 
     def known(self, like: Tensor) -> dict[str, Any]:
         """For which robots (...) it is known where each object is, seen or not."""
-        one = like[..., 0]
-        known = {name: ~self.holding.free(name, one) for name in self.holding.held}
+        known = {name: ~self.holding.free(name, like[..., 0]) for name in self.holding.held}
         for name, where in self.hidden.items():
             known[name] = where | known.get(name, where)
         return {name: np.asarray(where.numpy(force=True)) for name, where in known.items()}

@@ -19,5 +19,5 @@ def changed[State](state: State, **values: Any) -> State:
         Of its fields.
     """
     new = object.__new__(type(state))
-    vars(new).update(vars(state), **values)
+    new.__dict__.update(state.__dict__, **values)
     return new

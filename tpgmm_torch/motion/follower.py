@@ -210,17 +210,20 @@ class Moment(NamedTuple):
 
     def taken(self, position: Array, dt: Seconds) -> Self:
         """The next moment if that is the next reference."""
-        slope, bend = self._differences(position, dt)
-        motion = np.stack((position, slope + bend * (dt / 2), bend))  # (F1)
+        before = self._last_dt(dt)
+        slope, bend = self._differences(position, dt, before)
+        motion = np.array((position, slope + bend * (dt / 2), bend))  # (F1)
         drift = slope
         if self.behind.any():
             drift = (position - self.wanted) / dt
-        none, before = np.zeros_like(self.behind), self._last_dt(dt)
+        none = np.zeros_like(self.behind)
         return type(self)(motion, slope, bend, position, drift, none, dt, before)
 
-    def _differences(self, position: Array, dt: Seconds) -> tuple[Array, Array]:
+    def _differences(
+        self, position: Array, dt: Seconds, before: Seconds
+    ) -> tuple[Array, Array]:
         slope = (position - self.motion[0]) / dt
-        return slope, (slope - self.slope) * (2 / (dt + self._last_dt(dt)))
+        return slope, (slope - self.slope) * (2 / (dt + before))
 
     def _last_dt(self, dt: Seconds) -> Array:
         """Duration of the tick before; of this one if it was the first [s]."""
@@ -278,7 +281,7 @@ class Moment(NamedTuple):
             )
         motion, drifts = exact.motion.copy(), exact.drift.copy()
         motion[:, asked], drifts[asked] = part, drift
-        differences = self._differences(motion[0], exact.dt)
+        differences = self._differences(motion[0], exact.dt, exact.dt_before)
         return exact._replace(
             motion=motion, slope=differences[0], bend=differences[1], drift=drifts, behind=asked
         )

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
+from operator import is_
 
 import torch
 from torch import Tensor
@@ -108,8 +109,7 @@ class Stack(Operator):
     def at(self, time: Tensor) -> Operator:
         """The stack of the members at a time."""
         members = [operator.at(time) for operator in self.operators]
-        same = all(now is one for now, one in zip(members, self.operators, strict=True))
-        return self if same else Stack(*members)
+        return self if all(map(is_, members, self.operators)) else Stack(*members)
 
     def tolerances(self, kinematics: Kinematics | None) -> tuple[float, ...]:
         """Those of the members, side by side."""

@@ -123,13 +123,13 @@ class TreeKinematics:
         local = torch.addcmul(local, cosine, moved.cos())
         if self._slides is not None:
             local = torch.addcmul(local, sliding, moved)
-        numbers = self._products(local.unflatten(-1, (4, 4))).flatten(1)
+        numbers = self._products(local.view(*local.shape[:-1], 4, 4)).flatten(1)
         numbers = numbers.index_select(1, self._wanted)
         position, origin, axis, quaternion = numbers.split(self._sizes, 1)
-        position = position.unflatten(1, (links, 3))
-        quaternion = quaternion.unflatten(1, (links, 4))
+        position = position.view(-1, links, 3)
+        quaternion = quaternion.view(-1, links, 4)
         quaternion = quaternion * quaternions.hemisphere_sign(quaternion.narrow(-1, 0, 1))
-        origin, axis = (part.unflatten(1, (1, 3, columns)) for part in (origin, axis))
+        origin, axis = (part.view(-1, 1, 3, columns) for part in (origin, axis))
         turning = axis * self._turns  # (B, L, 3, C)
         linear = torch.linalg.cross(turning, position.unsqueeze(-1) - origin, dim=2)
         if self._slides is not None:

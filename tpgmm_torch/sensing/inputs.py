@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -260,11 +261,11 @@ class Inputs:
         except (TypeError, ValueError, OverflowError):
             return None
         batch = tuple(self.start.shape[:-1])
-        try:
+        if array.shape == (*batch, size):
+            return array.copy()
+        with suppress(ValueError):
             if array.shape[-1:] == (size,):  # one value is not broadcast over the coordinates
-                return np.array(np.broadcast_to(array, (*batch, size)))  # its own copy
-        except ValueError:
-            pass
+                return np.array(np.broadcast_to(array, (*batch, size)))
         raise ShapeError(
             f"the skill began with robots of shape {batch}, {what} now has shape "
             f"{array.shape}, not {(*batch, size)}: begin it again for other robots"

@@ -130,8 +130,7 @@ class PoseFilter:
             change / each - self.velocity
         )
         speed = np.sqrt(np.square(velocity) @ METRIC)
-        with np.errstate(divide="ignore"):
-            cutoff = settings.cutoff * (1 + settings.noise**2 / variance)
+        cutoff = settings.cutoff * (1 + settings.noise**2 / np.maximum(variance, 1e-300))
         share = _share(cutoff + settings.slope * speed, dt)
         out = self.pose + share[..., None] * (pose - self.pose)
         turn = out[..., 3:]

@@ -168,7 +168,7 @@ class Reading:
         if self.accepted.all():  # an ordinary tick
             change = np.abs(seen - self.value)
             if (change <= self._small_change()).all() and not self._faults(seen).any():
-                none = np.zeros_like(self.jumped)
+                none = self.jumped & False
                 return changed(self, value=seen, same_for=same_for, jumped=none, pending=none)
         with np.errstate(invalid="ignore"):
             fault = self._faults(seen)
@@ -256,8 +256,7 @@ class JointReading(Reading):
 
     def _faults(self, seen: Floats) -> NDArray[np.int8]:
         margin = self.trust.limit_margin
-        with np.errstate(invalid="ignore"):
-            inside = (seen >= self.lower - margin) & (seen <= self.upper + margin)
+        inside = (seen >= self.lower - margin) & (seen <= self.upper + margin)
         dead = (seen == 0).all(-1) & (np.abs(self.value).max(-1) > margin / 10)
         dead &= seen.shape[-1] > 1
         fine = inside.all(-1) & ~dead
