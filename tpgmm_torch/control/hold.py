@@ -21,6 +21,7 @@ from tpgmm_torch.control.holding import (
     PERHAPS,
     SETTLING,
     TURNED,
+    YES,
     Holding,
     between,
     choose,
@@ -131,7 +132,7 @@ class HoldWatch:
         for name in known:  # the skill knows where it is
             rests.pop(name, None)
         for name in names - known:
-            seen, yet, gone = frames[name], free_yet.get(name, ~NO), lost.get(name, NO)
+            seen, yet, gone = frames[name], free_yet.get(name, YES), lost.get(name, NO)
             rest = rests.get(name) or Rest.at(seen, joints)
             if rest.seen is not seen:
                 rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet & ~gone)

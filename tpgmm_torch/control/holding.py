@@ -28,7 +28,7 @@ PERHAPS = 0.7
 #: Time in which the grasp settles to where an object is seen in the hand [s].
 SETTLING = 1.0
 
-NOBODY, NO = torch.tensor(-1), torch.tensor(False)
+NOBODY, NO, YES = torch.tensor(-1), torch.tensor(False), torch.tensor(True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -506,9 +506,9 @@ def between(one: Frame, other: Frame, share: Tensor) -> Frame:
         Of the way, from 0 to 1.
     """
     share = share.unsqueeze(-1)
-    position = one.position + share * (other.position - one.position)
     inner = (other.orientation * one.orientation).sum(-1, keepdim=True)
     turn = quaternions.hemisphere_sign(inner) * other.orientation
     return Frame._from(
-        position, quaternions.normalize(one.orientation + share * (turn - one.orientation))
+        one.position + share * (other.position - one.position),
+        quaternions.normalize(one.orientation + share * (turn - one.orientation)),
     )
