@@ -385,10 +385,10 @@ class Controller:
         if tick.first:
             return
         before = self._progress
-        none = np.zeros(len(before.time), bool)
+        none: Flags = np.zeros(len(before.time), bool)
         passed = none + np.ravel(tick.seconds)
-        held = (robots for robots in (tick.halted, tick.late) if robots is not None)
-        still = functools.reduce(np.logical_or, held, none)
+        held = [robots for robots in (tick.halted, tick.late) if robots is not None]
+        still: Flags = np.logical_or.reduce([none, *held])
         if not self._trusts and tick.joints is None:
             self._progress = before.even(np.where(still, 0.0, passed))
         else:
@@ -514,8 +514,8 @@ class Controller:
 
     def _tensor(self, rows: Any) -> Tensor:
         """Rows of robots (B, ...) in the batch's shape."""
-        like, tensor = self._start, torch.from_numpy(np.ascontiguousarray(rows))
-        tensor = tensor.view((*like.shape[:-1], *rows.shape[1:]))
+        like, array = self._start, np.ascontiguousarray(rows)
+        tensor = torch.from_numpy(array.reshape((*like.shape[:-1], *rows.shape[1:])))
         return tensor.to(like) if tensor.is_floating_point() else tensor.to(like.device)
 
     def _checked(self, joints: Any) -> Tensor | None:

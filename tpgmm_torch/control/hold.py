@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Self
 
@@ -27,7 +27,6 @@ from tpgmm_torch.control.holding import (
     choose,
 )
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.sensing.inputs import Inputs
 from tpgmm_torch.skills.skill import Skill
@@ -138,10 +137,10 @@ class HoldWatch:
                 rest, holding = self._seen(name, rest, seen, joints, holding, dt, yet & ~gone)
             elif rest.pose is seen:  # it has not moved
                 stood = torch.where(gone.unsqueeze(-1), rest.joints, joints)
-                rest = changed(rest, joints=stood)
+                rest = replace(rest, joints=stood)
             rests[name] = rest
             places[name] = seen if name in free_yet else rest.pose
-        return changed(self, rests=rests), holding, places
+        return replace(self, rests=rests), holding, places
 
     def _ungiven(self, holding: Holding, free_yet: Mapping[str, Tensor]) -> Holding:
         """The skill's holds count again for robots for which they have begun."""
@@ -162,7 +161,7 @@ class HoldWatch:
         yet: Tensor,
     ) -> tuple[Rest, Holding]:
         """After a new reading of an object."""
-        rest = changed(rest, seen=seen, since=rest.since + dt)
+        rest = replace(rest, seen=seen, since=rest.since + dt)
         rest, holding = self._taken(name, rest, joints, holding, dt, yet)
         if rest.found and bool((due := rest.since >= LOST_PERIOD).any()):
             rest, holding = self._lost(name, rest, joints, holding, due, yet)
@@ -184,7 +183,7 @@ class HoldWatch:
         rests = free & (moved < 0.1)
         if bool(rests.all()):
             pose = between(rest.pose, rest.seen, settled)
-            return changed(rest, pose=pose, joints=joints), holding
+            return replace(rest, pose=pose, joints=joints), holding
         settles, elsewhere, found = rests, torch.zeros_like(rests), rest.found
         if bool((asked := free & ~rests).any()):
             before, now = self.kinematics.state(rest.joints), self.kinematics.state(joints)
@@ -206,7 +205,7 @@ class HoldWatch:
         share = torch.where(settles, settled, elsewhere.to(moved))
         stood = torch.where((rests | elsewhere).unsqueeze(-1), joints, rest.joints)
         pose = between(rest.pose, rest.seen, share)
-        return changed(rest, pose=pose, joints=stood, found=found), holding
+        return replace(rest, pose=pose, joints=stood, found=found), holding
 
     def _lost(
         self,
@@ -228,7 +227,7 @@ class HoldWatch:
         pose = choose(lost, rest.seen, rest.pose)
         stood = torch.where(lost.unsqueeze(-1), joints, rest.joints)
         since = rest.since.masked_fill(due, 0.0)
-        return changed(rest, pose=pose, joints=stood, away=away, since=since), holding
+        return replace(rest, pose=pose, joints=stood, away=away, since=since), holding
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,11 +304,11 @@ class Holds:
             frames = _seen_frames(frames, holding, lost)
         shares = inputs.shares if inputs is not None and holding.held else {}
         holding = holding.advance(time, joints, frames, holds, dt=dt, shares=shares)
-        new = changed(self, holding=holding, watch=watch, given=given)
+        new = replace(self, holding=holding, watch=watch, given=given)
         if not (lost or self.hidden):
             return new
         assert inputs is not None
-        return changed(new, hidden=new._hidden(joints, lost, inputs, dt))
+        return replace(new, hidden=new._hidden(joints, lost, inputs, dt))
 
     def _hidden(
         self, joints: Tensor, lost: Mapping[str, Tensor], inputs: Inputs, dt: float | Tensor

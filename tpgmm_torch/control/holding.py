@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
 from typing import Self
@@ -15,7 +15,6 @@ from torch import Tensor
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold, check_holds
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import UnknownNameError
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
@@ -93,10 +92,10 @@ class Held:
         if seen is None:
             return self
         if self.apart is None or share is None:
-            return self if self.joints is None else changed(self, joints=None)
+            return self if self.joints is None else replace(self, joints=None)
         last = joints if self.joints is None else self.joints
         last = torch.where(last.isnan(), joints, last)
-        return changed(self, joints=last + share.unsqueeze(-1) * (joints - last))
+        return replace(self, joints=last + share.unsqueeze(-1) * (joints - last))
 
 
 FREE = Held()
@@ -224,7 +223,7 @@ class Holding:
             after = self._seen(before, after, pose, state_now, dt)
             if after is not FREE:
                 held[name] = after
-        return changed(self, frames=places, held=self.held if held == self.held else held)
+        return replace(self, frames=places, held=self.held if held == self.held else held)
 
     def free(self, name: str, like: Tensor) -> Tensor:
         """For which robots an object is free: bool, of the shape of ``like``."""
@@ -252,7 +251,7 @@ class Holding:
         """
         before = self.held.get(name, FREE)
         old, apart = grasp if before.grasp is None else before.grasp, before.apart
-        now = changed(
+        now = replace(
             before,
             carrier=torch.where(where, index, before.carrier),
             grasp=choose(where, grasp, old),
@@ -262,7 +261,7 @@ class Holding:
             joints=_restarted(before.joints, where),
         )
         frames = {**self.frames, name: choose(where, place, self.frames[name])}
-        return changed(self, frames=frames, held={**self.held, name: now})
+        return replace(self, frames=frames, held={**self.held, name: now})
 
     def ungiven(self, name: str, where: Tensor) -> Self:
         """The skill's holds of an object count again, whatever was given before.
@@ -276,8 +275,8 @@ class Holding:
         before = self.held[name]
         if not bool((before.given & where).any()):
             return self
-        now = changed(before, given=before.given & ~where)
-        return changed(self, held={**self.held, name: now})
+        now = replace(before, given=before.given & ~where)
+        return replace(self, held={**self.held, name: now})
 
     def carried(self, name: str, state: RobotState) -> Frame:
         """Pose of an object that is or was held, if its link has it still."""
@@ -335,21 +334,21 @@ class Holding:
         if bool((carrier == before.carrier).all()):
             pose = _unless(before.taken, place if seen is None else seen, place)
             same = given is before.given
-            after = before if same else changed(before, given=given)
+            after = before if same else replace(before, given=given)
             return after, choose(carrier >= 0, place, pose)
         state = state_now()
         known = place if before.grasp is None else self._with(state, name, before).pose(name)
         now = known if seen is None else _unless(before.taken, seen, known)
         holds, held = carrier >= 0, before.is_held
         grasp, apart = before.grasp, before.apart
-        for index in changed(before, carrier=carrier).carriers:
+        for index in replace(before, carrier=carrier).carriers:
             other = now.seen_from(state.pose(self.kinematics.links[index]))
             grasp = other if grasp is None else grasp
             apart = _constant(other, math.inf) if apart is None else apart
             news = (carrier == index) & (before.carrier != index)
             grasp = choose(news, other, grasp)
             apart = choose(news, _constant(apart, math.nan), apart)
-        after = changed(
+        after = replace(
             before,
             carrier=carrier,
             grasp=grasp,
@@ -374,7 +373,7 @@ class Holding:
         unseen = _same(seen, before.taken)
         live = held.is_held & (held.carrier == before.carrier) & ~unseen
         if bool((held.rests & unseen).any()):  # it may be lifted by now
-            held = changed(held, rests=held.rests & ~unseen)
+            held = replace(held, rests=held.rests & ~unseen)
         return self._observed(held, seen, live, state_now(), dt) if bool(live.any()) else held
 
     def _observed(
@@ -398,7 +397,7 @@ class Holding:
             grasp = choose(here, between(grasp, seen.seen_from(link), share), grasp)
             mean = between(before, link, (dt / 0.1).clamp(max=1.0))
             link_pose = choose(here, mean, before)
-        held = changed(held, grasp=grasp, link=link_pose)
+        held = replace(held, grasp=grasp, link=link_pose)
         if bool((moving | ~held.is_held).all()):
             return held
         return self._shifted(held, seen, live & ~moving, state, then)
@@ -432,12 +431,12 @@ class Holding:
             shown = choose(lies, together, shown)
             apart = choose(lies, link, apart)
             apart = choose(goes, _constant(apart, math.inf), apart)
-        held = changed(held, grasp=grasp, apart=apart, link=first_link)
+        held = replace(held, grasp=grasp, apart=apart, link=first_link)
         moving = held.moves_along
         if bool((moving | ~held.is_held).all()):
-            return changed(held, first=None, last=None, rests=NO, shown=None)
+            return replace(held, first=None, last=None, rests=NO, shown=None)
         last = seen if held.last is None else choose(live, seen, held.last)
-        return changed(held, first=first, last=last, rests=rests & ~moving, shown=shown)
+        return replace(held, first=first, last=last, rests=rests & ~moving, shown=shown)
 
     def _with(self, state: RobotState, name: str, held: Held) -> RobotState:
         """A state with an object as a link: free for some robots, held by others."""

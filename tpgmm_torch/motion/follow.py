@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.motion.follower import Follower, Seconds
 from tpgmm_torch.motion.motion_bounds import MotionBounds
 
@@ -75,7 +74,7 @@ class Following:
         fitting : Follower, optional
             At ``wanted``, where all robots can be there.
         """
-        new = changed(self, wanted=wanted, lost=None)
+        new = replace(self, wanted=wanted, lost=None)
         if self.bounds is None:
             return new._unbounded(goal, dt, halted, late, first)
         if first:  # the first reference is where robots stand
@@ -86,10 +85,10 @@ class Following:
         follower = fitting
         if follower is None or follower.reference is not goal:
             follower = last.advance(goal, dt)
-            new = changed(new, lost=~goal.isfinite().all(-1))
+            new = replace(new, lost=~goal.isfinite().all(-1))
         if late is not None:
             follower = follower.undone(late, last)
-        return changed(
+        return replace(
             new, follower=follower, reference=follower.reference, velocity=follower.velocity
         )
 
@@ -101,7 +100,7 @@ class Following:
             if still is not None:
                 goal = torch.where(still.unsqueeze(-1), self.reference, goal)
         velocity = self.velocity if first else (goal - self.reference) / _column(dt, goal)
-        return changed(self, reference=goal, velocity=velocity)
+        return replace(self, reference=goal, velocity=velocity)
 
     def _moving(self, bounds: MotionBounds, goal: Tensor, dt: Seconds) -> Follower:
         """A follower that moves as the skill begins; a gap to there is no speed."""

@@ -17,7 +17,7 @@ with the velocity it has had for a while, and its first ``dt`` is taken.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.data.arrays import Array, as_array, as_tensor
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import DataError, ShapeError
 from tpgmm_torch.motion.motion_bounds import ROUNDING, MotionBounds
 from tpgmm_torch.motion.trajectory_generator import first_part, stopping_range
@@ -102,7 +101,7 @@ class Follower:
         where = robots.unsqueeze(-1)
         reference = torch.where(where, before.reference, self.reference)
         moment = before.moment.choose(where.numpy(force=True), self.moment)
-        return changed(self, reference=reference, moment=moment)
+        return replace(self, reference=reference, moment=moment)
 
     @property
     def velocity(self) -> Tensor:
@@ -126,7 +125,7 @@ class Follower:
         """
         exact = self.moment.taken(as_array(wanted), _column(dt))
         return (
-            changed(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
+            replace(self, reference=wanted, moment=exact) if self._fits(exact).all() else None
         )
 
     def fits(self, wanted: Tensor, dt: Seconds) -> Tensor:
@@ -166,7 +165,7 @@ class Follower:
         following = exact if fits.all() else moment.generated(exact, ~fits, bounds)
         as_wanted = torch.from_numpy(fits & (raw == target)).to(wanted.device)
         reached = torch.from_numpy(following.motion[0]).to(wanted)
-        return changed(
+        return replace(
             self, reference=torch.where(as_wanted, wanted, reached), moment=following
         )
 
@@ -219,11 +218,9 @@ class Moment(NamedTuple):
         none = np.zeros_like(self.behind)
         return type(self)(motion, slope, bend, position, drift, none, dt, before)
 
-    def _differences(
-        self, position: Array, dt: Seconds, before: Seconds
-    ) -> tuple[Array, Array]:
+    def _differences(self, position: Array, dt: Seconds, last: Seconds) -> tuple[Array, Array]:
         slope = (position - self.motion[0]) / dt
-        return slope, (slope - self.slope) * (2 / (dt + before))
+        return slope, (slope - self.slope) * (2 / (dt + last))
 
     def _last_dt(self, dt: Seconds) -> Array:
         """Duration of the tick before; of this one if it was the first [s]."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import ShapeError
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.sensing.pose_filter import OneEuro, PoseFilter
@@ -120,7 +119,7 @@ class Inputs:
             pose = seen.get(name)
             if name in poses or pose is not known[name]:  # a pose of the start is no stream
                 poses[name], filters[name], known[name] = self._pose(name, pose, dt)
-        return changed(
+        return replace(
             self,
             joints=None if quiet else self._joints(joints, dt),
             poses=poses,

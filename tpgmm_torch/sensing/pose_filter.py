@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from tpgmm_torch.data.frames import LEVER
-from tpgmm_torch.data.states import changed
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["OneEuro", "PoseFilter"]
@@ -115,7 +114,7 @@ class PoseFilter:
         """
         settings = self.settings
         if math.isinf(settings.cutoff):
-            return changed(self, pose=pose, last=pose)
+            return replace(self, pose=pose, last=pose)
         if (pose == self.last).all() and not (self.change.any() or self.history.any()):
             return self
         side = np.einsum("...i,...i", pose[..., 3:], self.pose[..., 3:])[..., None]
@@ -137,7 +136,7 @@ class PoseFilter:
         out[..., 3:] = turn / np.sqrt(np.einsum("...i,...i", turn, turn))[..., None]
         # a pose without noise passes bit for bit
         out = np.where(share[..., None] == 1, pose, out)
-        return changed(
+        return replace(
             self, pose=out, velocity=velocity, change=change, last=pose, history=history,
             share=share,
         )  # fmt: skip

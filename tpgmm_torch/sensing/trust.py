@@ -132,19 +132,9 @@ class Reading:
         rival = np.full_like(value, np.nan)
         none = zero.astype(np.int8)
         return cls(
-            trust,
-            value,
-            zero,
-            none,
-            rival,
-            zero,
-            zero > 0,
-            zero,
-            zero,
-            zero > 0,
-            zero > 0,
+            trust, value, zero, none, rival, zero, zero > 0, zero, zero, zero > 0, zero > 0,
             **limits,
-        )
+        )  # fmt: skip
 
     @property
     def accepted(self) -> Mask:
