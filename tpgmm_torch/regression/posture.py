@@ -53,11 +53,11 @@ PROMISE = 1e-9
 #: The regression is trusted where its step leaves less than this share of the way to the
 #: minimum, and not at all where it leaves twice as much.
 TRUST = 0.2
-#: Ticks for which a lower cost is looked for from another posture. It is gone to if it is
+#: Ticks for which a lower cost is looked for from another posture. It is gone to where it is
 #: lower by this factor, and by so much: within reach nothing else is looked for.
-LOOK, BETTER, SLACK = 25, 0.95, 50.0
+LOOK, BETTER, SLACK = 40, 0.95, 50.0
 #: After so many ticks a look that is still this many times as high is given up for the next.
-EARLY, HOPELESS = 5, 5.0
+EARLY, HOPELESS = 10, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,34 +192,33 @@ class PostureSearch:
             {name: frame.expand(batch)[where] for name, frame in frames.items()},
             state,
         )
-        # within reach, the second is a step from where the robot stands
-        look = age // LOOK
-        starts = torch.where((look == 0).unsqueeze(-1), begun, _starts(look, lower, upper))
-        begins = (look == 0) | (age % LOOK == 0)
-        begins = torch.stack((torch.zeros_like(begins), begins))
-        postures = torch.where(begins.unsqueeze(-1), starts, postures)
-        damping = torch.where(begins, 0.0, damping)
-        postures, damping, height = descend(cost, postures, damping, lower, upper)
-        better = (age % LOOK == LOOK - 1) & (height[1] < BETTER * height[0] - SLACK)
-        better = torch.stack((better, torch.zeros_like(better)))
-        postures = torch.where(better.unsqueeze(-1), postures[:, 1:], postures)
-        damping = torch.where(better, damping[1:], damping)
+        # elsewhere or, within reach, a step from where the robot stands
+        look, begins = age // LOOK, (age < LOOK) | (age % LOOK == 0)
+        if bool(begins.any()):
+            start = torch.where((look > 0).unsqueeze(-1), _starts(look, lower, upper), begun)
+            postures[:, 1] = torch.where(begins.unsqueeze(-1), start, postures[:, 1])
+            damping[1] = torch.where(begins, 0.0, damping[1])
+        postures, damping, (least, height) = descend(cost, postures, damping, lower, upper)
+        hopeless = (age % LOOK == EARLY - 1) & ((look == 0) | (height > HOPELESS * least))
+        better = height < BETTER * least - SLACK
+        postures[:, 0] = torch.where(better.unsqueeze(-1), postures[:, 1], postures[:, 0])
+        damping[0] = torch.where(better, damping[1], damping[0])
+        reached = torch.where(better, height, least) < SLACK
+        age = torch.where(better | hopeless, (look + 1) * LOOK, age + 1)
         # how much nearer to the minimum one step of the linearised problem leads; out of
         # reach, where components of little weight may lead astray, the estimate
-        reached, goal = height[0] < SLACK, postures[0, 0]
+        goal = postures[0, 0]
         step = torch.where((reached & (look == 0)).unsqueeze(-1), postures[1, 1], estimated)
         away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
         trusted = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
-        hopeless = (age % LOOK == EARLY - 1) & (height[1] > HOPELESS * height[0])
-        age = torch.where(hopeless, (look + 1) * LOOK, age + 1)
-        age = torch.where(reached, 0, age)
         trust, wanted = like.new_ones(batch), like.clone()
         trust[where], wanted[where] = trusted, goal
-        if self.active is not None:
-            trust = torch.where(self.active, trust, 1.0)
-        else:
+        if self.active is None:  # nothing is found yet
             trust = torch.ones_like(trust)
-        all_postures[of_all], all_damping[of_both], all_age[where] = postures, damping, age
+        else:
+            trust = torch.where(self.active, trust, 1.0)
+        all_postures[of_all], all_damping[of_both] = postures, damping
+        all_age[where] = torch.where(reached, 0, age)
         return trust, wanted, all_postures, all_damping, all_age
 
     def _state(self, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:

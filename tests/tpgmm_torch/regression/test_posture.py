@@ -92,7 +92,7 @@ def test_what_is_reached_is_left_to_the_regression():
 )
 def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
     frame = Frame(torch.tensor(place, dtype=torch.float64))
-    found, search = searched(frame, neutral(), 350)
+    found, search = searched(frame, neutral(), 500)
     lower, upper = limits()
     assert all(bool(((q >= lower) & (q <= upper)).all()) for q in found)
     assert float((found[-1] - found[-6]).abs().max()) < 1e-4
