@@ -49,7 +49,7 @@ NEGLIGIBLE = 1e-5
 #: whoever gives up all damping at once creeps along the valleys between them.
 LEAST, FIRST, MOST = 1e-6, 1e-3, 1e8
 #: A step that promises less than this share of the cost is not tried.
-PROMISE = 1e-9
+PROMISE = 1e-6
 #: The regression is trusted where its step leaves less than this share of the way to the
 #: minimum, and not at all where it leaves twice as much.
 TRUST = 0.2
@@ -207,10 +207,12 @@ class PostureSearch:
         age = torch.where(better | hopeless, (look + 1) * LOOK, age + 1)
         # how much nearer to the minimum one step of the linearised problem leads; out of
         # reach, where components of little weight may lead astray, the estimate
-        goal = postures[0, 0]
+        goal = torch.where(reached.unsqueeze(-1), postures[1, 0], postures[0, 0])
         step = torch.where((reached & (look == 0)).unsqueeze(-1), postures[1, 1], estimated)
         away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
         trusted = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
+        mixed = torch.clamp(goal + estimated - step, lower, upper)
+        goal = torch.where(reached.unsqueeze(-1), mixed, goal)
         trust, wanted = like.new_ones(batch), like.clone()
         trust[where], wanted[where] = trusted, goal
         if self.active is None:  # nothing is found yet
@@ -282,11 +284,12 @@ def descend(
     promise = (vectors[0] * step).sum(-1) - 0.5 * bend
     tried = promise > PROMISE * (heights[0] + PROMISE)
     gain = torch.where(tried, (heights[0] - heights[1]) / promise, 0.5)
+    gain = torch.where(heights[1] < SLACK, 1.0, gain)
     easier = torch.where(damping > LEAST, damping / 5, 0.0)
     harder = torch.clamp(10 * damping, FIRST, MOST)
     damping = torch.where(gain > 0.75, easier, damping)
     damping = torch.where(gain < 0.25, harder, damping)
-    taken = tried & (heights[1] < heights[0])
+    taken = (tried & (heights[1] < heights[0])) | (heights[1] < SLACK)
     joints = torch.where(taken.unsqueeze(-1), there, joints)
     vector = torch.where(taken.unsqueeze(-1), vectors[1], vectors[0])
     precision = torch.where(taken[..., None, None], precisions[1], precisions[0])
