@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Self
 
 import torch
@@ -325,17 +326,18 @@ class PostureCost:
         state_at: Callable[[Tensor], RobotState],
     ) -> None:
         weights = torch.where(weights > NEGLIGIBLE, weights, 0.0)
-        index = weights.flatten(0, -2).any(0)
-        weights = (weights / weights.sum(-1, keepdim=True))[..., index]
-        self._weights = weights.movedim(-1, 0)[:, None, None, ..., None, None]
+        index = weights.reshape(-1, weights.shape[-1]).any(0).nonzero()[:, 0]
+        # components stand in front of joints (P, A, ...)
+        weights = weights.movedim(-1, 0)[index]
+        self._weights = (weights / weights.sum(0))[:, None, None, ..., None, None]
         self._centre, self._frames, self._state_at = centre, frames, state_at
         self._prior, self._local = search.prior, []
+        time, single = time.expand(centre.shape[:-1]), [1] * (centre.ndim + 1)
         for operator, one in zip(search.operators, search.conditionals, strict=True):
             term = Residual.of(operator.at(time), search.kinematics)
-            # components stand in front of joints (P, A, ...)
-            mean = one.at(time.expand(centre.shape[:-1]))[..., index, :].movedim(-2, 0)
-            covariance = one.covariance[index].unflatten(0, (-1, *[1] * (centre.ndim + 1)))
-            self._local.append((term, mean[:, None, None], covariance))
+            mean = one.at(time).movedim(-2, 0)[index][:, None, None]
+            covariance = one.covariance[index].unflatten(0, (-1, *single))
+            self._local.append((term, mean, covariance))
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost (P, A, ...), downhill gradient (P, A, ..., n), and precision (P, A, ..., n, n).
@@ -376,26 +378,38 @@ class Residual:
     starts : tuple of int
         Where the operator's quaternions begin.
     leaves : tuple
-        Position and orientation operators: each with the slices of its displacement and, of an
-        orientation, of its quaternion.
+        Position and orientation operators that have three rows each; none if there are others.
+    turning : tuple of three Tensor, of shape (D, L), (L,) and (L, 1), optional
+        ``w`` of each leaf's turn as a sum of coordinates times present ones and a constant, and
+        what of ``r`` is half a ``v``; None where derivatives are exact.
     """
 
     operator: Operator
     starts: tuple[int, ...]
-    leaves: tuple[tuple[Any, slice, slice | None], ...]
+    leaves: tuple[Any, ...]
+    turning: tuple[Tensor, Tensor, Tensor] | None
 
     @classmethod
+    @lru_cache(maxsize=64)
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
-        parts: list[Any] = list(leaves([operator]))
-        found: list[tuple[Any, slice, slice | None]] = []
-        row, column = 0, 0
-        for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
-            block = slice(column, column + 4) if leaf.gain is not None else None
-            if not leaf.rotation_vector_starts(kinematics):
-                found.append((leaf, slice(row, row + 3), block))
-            row, column = row + 3, column + leaf.dimension(kinematics)
-        return cls(operator, operator.quaternion_starts(kinematics), tuple(found))
+        parts: Sequence[Any] = leaves([operator])
+        parts = parts if all(type(leaf) in TASKS for leaf in parts) else ()
+        column = 0
+        with torch.inference_mode(False):  # as it serves where gradients are wanted, too
+            like = kinematics.lower.new_ones(len(parts))
+            whole, half = like.clone(), torch.zeros_like(like).unsqueeze(-1)
+            share = like.new_zeros(operator.dimension(kinematics), len(parts))
+            for row, leaf in enumerate(parts):
+                if leaf.quaternion_starts(kinematics):
+                    share[column : column + 4, row] = leaf.gain / 2
+                    whole[row], half[row] = 0.0, 0.5
+                column += leaf.dimension(kinematics)
+        starts = operator.quaternion_starts(kinematics)
+        turning = (share, whole, half) if starts and parts else None
+        exact = [bool(leaf.rotation_vector_starts(kinematics)) for leaf in parts]
+        kept = tuple(None if one else leaf for one, leaf in zip(exact, parts, strict=True))
+        return cls(operator, starts, kept, turning)
 
     def __call__(
         self, mean: Tensor, state: RobotState, frames: Mapping[str, Frame]
@@ -413,15 +427,19 @@ class Residual:
         residual, jacobian = moved + at.displacement, at.jacobian
         if jacobian is None or not self.leaves:
             return matrix, residual, jacobian, at.noise
-        jacobian = jacobian.expand(*residual.shape, -1).clone()
-        for leaf, rows, block in self.leaves:
-            still, own = residual[..., rows], jacobian[..., rows, :]
-            if block is not None:
-                assert present is not None  # there are quaternions
-                cosine = (mean[..., block] * present[..., block]).sum(-1)[..., None, None]
-                jacobian[..., rows, :] = leaf.gain / 2 * cosine * own + _cross(still / 2, own)
-            if (reference := leaf.moving_reference(state)) is not None:
-                jacobian[..., rows, :] += _cross(still, state.angular_jacobian(reference))
+        jacobian, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
+        if self.turning is not None:
+            assert present is not None  # there are quaternions
+            share, whole, half = self.turning
+            cosine = whole + (mean * present) @ share
+            jacobian = cosine[..., None, None] * jacobian + _cross(half * still, jacobian)
+        for row, leaf in enumerate(self.leaves):
+            if leaf is None or (reference := leaf.moving_reference(state)) is None:
+                continue
+            jacobian = jacobian.expand(*still.shape, -1).clone()
+            swing = _cross(still[..., row, :], state.angular_jacobian(reference))
+            jacobian[..., row, :, :] += swing
+        jacobian = jacobian.flatten(-3, -2)
         return matrix, residual, jacobian, at.noise
 
 
