@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Self
 
 import torch
@@ -71,7 +70,8 @@ class PostureSearch:
     Parameters
     ----------
     kinematics : Kinematics
-    operators : sequence of Operator
+    terms : sequence of Residual
+        Of each operator.
     conditionals : sequence of Conditionals
         The components' Gaussians given time, as they are fused, one for each operator.
     prior : Tensor of shape (n_joints,)
@@ -88,7 +88,7 @@ class PostureSearch:
     """
 
     kinematics: Kinematics
-    operators: Sequence[Operator]
+    terms: Sequence[Residual]
     conditionals: Sequence[Conditionals]
     prior: Tensor
     active: Tensor | None = None
@@ -136,10 +136,11 @@ class PostureSearch:
         rows = asked if self.active is None else asked | self.active
         if not bool(rows.any()):
             return estimate.joints, self.begun()
-        with torch.no_grad():
+        with torch.inference_mode():
             trust, goal, *state = self._searched(
                 time, reference, frames, estimate, bounds, rows, state_at
             )
+        goal, trust = goal.clone(), trust.clone()
         wanted = torch.lerp(goal, estimate.joints, trust.unsqueeze(-1))
         wanted = torch.where((trust < 1).unsqueeze(-1), wanted, estimate.joints)
         # what begins has found nothing yet
@@ -333,8 +334,9 @@ class PostureCost:
         self._centre, self._frames, self._state_at = centre, frames, state_at
         self._prior, self._local = search.prior, []
         time, single = time.expand(centre.shape[:-1]), [1] * (centre.ndim + 1)
-        for operator, one in zip(search.operators, search.conditionals, strict=True):
-            term = Residual.of(operator.at(time), search.kinematics)
+        for term, one in zip(search.terms, search.conditionals, strict=True):
+            if (operator := term.operator.at(time)) is not term.operator:
+                term = Residual.of(operator, search.kinematics)
             mean = one.at(time).movedim(-2, 0)[index][:, None, None]
             covariance = one.covariance[index].unflatten(0, (-1, *single))
             self._local.append((term, mean, covariance))
@@ -390,7 +392,6 @@ class Residual:
     turning: tuple[Tensor, Tensor, Tensor] | None
 
     @classmethod
-    @lru_cache(maxsize=64)
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
         parts: Sequence[Any] = leaves([operator])

@@ -260,8 +260,6 @@ def test_what_is_wanted_is_the_minimum_of_the_exact_cost():
         {"bottle": frame.expand((1,))}, regression.kinematics.state,
     )  # fmt: skip
     steps = 1e-6 * torch.eye(17, dtype=torch.float64).reshape(17, 1, 1, 17)
-    heights, downhill, _ = cost(
-        torch.cat((joints[None, None], joints + steps, joints - steps))
-    )
+    heights, downhill, _ = cost(torch.cat((joints[None, None], joints + steps, joints - steps)))
     slope = (heights[1:18] - heights[18:]).squeeze() / 2e-6
     assert float((slope + downhill[0].squeeze()).abs().max() / downhill[0].abs().max()) < 1e-6
