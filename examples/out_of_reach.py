@@ -19,7 +19,6 @@ nearest posture is more than 100 standard deviations away.
 
 import argparse
 import warnings
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -29,7 +28,7 @@ from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import BottleShaking
 from tpgmm_torch import Clock, Controller, Frame, TaskParameterizedGMM
 from tpgmm_torch.alignment import DynamicTimeWarping
-from tpgmm_torch.regression.posture import NEGLIGIBLE, PostureCost, descend
+from tpgmm_torch.regression.posture import PostureCost, descend
 
 #: When the hands are at the bottle, shortly before it is moved [s].
 GRASP = 4.4
@@ -96,34 +95,17 @@ def distances(
     regression, robot = model.skill, BottleShaking().robot
     time, frames = torch.tensor(GRASP, dtype=torch.float64), {"bottle": bottles}
     activation = regression.estimate(time, joints, frames).activation
-    index = (activation > NEGLIGIBLE).nonzero()[:, 0]
-    weights = (activation[index] / activation[index].sum()).unsqueeze(-1)
-
-    def cost(count: int) -> Callable[[Tensor], tuple[Tensor, Tensor, Tensor]]:
-        every = index.repeat(count).unsqueeze(-1).expand(-1, len(joints))
-        search, state = regression.posture_search(), regression.kinematics.state
-        of_each = PostureCost(search, every, time, joints, frames, state)
-
-        def mean(postures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            found = of_each(postures.repeat_interleave(len(index), 0))
-            height, vector, precision = (one.unflatten(0, (count, -1)) for one in found)
-            share = weights[..., None]
-            return (
-                (weights * height).sum(1),
-                (share * vector).sum(1),
-                (share[..., None] * precision).sum(1),
-            )
-
-        return mean
-
+    search, state = regression.posture_search(), regression.kinematics.state
+    weights = activation.expand(len(joints), -1)
+    cost = PostureCost(search, weights, time, joints, frames, state)
     generator = torch.Generator().manual_seed(1)
     share = torch.rand(starts, *joints.shape, generator=generator, dtype=torch.float64)
-    many = robot.lower + (robot.upper - robot.lower) * share
-    damping, looked = torch.zeros(many.shape[:-1], dtype=torch.float64), cost(starts)
+    many = (robot.lower + (robot.upper - robot.lower) * share).expand(2, -1, -1, -1)
+    damping = torch.zeros(many.shape[1:-1], dtype=torch.float64)
     for _ in range(steps):
-        many, damping, height, _ = descend(looked, many, damping, robot.lower, robot.upper)
+        many, damping, height = descend(cost, many, damping, robot.lower, robot.upper)
     # from where they are, too: nobody is nearer than the nearest
-    here = cost(1)(joints.unsqueeze(0))[0][0]
+    here = cost(joints[None, None])[0][0, 0]
     least = torch.minimum(height.amin(0), here)
     return (2 * here).sqrt(), (2 * least).sqrt()
 
@@ -135,7 +117,7 @@ if __name__ == "__main__":
     parser.add_argument("--most", type=float, default=0.5, help="metres outside the box")
     parser.add_argument("--rest", type=float, default=4.0, help="seconds at the grasp")
     parser.add_argument("--starts", type=int, default=60, help="of the minimisation")
-    parser.add_argument("--steps", type=int, default=25, help="of each, two trials each")
+    parser.add_argument("--steps", type=int, default=50, help="of each")
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")  # of bottles that nobody has shown

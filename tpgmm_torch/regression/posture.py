@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from typing import Any, Self
 
 import torch
@@ -43,8 +42,6 @@ from tpgmm_torch.robots.kinematics import Kinematics, RobotState
 
 __all__ = ["PostureCost", "PostureSearch", "Residual", "descend"]
 
-#: Steps that are tried in one tick: the time that they take is all that trouble may cost.
-TRIALS = 2
 #: Components of a smaller weight do not count.
 NEGLIGIBLE = 1e-5
 #: Damping, as a share of the precision: at least, at first after a step that failed, and at
@@ -52,15 +49,15 @@ NEGLIGIBLE = 1e-5
 #: whoever gives up all damping at once creeps along the valleys between them.
 LEAST, FIRST, MOST = 1e-6, 1e-3, 1e8
 #: A step that promises less than this share of the cost is not tried.
-PROMISE = 1e-9
+PROMISE = 1e-6
 #: The regression is trusted where its step leaves less than this share of the way to the
 #: minimum, and not at all where it leaves twice as much.
 TRUST = 0.2
-#: Ticks for which a lower cost is looked for from one of so many other postures. It is gone to
-#: if it is lower by this factor, and by so much.
-LOOK, STARTS, BETTER, SLACK = 25, 64, 0.95, 50.0
+#: Ticks for which a lower cost is looked for from another posture. It is gone to where it is
+#: lower by this factor, and by so much: within reach nothing else is looked for.
+LOOK, BETTER, SLACK = 40, 0.95, 50.0
 #: After so many ticks a look that is still this many times as high is given up for the next.
-EARLY, HOPELESS = 5, 5.0
+EARLY, HOPELESS = 10, 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,26 +70,29 @@ class PostureSearch:
     Parameters
     ----------
     kinematics : Kinematics
-    operators : sequence of Operator
+    terms : sequence of Residual
+        Of each operator.
     conditionals : sequence of Conditionals
         The components' Gaussians given time, as they are fused, one for each operator.
     prior : Tensor of shape (n_joints,)
         Precision of the prior around q_{t-1}: 0 where operators determine every joint.
     active : Tensor of bool, of shape (...), optional
         Robots whose regression is not trusted; None if there are none.
-    minima, damping : Tensor of shape (K + 2, ..., n_joints) and (K + 2, ...), optional
-        Where the components' searches are; behind them that for the lowest mean cost, and one
-        that looks elsewhere for a lower one.
+    postures : Tensor of shape (2, 2, ..., n_joints), optional
+        The nearest that was found, and where a nearer one is looked for; behind both, the steps
+        from there that are tried next.
+    damping : Tensor of shape (2, ...), optional
+        Of these steps.
     age : Tensor of int, of shape (...), optional
-        Ticks since each robot's search began, and those that looks were given up early.
+        Ticks since the first look began; 0 within reach, where none is needed.
     """
 
     kinematics: Kinematics
-    operators: Sequence[Operator]
+    terms: Sequence[Residual]
     conditionals: Sequence[Conditionals]
     prior: Tensor
     active: Tensor | None = None
-    minima: Tensor | None = None
+    postures: Tensor | None = None
     damping: Tensor | None = None
     age: Tensor | None = None
 
@@ -136,20 +136,22 @@ class PostureSearch:
         rows = asked if self.active is None else asked | self.active
         if not bool(rows.any()):
             return estimate.joints, self.begun()
-        with torch.no_grad():
-            wanted, trust, *state = self._searched(
+        with torch.inference_mode():
+            trust, goal, *state = self._searched(
                 time, reference, frames, estimate, bounds, rows, state_at
             )
-        joints = torch.lerp(wanted, estimate.joints, trust.unsqueeze(-1))
-        joints = torch.where((trust < 1).unsqueeze(-1), joints, estimate.joints)
+        goal, trust = goal.clone(), trust.clone()
+        wanted = torch.lerp(goal, estimate.joints, trust.unsqueeze(-1))
+        wanted = torch.where((trust < 1).unsqueeze(-1), wanted, estimate.joints)
+        # what begins has found nothing yet
         active = rows & (asked | (trust < 1))
-        minima, damping, age = state
-        searched = replace(self, active=active, minima=minima, damping=damping, age=age)
-        return joints, searched
+        postures, damping, age = state
+        searched = replace(self, active=active, postures=postures, damping=damping, age=age)
+        return wanted, searched
 
     def begun(self) -> Self:
         """The same before any robot is searched for."""
-        return replace(self, active=None, minima=None, damping=None, age=None)
+        return replace(self, active=None, postures=None, damping=None, age=None)
 
     def ended(self, robots: Tensor) -> Self:
         """The same without the searches of robots (...) that were displaced."""
@@ -168,276 +170,197 @@ class PostureSearch:
         rows: Tensor,
         state_at: Callable[[Tensor], RobotState] | None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Wanted joints, trust in the estimate's, minima, damping and age."""
+        """Trust in the estimate's joints, the nearest ones, and the state."""
         like, batch = estimate.joints, estimate.joints.shape[:-1]
         where: tuple[Any, ...] = rows.nonzero(as_tuple=True) if batch else (None,)
-        of_all = (slice(None), *where)
-        weights = estimate.activation.expand(*batch, -1)[where]
-        weights = torch.where(weights > NEGLIGIBLE, weights, 0.0).mT  # (K, R)
-        count, index = len(weights), weights.any(-1).nonzero()[:, 0]
-        weights = weights[index] / weights.sum(0)
+        of_both, of_all = (slice(None), *where), (slice(None), slice(None), *where)
+        all_postures, all_damping, all_age = self._state(reference)
+        postures, damping, age = all_postures[of_all], all_damping[of_both], all_age[where]
+        begun, estimated = reference[where], like[where]
         lower, upper = (bound.expand_as(like)[where] for bound in bounds)
-        minima, damping, age = self._state(reference, count)
 
         def state(joints: Tensor) -> RobotState:
             if state_at is None:
                 return self.kinematics.state(joints)
-            everyone = reference.expand(len(joints), *batch, -1).clone()
+            everyone = reference.expand(2, 2, *batch, -1).clone()
             everyone[of_all] = joints
             return state_at(everyone)[of_all]
 
-        # rows: a step of the heaviest component from where the robot stands, the components'
-        # searches, that of their mean cost, and the same from elsewhere
-        here, heaviest = age[where], weights.argmax(0, keepdim=True)
-        places = torch.cat((index, index.new_tensor([count, count + 1])))
-        found, damped = minima[places][of_all], damping[places][of_all]
-        begins = here % LOOK == 0
-        starts = _starts(here // LOOK, lower, upper)
-        found[-1] = torch.where(begins.unsqueeze(-1), starts, found[-1])
-        damped[-1] = torch.where(begins, 0.0, damped[-1])
-        every = index.unsqueeze(-1).expand(-1, len(here))
         cost = PostureCost(
             self,
-            torch.cat((every.gather(0, heaviest), every, every, every)),
+            estimate.activation.expand(*batch, -1)[where],
             time.expand(batch)[where] if time.ndim else time,
-            reference[where],
+            begun,
             {name: frame.expand(batch)[where] for name, frame in frames.items()},
             state,
         )
-        begun = torch.clamp(reference[where], lower, upper)
-        found, damped, height, stepped = descend(
-            partial(_with_means, cost, weights, 1 + len(weights)),
-            torch.cat((begun.unsqueeze(0), found)),
-            torch.cat((torch.zeros_like(damped[:1]), damped)),
-            lower,
-            upper,
-        )
-        found, damped, height = found[1:], damped[1:], height[1:]
-        asked = begun, stepped[0], estimate.joints[where]
-        trust = like.new_ones(batch)
-        sought, nearest, trust[where] = _nearest(
-            weights, found, height, here, asked, (lower, upper)
-        )
-        wanted = like.clone()
-        wanted[where] = sought
-        # a component that counts only later begins where the others are
-        counts = (weights > 0).unsqueeze(-1)
-        own = torch.where(counts, nearest[:-1], sought)
-        minima = wanted.expand(count + 2, *batch, -1).clone()
-        damping = torch.zeros_like(damping)
-        rows_of = (places[:, None], *where) if batch else (places, None)
-        minima[rows_of] = torch.cat((own, nearest[-1:], found[-1:]))
-        damping[rows_of] = damped
-        hopeless = (here % LOOK == EARLY - 1) & (height[-1] > HOPELESS * height[-2])
-        age = age + 1
-        age[where] = torch.where(hopeless, (here // LOOK + 1) * LOOK, age[where])
-        return wanted, trust, minima, damping, age
+        # elsewhere or, within reach, a step from where the robot stands
+        look, begins = age // LOOK, (age < LOOK) | (age % LOOK == 0)
+        if bool(begins.any()):
+            start = torch.where((look > 0).unsqueeze(-1), _starts(look, lower, upper), begun)
+            postures[:, 1] = torch.where(begins.unsqueeze(-1), start, postures[:, 1])
+            damping[1] = torch.where(begins, 0.0, damping[1])
+        postures, damping, (least, height) = descend(cost, postures, damping, lower, upper)
+        hopeless = (age % LOOK == EARLY - 1) & ((look == 0) | (height > HOPELESS * least))
+        better = height < BETTER * least - SLACK
+        postures[:, 0] = torch.where(better.unsqueeze(-1), postures[:, 1], postures[:, 0])
+        damping[0] = torch.where(better, damping[1], damping[0])
+        reached = torch.where(better, height, least) < SLACK
+        age = torch.where(better | hopeless, (look + 1) * LOOK, age + 1)
+        # how much nearer to the minimum one step of the linearised problem leads; out of
+        # reach, where components of little weight may lead astray, the estimate
+        goal = torch.where(reached.unsqueeze(-1), postures[1, 0], postures[0, 0])
+        step = torch.where((reached & (look == 0)).unsqueeze(-1), postures[1, 1], estimated)
+        away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
+        trusted = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
+        mixed = torch.clamp(goal + estimated - step, lower, upper)
+        goal = torch.where(reached.unsqueeze(-1), mixed, goal)
+        trust, wanted = like.new_ones(batch), like.clone()
+        trust[where], wanted[where] = trusted, goal
+        if self.active is None:  # nothing is found yet
+            trust = torch.ones_like(trust)
+        else:
+            trust = torch.where(self.active, trust, 1.0)
+        all_postures[of_all], all_damping[of_both] = postures, damping
+        all_age[where] = torch.where(reached, 0, age)
+        return trust, wanted, all_postures, all_damping, all_age
 
-    def _state(self, reference: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Minima, damping and age; a search begins where the robot stands."""
-        batch = reference.shape[:-1]
-        minima = reference.expand(count + 2, *batch, -1)
-        damping = reference.new_zeros(count + 2, *batch)
-        age = torch.zeros(batch, dtype=torch.long, device=reference.device)
-        if self.active is None or self.minima is None:
-            return minima, damping, age
+    def _state(self, reference: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Postures, damping and age; a search begins where the robot stands."""
+        postures = reference.expand(2, 2, *reference.shape)
+        damping = reference.new_zeros(postures.shape[1:-1])
+        age = torch.zeros_like(damping[0], dtype=torch.long)
+        if self.active is None or self.postures is None:
+            return postures.clone(), damping, age
         assert self.damping is not None and self.age is not None
         return (
-            torch.where(self.active.unsqueeze(-1), self.minima, minima),
+            torch.where(self.active.unsqueeze(-1), self.postures, postures),
             torch.where(self.active, self.damping, damping),
             torch.where(self.active, self.age, age),
         )
 
 
-def _nearest(
-    weights: Tensor,
-    found: Tensor,
-    height: Tensor,
-    age: Tensor,
-    asked: tuple[Tensor, Tensor, Tensor],
-    bounds: tuple[Tensor, Tensor],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Wanted postures (R, n), minima (S + 1, R, n), and trust in the estimates (R,).
-
-    Of the components' minima, that of their mean cost, and one that was looked for elsewhere;
-    ``asked`` are where robots stand, a step of the heaviest component, and the estimates.
-    """
-    heaviest = weights.argmax(0, keepdim=True)
-    low = height.gather(0, heaviest)[0]
-    reached, least = low < SLACK, BETTER * height[-2] - SLACK
-    better = (age % LOOK == LOOK - 1) & (height[-1] < least) & ~reached
-    nearest = torch.where(better.unsqueeze(-1), found[-1], found[:-1])
-    # out of reach the components' minima lie apart, and what is between them is none
-    mixed = torch.clamp((weights.unsqueeze(-1) * nearest[:-1]).sum(0), *bounds)
-    share = torch.clamp(low / SLACK - 1, 0, 1).unsqueeze(-1)
-    sought = torch.lerp(mixed, nearest[-1], share)
-    # how much nearer to its minimum one step of the linearised problem leads; out of
-    # reach, where components of little weight may lead astray, of the whole mixture
-    begun, stepped, estimates = asked
-    goal = nearest.gather(0, heaviest.unsqueeze(-1).expand(1, *begun.shape))[0]
-    goal = torch.where(reached.unsqueeze(-1), goal, sought)
-    step = torch.where(reached.unsqueeze(-1), stepped, estimates)
-    away, misses = ((x - goal).abs().amax(-1) for x in (begun, step))
-    trust = torch.where(away > 0, 2 - misses / (TRUST * away), 0.0).clamp(0, 1)
-    return sought, nearest, trust
-
-
-def _with_means(
-    cost: PostureCost, weights: Tensor, alone: int, joints: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Costs for joints (A, R, n): of one component each for ``alone`` rows, then means.
-
-    For each mean, ``cost`` has a row for each of the components with ``weights`` (S, R).
-    """
-    means = joints[alone:].repeat_interleave(len(weights), 0)
-
-    def mixed(values: Tensor) -> Tensor:
-        every = values[alone:].unflatten(0, (-1, len(weights)))
-        shares = weights.reshape(weights.shape + (1,) * (every.ndim - 3))
-        return torch.cat((values[:alone], (shares * every).sum(1)))
-
-    height, vector, precision = map(mixed, cost(torch.cat((joints[:alone], means))))
-    return height, vector, precision
-
-
 def _starts(number: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Postures (R, n) to look for a lower cost from: the middle of the limits, and others."""
+    """Postures (R, n) to look for a lower cost from.
+
+    Their shares of the way between the limits are Richtmyer's sequence, which fills the cube.
+    """
+    n = lower.shape[-1]
+    steps = 2 ** (torch.arange(1, n + 1, dtype=lower.dtype, device=lower.device) / (n + 1))
+    shares = (0.5 + (number.unsqueeze(-1) - 1) * steps).frac()
     # joints without limits turn
     low, high = lower.clamp(min=-torch.pi), upper.clamp(max=torch.pi)
-    shares = _shares(lower.shape[-1]).to(lower)[number % STARTS]
     return torch.lerp(low, torch.maximum(low, high), shares)
-
-
-@cache
-def _shares(n_joints: int) -> Tensor:
-    """Where between their limits the joints begin, (STARTS, n)."""
-    generator = torch.Generator().manual_seed(0)
-    with torch.inference_mode(False):
-        shares = torch.rand(STARTS, n_joints, generator=generator, dtype=torch.float64)
-        shares[0] = 0.5
-    return shares
 
 
 def descend(
     cost: Callable[[Tensor], tuple[Tensor, Tensor, Tensor]],
-    joints: Tensor,
+    postures: Tensor,
     damping: Tensor,
     lower: Tensor,
     upper: Tensor,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """A few steps of Levenberg's and Marquardt's method within bounds.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A step of Levenberg's and Marquardt's method within bounds, with one evaluation.
 
     Parameters
     ----------
     cost : callable
         Cost, downhill gradient and precision at joints.
-    joints : Tensor of shape (A, ..., n_joints)
-    damping : Tensor of shape (A, ...)
+    postures : Tensor of shape (2, ..., n_joints)
+        Where the search is, and what is tried; for a start, both may be the same.
+    damping : Tensor of shape (...)
+        Of what is tried.
     lower, upper : Tensor of shape (..., n_joints)
 
     Returns
     -------
-    joints, damping, cost : Tensor
-        After the steps.
-    first : Tensor of shape (A, ..., n_joints)
-        Joints after the first step.
+    postures, damping : Tensor
+        The better ones, and what to try next.
+    cost : Tensor of shape (...)
+        Of the better ones.
     """
-    joints = torch.clamp(joints, lower, upper)
-    here, vector, precision = cost(joints)
-    first = joints
-    for trial in range(TRIALS):
-        scale = precision.diagonal(dim1=-2, dim2=-1) * damping.unsqueeze(-1)
-        damped = precision + torch.diag_embed(scale)
-        there = step_within(joints, vector, damped, lower, upper)
-        first, step = there if trial == 0 else first, there - joints
-        bend = (step.unsqueeze(-2) @ precision @ step.unsqueeze(-1))[..., 0, 0]
-        promise = (vector * step).sum(-1) - 0.5 * bend
-        tried = promise > PROMISE * (here + PROMISE)
-        if not bool(tried.any()):
-            break
-        new, new_vector, new_precision = cost(there)
-        gain = torch.where(tried, (here - new) / promise, 0.0)
-        taken = tried & (new < here)
-        easier = torch.where(damping > LEAST, damping / 5, 0.0)
-        harder = torch.clamp(10 * damping, FIRST, MOST)
-        damping = torch.where(tried & (gain > 0.75), easier, damping)
-        damping = torch.where(tried & (gain < 0.25), harder, damping)
-        joints = torch.where(taken.unsqueeze(-1), there, joints)
-        here = torch.where(taken, new, here)
-        vector = torch.where(taken.unsqueeze(-1), new_vector, vector)
-        precision = torch.where(taken[..., None, None], new_precision, precision)
-    return joints, damping, here, first
+    joints, there = torch.clamp(postures, lower, upper)
+    heights, vectors, precisions = cost(torch.stack((joints, there)))
+    step = there - joints
+    bend = (step.unsqueeze(-2) @ precisions[0] @ step.unsqueeze(-1))[..., 0, 0]
+    promise = (vectors[0] * step).sum(-1) - 0.5 * bend
+    tried = promise > PROMISE * (heights[0] + PROMISE)
+    gain = torch.where(tried, (heights[0] - heights[1]) / promise, 0.5)
+    gain = torch.where(heights[1] < SLACK / 2, 1.0, gain)
+    easier = torch.where(damping > LEAST, damping / 5, 0.0)
+    harder = torch.clamp(10 * damping, FIRST, MOST)
+    damping = torch.where(gain > 0.75, easier, damping)
+    damping = torch.where(gain < 0.25, harder, damping)
+    taken = (tried & (heights[1] < heights[0])) | (heights[1] < SLACK / 2)
+    joints = torch.where(taken.unsqueeze(-1), there, joints)
+    vector = torch.where(taken.unsqueeze(-1), vectors[1], vectors[0])
+    precision = torch.where(taken[..., None, None], precisions[1], precisions[0])
+    scale = precision.diagonal(dim1=-2, dim2=-1) * damping.unsqueeze(-1)
+    there = step_within(joints, vector, precision + scale.diag_embed(), lower, upper)
+    return torch.stack((joints, there)), damping, torch.where(taken, heights[1], heights[0])
 
 
 class PostureCost:
-    """The costs F_i of components (A, ...) at one instant, for joints (A, ..., n).
+    """The costs F, mixed over components, at one instant.
 
     Parameters
     ----------
     search : PostureSearch
         Operators and their conditionals.
-    index : Tensor of int, of shape (A, ...)
-        The components.
+    weights : Tensor of shape (..., K)
+        Of the components, for the batch of the joints.
     time : Tensor of shape () or (...)
     centre : Tensor of shape (..., n_joints)
         Mean of the prior where no operator determines every joint.
     frames : mapping of str to Frame
     state_at : callable
-        ``state_at(joints)`` gives the states of joints (A, ..., n_joints).
+        ``state_at(joints)`` gives the states of joints (..., n_joints).
     """
 
     def __init__(
         self,
         search: PostureSearch,
-        index: Tensor,
+        weights: Tensor,
         time: Tensor,
         centre: Tensor,
         frames: Mapping[str, Frame],
         state_at: Callable[[Tensor], RobotState],
     ) -> None:
-        self.centre, self.frames = centre, frames
-        self.state_at, self.factors = state_at, list[Tensor]()
-        self.local = []
-        for operator, one in zip(search.operators, search.conditionals, strict=True):
-            chosen = one.select(index)
-            elapsed = (time - chosen.time_mean).unsqueeze(-1)
-            mean = torch.addcmul(chosen.mean, chosen.gain, elapsed)
-            term = Residual.of(operator.at(time), search.kinematics)
-            self.local.append((term, mean, chosen.covariance))
-        self.prior = search.prior
+        weights = torch.where(weights > NEGLIGIBLE, weights, 0.0)
+        index = weights.reshape(-1, weights.shape[-1]).any(0).nonzero()[:, 0]
+        # components stand in front of joints (P, A, ...)
+        weights = weights.movedim(-1, 0)[index]
+        self._weights = (weights / weights.sum(0))[:, None, None, ..., None, None]
+        self._centre, self._frames, self._state_at = centre, frames, state_at
+        self._prior, self._local = search.prior, []
+        time, single = time.expand(centre.shape[:-1]), [1] * (centre.ndim + 1)
+        for term, one in zip(search.terms, search.conditionals, strict=True):
+            if (operator := term.operator.at(time)) is not term.operator:
+                term = Residual.of(operator, search.kinematics)
+            mean = one.at(time).movedim(-2, 0)[index][:, None, None]
+            covariance = one.covariance[index].unflatten(0, (-1, *single))
+            self._local.append((term, mean, covariance))
 
     def __call__(self, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost (A, ...), downhill gradient (A, ..., n), and precision (A, ..., n, n)."""
-        state = self.state_at(joints)
-        away, n = self.centre - joints, joints.shape[-1]
-        cost = 0.5 * (self.prior * away.square()).sum(-1)
-        vector, precision = self.prior * away, self.prior.diag()
-        first = not self.factors
-        factors = []
-        for j, (term, mean, covariance) in enumerate(self.local):
-            matrix, residual, jacobian, noise = term(mean, state, self.frames)
-            if first:  # how far apart displacements are does not change within a tick
-                spread = covariance if matrix is None else matrix @ covariance @ matrix.mT
-                if noise is not None:
-                    spread = spread + noise.diag_embed()
-                name = "the covariance of a projected component"
-                factor = gaussians.cholesky(spread, name)
-                # of the joints themselves the precision is all that is asked for
-                known = jacobian is None
-                factors.append(torch.cholesky_inverse(factor) if known else factor)
-            factor = factors[j] if first else self.factors[j]
-            if jacobian is None:
-                pull = (factor @ residual.unsqueeze(-1)).squeeze(-1)
-                cost = cost + 0.5 * (residual * pull).sum(-1)
-                vector, precision = vector + pull, precision + factor
-                continue
-            right = torch.cat((jacobian.expand(*residual.shape, n), residual.unsqueeze(-1)), -1)
-            white = torch.linalg.solve_triangular(factor, right, upper=False)
-            gram = white.mT @ white
-            cost = cost + 0.5 * gram[..., n, n]
-            vector = vector + gram[..., :n, n]
-            precision = precision + gram[..., :n, :n]
-        self.factors = self.factors or factors
+        """Cost (P, A, ...), downhill gradient (P, A, ..., n), and precision (P, A, ..., n, n).
+
+        Of joints (P, A, ..., n). How far apart displacements may be is said by the first of P.
+        """
+        state = self._state_at(joints)
+        away = self._centre - joints
+        cost = 0.5 * (self._prior * away.square()).sum(-1)
+        vector, precision = self._prior * away, self._prior.diag()
+        for term, mean, covariance in self._local:
+            matrix, residual, jacobian, noise = term(mean, state, self._frames)
+            if matrix is not None:
+                matrix = matrix.expand(*residual.shape, -1)[:, :1]
+                covariance = matrix @ covariance @ matrix.mT
+            if noise is not None:
+                covariance = covariance + noise.expand(residual.shape)[:, :1].diag_embed()
+            parts = gaussians.information(jacobian, residual.unsqueeze(-1), covariance)
+            mixed, pull, square = ((self._weights * part).sum(0) for part in parts)
+            cost = cost + 0.5 * square[..., 0, 0]
+            vector, precision = vector + pull[..., 0], precision + mixed
         return cost, vector, precision
 
 
@@ -457,26 +380,37 @@ class Residual:
     starts : tuple of int
         Where the operator's quaternions begin.
     leaves : tuple
-        Position and orientation operators: each with the slices of its displacement and, of an
-        orientation, of its quaternion.
+        Position and orientation operators that have three rows each; none if there are others.
+    turning : tuple of three Tensor, of shape (D, L), (L,) and (L, 1), optional
+        ``w`` of each leaf's turn as a sum of coordinates times present ones and a constant, and
+        what of ``r`` is half a ``v``; None where derivatives are exact.
     """
 
     operator: Operator
     starts: tuple[int, ...]
-    leaves: tuple[tuple[Any, slice, slice | None], ...]
+    leaves: tuple[Any, ...]
+    turning: tuple[Tensor, Tensor, Tensor] | None
 
     @classmethod
     def of(cls, operator: Operator, kinematics: Kinematics) -> Self:
         """For an ``operator`` on the joints of ``kinematics``."""
-        parts: list[Any] = list(leaves([operator]))
-        found: list[tuple[Any, slice, slice | None]] = []
-        row, column = 0, 0
-        for leaf in parts if all(type(leaf) in TASKS for leaf in parts) else ():
-            block = slice(column, column + 4) if leaf.gain is not None else None
-            if not leaf.rotation_vector_starts(kinematics):
-                found.append((leaf, slice(row, row + 3), block))
-            row, column = row + 3, column + leaf.dimension(kinematics)
-        return cls(operator, operator.quaternion_starts(kinematics), tuple(found))
+        parts: Sequence[Any] = leaves([operator])
+        parts = parts if all(type(leaf) in TASKS for leaf in parts) else ()
+        column = 0
+        with torch.inference_mode(False):  # as it serves where gradients are wanted, too
+            like = kinematics.lower.new_ones(len(parts))
+            whole, half = like.clone(), torch.zeros_like(like).unsqueeze(-1)
+            share = like.new_zeros(operator.dimension(kinematics), len(parts))
+            for row, leaf in enumerate(parts):
+                if leaf.quaternion_starts(kinematics):
+                    share[column : column + 4, row] = leaf.gain / 2
+                    whole[row], half[row] = 0.0, 0.5
+                column += leaf.dimension(kinematics)
+        starts = operator.quaternion_starts(kinematics)
+        turning = (share, whole, half) if starts and parts else None
+        exact = [bool(leaf.rotation_vector_starts(kinematics)) for leaf in parts]
+        kept = tuple(None if one else leaf for one, leaf in zip(exact, parts, strict=True))
+        return cls(operator, starts, kept, turning)
 
     def __call__(
         self, mean: Tensor, state: RobotState, frames: Mapping[str, Frame]
@@ -494,15 +428,19 @@ class Residual:
         residual, jacobian = moved + at.displacement, at.jacobian
         if jacobian is None or not self.leaves:
             return matrix, residual, jacobian, at.noise
-        jacobian = jacobian.expand(*residual.shape, -1).clone()
-        for leaf, rows, block in self.leaves:
-            still, own = residual[..., rows], jacobian[..., rows, :]
-            if block is not None:
-                assert present is not None  # there are quaternions
-                cosine = (mean[..., block] * present[..., block]).sum(-1)[..., None, None]
-                jacobian[..., rows, :] = leaf.gain / 2 * cosine * own + _cross(still / 2, own)
-            if (reference := leaf.moving_reference(state)) is not None:
-                jacobian[..., rows, :] += _cross(still, state.angular_jacobian(reference))
+        jacobian, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
+        if self.turning is not None:
+            assert present is not None  # there are quaternions
+            share, whole, half = self.turning
+            cosine = whole + (mean * present) @ share
+            jacobian = cosine[..., None, None] * jacobian + _cross(half * still, jacobian)
+        for row, leaf in enumerate(self.leaves):
+            if leaf is None or (reference := leaf.moving_reference(state)) is None:
+                continue
+            jacobian = jacobian.expand(*still.shape, -1).clone()
+            swing = _cross(still[..., row, :], state.angular_jacobian(reference))
+            jacobian[..., row, :, :] += swing
+        jacobian = jacobian.flatten(-3, -2)
         return matrix, residual, jacobian, at.noise
 
 

@@ -37,7 +37,7 @@ from tpgmm_torch.regression.estimate import Estimate
 from tpgmm_torch.regression.fusion import KalmanUpdate, Projection
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, Fusion, InformationFusion
 from tpgmm_torch.regression.joint_limits import within
-from tpgmm_torch.regression.posture import PostureSearch
+from tpgmm_torch.regression.posture import PostureSearch, Residual
 from tpgmm_torch.regression.prior import prior_widths
 from tpgmm_torch.regression.time_likelihood import TimeLikelihood
 from tpgmm_torch.robots.kinematics import Kinematics, RobotState
@@ -300,8 +300,12 @@ class Regression:
 
     def posture_search(self) -> PostureSearch:
         """Search for the nearest posture; see :meth:`Skill.posture_search`."""
-        parts = self.kinematics, self.operators, self.fused
-        return PostureSearch(*parts, self.free_precision)
+        return self._search
+
+    @cached_property
+    def _search(self) -> PostureSearch:
+        terms = [Residual.of(operator, self.kinematics) for operator in self.operators]
+        return PostureSearch(self.kinematics, terms, self.fused, self.free_precision)
 
     def log_density(
         self, time: Tensor, local: Sequence[Tensor], n_samples: float | None = None

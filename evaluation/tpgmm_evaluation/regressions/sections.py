@@ -129,7 +129,7 @@ def reach(plan: Plan) -> Iterator[tuple[str, Work]]:
         ticks = round((example.GRASP + 4.0) / example.DT)
         paths = example.played(model, there, ticks, True)
         found = {f"error:{k}": [v] for k, v in example.calm(model, paths).items()}
-        here, least = example.distances(model, there, paths[-1], starts, 25)
+        here, least = example.distances(model, there, paths[-1], starts, 50)
         far = least > example.REACHED
         excess = (here / least - 1)[far]
         found["error:excess distance"] = excess.tolist()

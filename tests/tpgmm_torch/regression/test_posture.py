@@ -32,16 +32,12 @@ def searched(frame, start, ticks, time=TIME, asked=True, **options):
     return found, search
 
 
-def costs(frame, joints, time=TIME, component=None):
-    """Of a component, the heaviest if none is named, for joints (N, n)."""
-    regression = small_bottle().skill
-    if component is None:
-        component = regression.estimate(time, joints[0], {"bottle": frame}).activation.argmax()
-    index = torch.as_tensor(component).expand(1, len(joints))
-    frames = {"bottle": frame.expand(joints.shape[:1])}
-    return PostureCost(
-        regression.posture_search(), index, time, joints, frames, regression.kinematics.state
-    )
+def costs(frame, joints, time=TIME):
+    """The cost of joints (P, A, N, n)."""
+    regression, frames = small_bottle().skill, {"bottle": frame.expand(joints.shape[:1])}
+    activation = regression.estimate(time, joints, frames).activation.expand(len(joints), -1)
+    search, state = regression.posture_search(), regression.kinematics.state
+    return PostureCost(search, activation, time, joints, frames, state)
 
 
 def neutral():
@@ -53,14 +49,12 @@ def test_the_gradient_is_that_of_the_cost(frame):
     torch.manual_seed(0)
     joints = neutral() + 0.3 * torch.randn(1, 17, dtype=torch.float64)
     cost = costs(frame, joints)
-    _, downhill, precision = cost(joints[None])
-    steps = 1e-6 * torch.eye(17, dtype=torch.float64)
-    slope = torch.stack(
-        [(cost((joints + s)[None])[0] - cost((joints - s)[None])[0]).squeeze() for s in steps]
-    )
-    scale = downhill.abs().max()
-    assert float((slope / 2e-6 + downhill[0, 0]).abs().max() / scale) < 1e-6
-    assert bool((torch.linalg.eigvalsh(precision) > 0).all())
+    steps = 1e-6 * torch.eye(17, dtype=torch.float64).reshape(17, 1, 1, 17)
+    every = torch.cat((joints[None, None], joints + steps, joints - steps))
+    heights, downhill, precision = cost(every)
+    slope = (heights[1:18] - heights[18:]).squeeze() / 2e-6
+    assert float((slope + downhill[0].squeeze()).abs().max() / downhill[0].abs().max()) < 1e-6
+    assert bool((torch.linalg.eigvalsh(precision[0]) > 0).all())
 
 
 def test_who_is_not_asked_keeps_the_estimate():
@@ -98,19 +92,19 @@ def test_what_is_reached_is_left_to_the_regression():
 )
 def test_what_cannot_be_reached_is_approached_and_then_nothing_moves(place):
     frame = Frame(torch.tensor(place, dtype=torch.float64))
-    found, search = searched(frame, neutral(), 350)
+    found, search = searched(frame, neutral(), 500)
     lower, upper = limits()
     assert all(bool(((q >= lower) & (q <= upper)).all()) for q in found)
     assert float((found[-1] - found[-6]).abs().max()) < 1e-4
     assert bool(search.active)
     # the best of many starts, within 5 % of its distance
     generator = torch.Generator().manual_seed(1)
-    many = torch.rand(1, 60, 17, generator=generator, dtype=torch.float64)
-    many, damping = lower + (upper - lower) * many, torch.zeros(1, 60, dtype=torch.float64)
-    for _ in range(40):
-        cost = costs(frame, many[0])
-        many, damping, height, _ = descend(cost, many, damping, lower, upper)
-    here = float(costs(frame, found[-1][None])(found[-1][None, None])[0])
+    many = torch.rand(60, 17, generator=generator, dtype=torch.float64)
+    many = (lower + (upper - lower) * many).expand(2, 1, -1, -1)
+    cost, damping = costs(frame, many[0, 0]), torch.zeros(1, 60, dtype=torch.float64)
+    for _ in range(80):
+        many, damping, height = descend(cost, many, damping, lower, upper)
+    here = float(costs(frame, found[-1][None])(found[-1][None, None, None])[0])
     assert here <= 1.05**2 * float(height.min())
 
 
@@ -122,20 +116,13 @@ def test_between_two_components_what_cannot_be_reached_is_approached_too():
         [regression.estimate(t, neutral(), {"bottle": frame}).activation for t in times]
     )
     time = times[shares.amax(-1).argmin()]
-    weights = shares[shares.amax(-1).argmin()]
-    assert float(weights.max()) < 0.7
+    assert float(shares.amax(-1).min()) < 0.7
     [*_, here], _ = searched(frame, neutral(), 350, time)
-    lower, upper = limits()
-
-    def mean(joints):
-        of_each = [costs(frame, joints[0], time, i)(joints) for i in weights.nonzero()[:, 0]]
-        own = weights[weights > 0]
-        return [sum(w * c[k] for w, c in zip(own, of_each, strict=True)) for k in range(3)]
-
-    joints, damping = here[None, None], torch.zeros(1, 1, dtype=torch.float64)
-    for _ in range(40):
-        joints, damping, height, _ = descend(mean, joints, damping, lower, upper)
-    assert float(mean(here[None, None])[0]) <= 1.02**2 * float(height)
+    cost = costs(frame, here[None], time)
+    joints, damping = here.expand(2, 1, 1, -1), torch.zeros(1, 1, dtype=torch.float64)
+    for _ in range(80):
+        joints, damping, height = descend(cost, joints, damping, *limits())
+    assert float(cost(here[None, None, None])[0]) <= 1.02**2 * float(height)
 
 
 def test_a_robot_does_not_depend_on_its_batch():
