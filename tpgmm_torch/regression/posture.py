@@ -424,11 +424,10 @@ class Residual:
             matrix = None if matrix is None else matrix * signs.unsqueeze(-2)
         moved = mean if at.matrix is None else (at.matrix @ mean.unsqueeze(-1))[..., 0]
         residual, jacobian = moved + at.displacement, at.jacobian
-        if jacobian is None or not self.leaves:
+        # orientations that are tracked have four rows, which are linear in the joints
+        if jacobian is None or residual.shape[-1] != 3 * len(self.leaves):
             return matrix, residual, jacobian, at.noise
-        size = 3 * len(self.leaves)  # behind these, tracked poses have rows of their own
-        own = jacobian[..., :size, :].unflatten(-2, (-1, 3))
-        still = residual[..., :size].unflatten(-1, (-1, 3))
+        own, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
         if self.turning is not None:
             assert present is not None  # there are quaternions
             share, whole, half = self.turning
@@ -439,11 +438,7 @@ class Residual:
                 continue
             own = own.expand(*still.shape, -1).clone()
             own[..., row, :, :] += _cross(still[..., row, :], state.angular_jacobian(reference))
-        own = own.flatten(-3, -2)
-        if size < residual.shape[-1]:
-            rest = jacobian[..., size:, :].expand(*own.shape[:-2], -1, -1)
-            own = torch.cat((own, rest), -2)
-        return matrix, residual, own, at.noise
+        return matrix, residual, own.flatten(-3, -2), at.noise
 
 
 def _cross(vector: Tensor, matrix: Tensor) -> Tensor:
