@@ -3,22 +3,19 @@
 A tick asks for one step of the linearised product (2). That is all there is to do while what is
 wanted stays near: then the step is exact to second order. For what is far away, or cannot be
 reached, the step overshoots, and taken again and again it circles. The product of component i
-is, up to a constant, ``exp(-F_i(q))`` with
+is, up to a constant, ``exp(-F_i(q))``; the wanted posture minimises the mean of these costs,
 
+    sum_i h_i(t) F_i(q)   such that  lower <= q <= upper,
     F_i(q) = 1/2 sum_j r_ij(q)^T S_ij^-1 r_ij(q),   r_ij = M_j(q) mu_ij(t) + c_j(q),
 
 where r_ij is the displacement that operator j asks for at q, with Jacobian ``-J_j`` (section
-4.1), and S_ij its covariance. The wanted posture is
-
-    q* = sum_i h_i(t) q_i*,   q_i* = argmin F_i(q)  such that  lower <= q <= upper,
-
-the components' minima mixed as the regression mixes their means: to first order it is the
-regression's estimate. Out of reach, where these minima lie apart and nothing between them is
-near, it is that of their mean cost, ``argmin sum_i h_i(t) F_i(q)``. Minima are found by
-Levenberg's and Marquardt's method with steps that keep within the limits exactly, taken only
-where the cost falls, from where the last tick ended: what cannot be reached is approached, and
-then nothing moves. Where the limits leave several minima, others are looked for meanwhile, from
-a few fixed postures in turn.
+4.1), and S_ij its covariance. Within reach it is moved by how far the regression's step leads
+from that of the mean cost, which is, to first order, the regression's estimate. The minimum is
+found by Levenberg's and Marquardt's method with steps that keep within the limits exactly, from
+where the last tick ended. Each tick evaluates the cost once, where the search is and where its
+next step leads, both at the same instant: what cannot be reached is approached, and then
+nothing moves. Where the limits leave several minima, others are looked for meanwhile, from a
+sequence of postures.
 """
 
 from __future__ import annotations
@@ -143,7 +140,6 @@ class PostureSearch:
         goal, trust = goal.clone(), trust.clone()
         wanted = torch.lerp(goal, estimate.joints, trust.unsqueeze(-1))
         wanted = torch.where((trust < 1).unsqueeze(-1), wanted, estimate.joints)
-        # what begins has found nothing yet
         active = rows & (asked | (trust < 1))
         postures, damping, age = state
         searched = replace(self, active=active, postures=postures, damping=damping, age=age)
@@ -217,10 +213,9 @@ class PostureSearch:
         goal = torch.where(reached.unsqueeze(-1), mixed, goal)
         trust, wanted = like.new_ones(batch), like.clone()
         trust[where], wanted[where] = trusted, goal
-        if self.active is None:  # nothing is found yet
-            trust = torch.ones_like(trust)
-        else:
-            trust = torch.where(self.active, trust, 1.0)
+        # where a search begins, nothing is found yet
+        begun_before = torch.zeros_like(rows) if self.active is None else self.active
+        trust = torch.where(begun_before, trust, 1.0)
         all_postures[of_all], all_damping[of_both] = postures, damping
         all_age[where] = torch.where(reached, 0, age)
         return trust, wanted, all_postures, all_damping, all_age
@@ -279,19 +274,21 @@ def descend(
     cost : Tensor of shape (...)
         Of the better ones.
     """
-    joints, there = torch.clamp(postures, lower, upper)
-    heights, vectors, precisions = cost(torch.stack((joints, there)))
+    joints, there = postures = torch.clamp(postures, lower, upper)
+    heights, vectors, precisions = cost(postures)
     step = there - joints
     bend = (step.unsqueeze(-2) @ precisions[0] @ step.unsqueeze(-1))[..., 0, 0]
     promise = (vectors[0] * step).sum(-1) - 0.5 * bend
     tried = promise > PROMISE * (heights[0] + PROMISE)
     gain = torch.where(tried, (heights[0] - heights[1]) / promise, 0.5)
-    gain = torch.where(heights[1] < SLACK / 2, 1.0, gain)
+    # valleys are curved: within reach a step along them is taken, and the next leads back
+    near = heights[1] < SLACK / 2
+    gain = torch.where(near, 1.0, gain)
     easier = torch.where(damping > LEAST, damping / 5, 0.0)
     harder = torch.clamp(10 * damping, FIRST, MOST)
     damping = torch.where(gain > 0.75, easier, damping)
     damping = torch.where(gain < 0.25, harder, damping)
-    taken = (tried & (heights[1] < heights[0])) | (heights[1] < SLACK / 2)
+    taken = (tried & (heights[1] < heights[0])) | near
     joints = torch.where(taken.unsqueeze(-1), there, joints)
     vector = torch.where(taken.unsqueeze(-1), vectors[1], vectors[0])
     precision = torch.where(taken[..., None, None], precisions[1], precisions[0])
@@ -349,7 +346,8 @@ class PostureCost:
         state = self._state_at(joints)
         away = self._centre - joints
         cost = 0.5 * (self._prior * away.square()).sum(-1)
-        vector, precision = self._prior * away, self._prior.diag()
+        vector = self._prior * away
+        precision = self._prior.diag().expand(*joints.shape, -1)
         for term, mean, covariance in self._local:
             matrix, residual, jacobian, noise = term(mean, state, self._frames)
             if matrix is not None:
@@ -426,22 +424,21 @@ class Residual:
             matrix = None if matrix is None else matrix * signs.unsqueeze(-2)
         moved = mean if at.matrix is None else (at.matrix @ mean.unsqueeze(-1))[..., 0]
         residual, jacobian = moved + at.displacement, at.jacobian
-        if jacobian is None or not self.leaves:
+        # orientations that are tracked have four rows, which are linear in the joints
+        if jacobian is None or residual.shape[-1] != 3 * len(self.leaves):
             return matrix, residual, jacobian, at.noise
-        jacobian, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
+        own, still = jacobian.unflatten(-2, (-1, 3)), residual.unflatten(-1, (-1, 3))
         if self.turning is not None:
             assert present is not None  # there are quaternions
             share, whole, half = self.turning
             cosine = whole + (mean * present) @ share
-            jacobian = cosine[..., None, None] * jacobian + _cross(half * still, jacobian)
+            own = cosine[..., None, None] * own + _cross(half * still, own)
         for row, leaf in enumerate(self.leaves):
             if leaf is None or (reference := leaf.moving_reference(state)) is None:
                 continue
-            jacobian = jacobian.expand(*still.shape, -1).clone()
-            swing = _cross(still[..., row, :], state.angular_jacobian(reference))
-            jacobian[..., row, :, :] += swing
-        jacobian = jacobian.flatten(-3, -2)
-        return matrix, residual, jacobian, at.noise
+            own = own.expand(*still.shape, -1).clone()
+            own[..., row, :, :] += _cross(still[..., row, :], state.angular_jacobian(reference))
+        return matrix, residual, own.flatten(-3, -2), at.noise
 
 
 def _cross(vector: Tensor, matrix: Tensor) -> Tensor:
