@@ -21,6 +21,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 
 NAMES = fitted().kinematics.joint_names
 POSE = [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+JOINTS = {"operators": ["canonical"]}
 UPPER_BODY = {"robot": "upper_body", "links": ["l_hand", "r_hand"]}
 
 
@@ -76,7 +77,7 @@ def test_joints_alone_need_no_robot():
     [
         (UPPER_BODY, environment(None), r"tell of no pose: name the frames, --policy.frames="),
         ({"fps": 50.0}, {}, "20 steps per second, the policy was made for 50: resample it"),
-        ({"state_names": ["a", "b"]}, {}, r"state_names are \['a', 'b'\], 2 entries"),
+        (JOINTS | {"state_names": ["a", "b"]}, {}, r"state_names are \['a', 'b'\], 2 entries"),
         ({"robot": "no.urdf", "links": ["hand"]}, {}, "no.urdf"),
     ],
 )

@@ -51,7 +51,7 @@ def test_units_are_converted_both_ways():
         ({"state": ("a", "b", "c", "c_joint")}, None),
         ({"state": ("a", "b", "c.pos", "c_joint")}, "'c' fits several values"),
         ({"units": "turns"}, "unit 'turns' is unknown"),
-        ({"units": {"d": "deg"}}, r"units are given for \['d'\]; the joints are"),
+        ({"units": {"d": "deg"}}, r"units names \['d'\], .* called \['a', 'b', 'c'\]"),
         ({"units": {"a": [1.0]}}, r"\[factor, offset\], got \[1.0\]"),
         ({"units": {"a": [0.0, 1.0]}}, r"\[factor, offset\]"),
     ],

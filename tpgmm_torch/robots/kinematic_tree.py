@@ -75,7 +75,8 @@ def reduce(
     Raises
     ------
     DataError
-        If a joint of several degrees of freedom lies between the base and a link.
+        If a joint of several degrees of freedom lies between the base and a link, or one of
+        which nothing is known.
     """
     bodies = [Body(0, np.eye(4))]
     places = {base: (0, np.eye(4))}  # of each link, the body that it is fixed to, and where
@@ -95,6 +96,11 @@ def reduce(
                 follow = column, slides, leader.multiplier, leader.offset
                 bodies.append(Body(carrier, pose @ before @ turn, *follow))
                 places[far] = len(bodies) - 1, turn.T @ after
+            elif leader and leader.joint not in locked:
+                raise DataError(
+                    f"joint {leader.joint!r} moves link {link!r}: it is measured in radians (or "
+                    "metres), and cannot be a coordinate in a unit of its own"
+                )
             else:
                 at = leader.multiplier * locked[leader.joint] + leader.offset if leader else 0.0
                 places[far] = carrier, pose @ before @ motion(joint.type, axis, at) @ after
