@@ -39,8 +39,8 @@ __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 #: Checks of ranges, and what helps where they are about values in a unit of their own.
 RANGES = ("units", "limits")
 RAW = (
-    "They are 'raw', and a robot.unlimited([...]) has no limits for them; units='lerobot' takes "
-    "a gripper's 0 to 100 to its limits"
+    "They are 'raw', and robot.unlimited([...]) has no limits for them; or units='lerobot', "
+    "where a gripper's 0 to 100 are its limits"
 )
 
 

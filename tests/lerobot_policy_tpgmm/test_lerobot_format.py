@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
-from tests.support.command_line import output, refusal
+from tests.support.command_line import output, run
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle

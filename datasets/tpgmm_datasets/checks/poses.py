@@ -91,13 +91,13 @@ def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Fi
     if gaps[""] <= REACHED:
         return
     message = (
-        f"none of the links {list(robot.links)} comes nearer than {gaps['']:.2g} m to one of "
+        f"none of the links {list(robot.links)} comes nearer than {gaps['']:.2f} m to one of "
         f"the objects {list(episodes[0].frames)}"
     )
     remedy = "Are poses in metres, in the robot's base frame, and are these the hands?"
     if gaps[best] <= REACHED:
         remedy = (
-            f"If poses were in the frame of {best!r}, one would come to {gaps[best]:.2g} m: "
+            f"If poses were in the frame of {best!r}, one would come to {gaps[best]:.2f} m: "
             "put that base at the origin (combine: base=...), or convert the poses"
         )
     yield Finding("distance", message, remedy, (*episodes[0].frames,), value=gaps[""])

@@ -55,6 +55,9 @@ class DataOptions:
         The robot's name of a stored joint, repeatable, where the names differ.
     rate : float >= 0.001
         Resample to this number of steps per second.
+    relax : ``CHECK``
+        Leave out episodes that fail a check, repeatable: duplicates, events, gaps, missing, nan,
+        poses or time; or metadata, and go on without it.
     """
 
     frame: list[str] | None = None
@@ -64,6 +67,7 @@ class DataOptions:
     joints: str | None = None
     joint_name: list[str] | None = None
     rate: float | None = None
+    relax: list[str] | None = None
 
     def arguments(self, robot: Kinematics | None = None) -> dict[str, Any]:
         """Keyword arguments of :func:`tpgmm_datasets.load_lerobot`, ``robot`` among them.
@@ -84,13 +88,14 @@ class DataOptions:
             "joints": self.joints,
             "joint_names": text.parse_joint_names(self.joint_name or ()),
             "rate": self.rate,
+            "relax": self.relax or (),
         }
 
     def opened(self, dataset: str, robot: Kinematics | None, **options: Any) -> Recording:
         """A ``dataset`` with a robot that has no limits for what is in a unit of its own."""
         from tpgmm_datasets.reader import open_recording
 
-        return open_recording(dataset, **self.arguments(robot), **options).unlimited()
+        return open_recording(dataset, **(self.arguments(robot) | options)).unlimited()
 
     def read(self, dataset: str, robot: Kinematics | None = None) -> list[Demonstration]:
         """The demonstrations in a ``dataset``, joints in the order of a ``robot``."""
