@@ -230,7 +230,9 @@ def as_scale(unit: Unit, column: str) -> Scale:
     if unit == "auto":
         return NAMED["raw"]
     if unit not in NAMED:
-        message = f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'lerobot', 'auto' and Scale"
+        message = (
+            f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'lerobot', 'auto' and Scale"
+        )
         raise DatasetError(message, column=column)
     return NAMED[unit]
 

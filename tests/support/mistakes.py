@@ -902,7 +902,7 @@ def a_pattern_that_is_misspelt(folder):
     recorded(folder, units={"*": "deg", "*griper": "raw"})
 
 
-@mistake("robots", r"20 m apart: poses are in metres, are these in centimetres")
+@mistake("robots", r"20 m apart: are poses in metres, or in centimetres")
 def bases_in_centimetres(_):
     parse_robot("left=so101@0,20,0;right=so101@0,0,0")
 

@@ -98,8 +98,8 @@ def reduce(
                 places[far] = len(bodies) - 1, turn.T @ after
             elif leader and leader.joint not in locked:
                 raise DataError(
-                    f"joint {leader.joint!r} moves link {link!r}: it is measured in radians (or "
-                    "metres), and cannot be a coordinate in a unit of its own"
+                    f"joint {leader.joint!r} moves link {link!r}: it is measured in radians "
+                    "(or metres), and cannot be a coordinate in a unit of its own"
                 )
             else:
                 at = leader.multiplier * locked[leader.joint] + leader.offset if leader else 0.0

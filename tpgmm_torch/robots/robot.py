@@ -8,6 +8,7 @@ import os
 import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
 
@@ -19,9 +20,7 @@ from tpgmm_torch import quaternions
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import (
-    DataError, PlausibilityWarning, ShapeError, TPGMMError, UnknownNameError,
-)  # fmt: skip
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
@@ -271,14 +270,10 @@ class Robot(Described):
             raise UnknownNameError("robot", name, "the robots to combine", robots)
         roots = {name: _pose(name, pose) for name, pose in (fixed or {}).items()}
         places = {name: _pose(name, (poses or {}).get(name, [0, 0, 0])) for name in robots}
-        for (one, at), (other, there) in itertools.combinations(places.items(), 2):
-            if (apart := float((at.position - there.position).norm())) > FARTHEST_BASES:
-                warnings.warn(
-                    f"the bases of {one!r} and {other!r} are {apart:.4g} m apart: poses are in "
-                    "metres, are these in centimetres or millimetres?",
-                    PlausibilityWarning,
-                    stacklevel=2,
-                )
+        at = torch.stack([place.position for place in places.values()])
+        if (apart := float(torch.cdist(at, at).max())) > FARTHEST_BASES:
+            told = f"bases of {[*robots]} are {apart:.4g} m apart: are poses in metres, or in "
+            warnings.warn(f"{told}centimetres?", PlausibilityWarning, stacklevel=2)
         for name, robot in robots.items():
             roots[f"{name}_{robot.model.root}"] = places[name].compose(robot._root())
         options: dict[str, Any] = _side_by_side(robots)
@@ -376,7 +371,7 @@ class Robot(Described):
         both = dict.fromkeys((*self._config["coordinates"], *sorted(more)))
         return self.from_config({**self._config, "coordinates": [*both]}, self.lower.device)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | Path) -> None:
         """Write the description as a URDF, tools as links of it.
 
         Which links, joints and base are wanted is not in it; files of shapes are named as they
@@ -395,9 +390,7 @@ class Robot(Described):
         urdf = parse_xml(self.model.text)
         for name, (parent, *pose) in self._config["tools"].items():
             ElementTree.SubElement(urdf, "link", name=name)
-            mount = free_name(f"{name}_mount", self.model.joint)
-            place = _matrix(Frame(*pose))
-            urdf.append(joint_element(UrdfJoint(mount, "fixed", parent, name, place, X_AXIS)))
+            _mount(urdf, parent, name, Frame(*pose))
         with replacing(path) as file:
             ElementTree.ElementTree(urdf).write(file, "utf-8", xml_declaration=True)
 
@@ -505,10 +498,8 @@ def _pose(name: str, given: Any) -> Frame:
         return given.to(torch.float64)
     values = as_tensor(given, f"the pose of {name!r}").to(torch.float64)
     if tuple(values.shape) not in ((3,), (7,)):
-        raise DataError(
-            f"the pose of {name!r} is a Frame, x y z in metres, or x y z qw qx qy qz; got "
-            f"{given!r}"
-        )
+        allowed = "a Frame, x y z in metres, or x y z qw qx qy qz"
+        raise DataError(f"the pose of {name!r} is {allowed}; got {given!r}")
     return Frame(values[:3], values[3:] if len(values) > 3 else None)
 
 
@@ -538,12 +529,15 @@ def _mounted(
     urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))
     for name, robot in robots.items():
         urdf.extend(_prefixed(name, robot))
-    taken = [part.get("name", "") for part in urdf]
     for link, frame in roots.items():
-        mount = free_name(f"{link}_mount", taken)
-        joint = UrdfJoint(mount, "fixed", "world", link, _matrix(frame), X_AXIS)
-        urdf.append(joint_element(joint))
+        _mount(urdf, "world", link, frame)
     return ElementTree.tostring(urdf, encoding="unicode")
+
+
+def _mount(urdf: ElementTree.Element, parent: str, link: str, pose: Frame) -> None:
+    """Fix a link to another one."""
+    name = free_name(f"{link}_mount", [part.get("name", "") for part in urdf])
+    urdf.append(joint_element(UrdfJoint(name, "fixed", parent, link, _matrix(pose), X_AXIS)))
 
 
 def _prefixed(prefix: str, robot: Robot) -> list[ElementTree.Element]:
@@ -613,7 +607,10 @@ def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[fl
     """
     try:
         leader = model.leader(joint.name)
-    except TPGMMError:  # raised where it matters: for a link that depends on it
+    except (
+        DataError,
+        UnknownNameError,
+    ):  # raised where it matters: for a link that depends on it
         return True
     if leader.joint not in rows or leader.multiplier == 0:
         return True

@@ -78,9 +78,7 @@ def bi_so101_urdf() -> str:
 ROBOTS = {"bi_so101": bi_so101_urdf, "so101": so101_urdf, "upper_body": upper_body_urdf}
 
 
-def parse_robot(
-    text: str | Sequence[str], links: Sequence[str] = (), **settings: Any
-) -> Robot:
+def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings: Any) -> Robot:
     """The robot that a text stands for.
 
     Parameters
@@ -106,20 +104,18 @@ def parse_robot(
     ('left_gripper_frame_link', 'right_gripper_frame_link')
     """
     texts = [text] if isinstance(text, str) else list(text)
-    if len(texts) == 1 and not texts[0].lstrip().startswith("<"):
-        texts = texts if Path(texts[0]).is_file() else texts[0].split(";")
-    if len(texts) > 1 or re.match(r"\w+=", texts[0]) and not Path(texts[0]).is_file():
-        poses, robots = {}, {}
-        for part in texts:
-            match = re.fullmatch(r"\s*([A-Za-z]\w*)=(.+)@([^@]+)", part)
-            if match is None or match[1] in robots:
-                twice = "is there twice; one" if match else "is not"
-                raise DataError(f"robot {part!r} {twice} {PART}; got {texts}")
-            poses[match[1]], robots[match[1]] = _place(part, match[3]), _robot(match[2])
-        whole = Robot.combine(poses, **robots)
-    else:
-        whole = _robot(texts[0])
-    return Robot.from_urdf(whole.model.text, links or end_links(whole.model), **settings)
+    one = len(texts) == 1 and (texts[0].lstrip().startswith("<") or Path(texts[0]).is_file())
+    texts = texts if one else [part.strip() for each in texts for part in each.split(";")]
+    robots: dict[str, Any] = {}
+    places = {}
+    for part in [] if one or (len(texts) == 1 and "=" not in texts[0]) else texts:
+        match = re.fullmatch(r"(?!poses=|fixed=|base=)([A-Za-z]\w*)=(.+)@([^@]+)", part)
+        if match is None or match[1] in robots:
+            twice = "is there twice; one" if match else "is not"
+            raise DataError(f"robot {part!r} {twice} {PART}; got {texts}")
+        places[match[1]], robots[match[1]] = _place(part, match[3]), _robot(match[2])
+    model = (Robot.combine(places, **robots) if robots else _robot(texts[0])).model
+    return Robot.from_urdf(model.text, links or end_links(model), **settings)
 
 
 def _robot(text: str) -> Robot:
@@ -158,17 +154,17 @@ def end_links(model: UrdfModel) -> tuple[str, ...]:
     """
     above = {joint.child: joint for joint in model.joints}
     carriers = {joint.parent for joint in model.movable.values() if is_gripper(joint.name)}
-    carriers |= {link for link in model.links if re.fullmatch("(.*_)?(l|r|left|right)_hand", link)}
-    found = []
+    carriers |= {
+        link for link in model.links if re.fullmatch("(.*_)?(l|r|left|right)_hand", link)
+    }
+    parents, found = {joint.parent for joint in model.joints}, []
     for carrier in (link for link in model.links if link in carriers):
-        way = [carrier]
-        while way[-1] in above:
-            way.append(above[way[-1]].parent)
-        if carriers.isdisjoint(way[1:]):
-            fixed = [carrier]
+        link, fixed = carrier, [carrier]
+        while link in above and (link := above[link].parent) not in carriers:
+            pass
+        if link not in carriers - {carrier}:  # nothing above it carries a gripper
             for link in fixed:  # which grows
                 fixed += [j.child for j in model.joints if j.parent == link and not j.movable]
-            parents = {joint.parent for joint in model.joints}
             tips = [link for link in fixed if link not in parents]
             found.append(tips[0] if len(tips) == 1 else carrier)
     return tuple(found)

@@ -376,7 +376,7 @@ class TestCombining:
         for pose in ([0, 0.2], [[0, 0, 0]], "here", [0, 0, 0, 1]):
             with pytest.raises(DataError, match="the pose of 'left'"):
                 Robot.combine({"left": pose}, left=arm)
-        with pytest.warns(PlausibilityWarning, match="'left' and 'right' are 20 m apart"):
+        with pytest.warns(PlausibilityWarning, match=r"\['left', 'right'\] are 20 m"):
             Robot.combine({"left": [0, 20, 0]}, left=arm, right=arm)
 
     def test_a_saved_description_has_all_of_it(self, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def learn(
             if source == UPLOADED:
                 described = robot_file if robot == ROBOT_FILE else robot
                 given = None if described == NO_ROBOT else described
-                kinematics = RobotOptions(given and [given], _names(links)).read()
+                kinematics = RobotOptions([given] if given else None, _names(links)).read()
                 read = uploaded(files or (), kinematics, _names(frames))
             else:
                 known: dict[str, Callable[[], Recorded]] = {GENERATED: generated_bottle}

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
+from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.episode_batches import EpisodeBatches
 from tpgmm_datasets.lerobot.columns import EVENT
 from tpgmm_datasets.lerobot.event_flags import event_features
@@ -16,11 +17,15 @@ from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
 from tpgmm_tools.cli import options
 from tpgmm_tools.cli.learning import (
-    Choices, aligner, asked_operators, learn, parse_parts, prepared,
+    Choices,
+    aligner,
+    asked_operators,
+    learn,
+    parse_parts,
+    prepared,
 )  # fmt: skip
 from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
-from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.mixture.processes import joined_processes
@@ -223,11 +228,12 @@ def _understood(
     links = ", ".join(assembly.robot.links) if assembly.robot is not None else ""
     lines["links"] = links + " (its hands; --link names others)" * bool(links and not named)
     places = {
-        name: getattr(one, "feature", None) or f"{one.link}@{one.event}"
+        name: f"{one.link}@{one.event}"
+        if isinstance(one, LinkPose)
+        else vars(one).get("feature")
         for name, one in assembly.frames.items()
-        if not isinstance(one, Frame)
     }
-    lines["frames"] = ", ".join(f"{n} ({places.get(n, 'given')})" for n in kept[0].frames)
+    lines["frames"] = ", ".join(f"{name} ({at or 'given'})" for name, at in places.items())
     stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]
     found = [f"{name} (looked for)" for name in assembly.events]
     lines["events"] = ", ".join((*stored, *found))

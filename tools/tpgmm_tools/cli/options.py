@@ -56,8 +56,8 @@ class DataOptions:
     rate : float >= 0.001
         Resample to this number of steps per second.
     relax : ``CHECK``
-        Leave out episodes that fail a check, repeatable: duplicates, events, gaps, missing, nan,
-        poses or time; or metadata, and go on without it.
+        Leave out episodes that fail a check, repeatable: duplicates, events, gaps, missing,
+        nan, poses or time; or metadata, and go on without it.
     """
 
     frame: list[str] | None = None
