@@ -36,8 +36,7 @@ from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
 
-#: Checks of ranges, and what helps where they are about values in a unit of their own.
-RANGES = ("units", "limits")
+#: What helps where values in a unit of their own are out of range.
 RAW = (
     "They are 'raw', and robot.unlimited([...]) has no limits for them; or units='lerobot', "
     "where a gripper's 0 to 100 are its limits"
@@ -130,7 +129,9 @@ class Recording:
         known = robot if isinstance(robot, Kinematics) else None
         report = check_summaries(summaries, known, raw)
         findings = [
-            replace(one, remedy=RAW) if {*one.names} <= raw and one.check in RANGES else one
+            replace(one, remedy=RAW)
+            if {*one.names} <= raw and one.check in ("units", "limits")
+            else one
             for one in report
         ]
         doubtful = doubtful_events(self.assembly.doubtful, "episode")

@@ -278,14 +278,11 @@ def units_of(
     called = list(zip(stored, final, strict=True))
     unknown = [key for key in given if not any(fits(key, *names) for names in called)]
     if unknown:
-        there = list(dict.fromkeys(stored))
-        message = f"units names {unknown}, which fit no value; they are called {there}"
-        raise DatasetError(message, column=column)
+        there = f"which fit no value; they are called {list(dict.fromkeys(stored))}"
+        raise DatasetError(f"units names {unknown}, {there}", column=column)
     for key in sorted(given, key=lambda key: 2 if key in {*stored, *final} else key != "*"):
-        chosen = [
-            given[key] if fits(key, *names) else unit
-            for names, unit in zip(called, chosen, strict=True)
-        ]
+        for place in (i for i, names in enumerate(called) if fits(key, *names)):
+            chosen[place] = given[key]
     return [
         _lerobot(*names, robot) if unit == "lerobot" else unit
         for names, unit in zip(called, chosen, strict=True)
@@ -296,9 +293,10 @@ def _lerobot(stored: str, name: str, robot: Any) -> Unit:
     """The unit in which LeRobot's motors say a value."""
     if not is_gripper(stored) and not is_gripper(name):
         return "deg"
-    if name in getattr(robot, "joint_names", ()) and hasattr(robot, "lower"):
-        place = robot.joint_names.index(name)
-        ends = float(robot.lower[place]), float(robot.upper[place])
-        if math.isfinite(ends[1] - ends[0]):
-            return replace(Scale.between((0, 100), ends), stored=(0.0, 100.0))
-    return "raw"
+    limits = (getattr(robot, key, ()) for key in ("joint_names", "lower", "upper"))
+    low, high = {joint: (float(a), float(b)) for joint, a, b in zip(*limits, strict=False)}.get(
+        name, (0, math.inf)
+    )
+    if math.isinf(high - low):
+        return "raw"
+    return replace(Scale.between((0, 100), (low, high)), stored=(0.0, 100.0))

@@ -81,12 +81,10 @@ def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Fi
     root = robot.config()["base"]
     fixed = (j for j in robot.model.joints if j.type == "fixed" and j.parent == root)
     bases = {"": np.eye(4)} | {joint.child: joint.origin for joint in fixed}
-    gaps = {
-        base: np.linalg.norm(
-            hands - (places @ pose[:3, :3].T + pose[:3, 3])[:, None, :, None], axis=-1
-        ).min()
-        for base, pose in bases.items()
-    }
+    gaps = {}
+    for base, pose in bases.items():
+        there = (places @ pose[:3, :3].T + pose[:3, 3])[:, None, :, None]
+        gaps[base] = float(np.linalg.norm(hands - there, axis=-1).min())
     best = min(gaps, key=lambda base: gaps[base])
     if gaps[""] <= REACHED:
         return
