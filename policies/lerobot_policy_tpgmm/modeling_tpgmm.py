@@ -526,6 +526,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _check_start(self, start: Tensor, wanted: Tensor) -> None:
         """Refuse to move robots that stand far from where the skill begins."""
         largest, gap = self.config.control.largest_start_gap, (wanted - start).abs()
+        if known := {*self.kinematics.angles, *self.kinematics.lengths}:
+            gap[..., [i for i in range(gap.shape[-1]) if i not in known]] = 0  # of any unit
         if largest is None or not bool((gap > largest).any()):
             return
         row, joint = divmod(int(gap.argmax()), gap.shape[-1])

@@ -268,12 +268,8 @@ class Robot(Described):
             raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
         for name in set(poses or ()) - set(robots):
             raise UnknownNameError("robot", name, "the robots to combine", robots)
-        roots = {name: _pose(name, pose) for name, pose in (fixed or {}).items()}
-        places = {name: _pose(name, (poses or {}).get(name, [0, 0, 0])) for name in robots}
-        at = torch.stack([place.position for place in places.values()])
-        if (apart := float(torch.cdist(at, at).max())) > FARTHEST_BASES:
-            told = f"bases of {[*robots]} are {apart:.4g} m apart: are poses in metres, or in "
-            warnings.warn(f"{told}centimetres?", PlausibilityWarning, stacklevel=2)
+        roots, places = _poses(fixed or {}, fixed or ()), _poses(poses or {}, robots)
+        _check_bases(places)
         for name, robot in robots.items():
             roots[f"{name}_{robot.model.root}"] = places[name].compose(robot._root())
         options: dict[str, Any] = _side_by_side(robots)
@@ -503,6 +499,18 @@ def _pose(name: str, given: Any) -> Frame:
     return Frame(values[:3], values[3:] if len(values) > 3 else None)
 
 
+def _poses(given: Mapping[str, Any], names: Iterable[str]) -> dict[str, Frame]:
+    return {name: _pose(name, given.get(name, [0, 0, 0])) for name in names}
+
+
+def _check_bases(places: Mapping[str, Frame]) -> None:
+    """Warn of bases that no robots have which work together."""
+    at = torch.stack([place.position for place in places.values()])
+    if (apart := float(torch.cdist(at, at).max())) > FARTHEST_BASES:
+        told = f"bases of {[*places]} are {apart:.4g} m apart: are poses in metres, or in "
+        warnings.warn(f"{told}centimetres?", PlausibilityWarning, stacklevel=3)
+
+
 def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tuple[str, Array]]]:
     """The base, and for each wanted link a link of the URDF and the pose in it."""
     here = np.eye(4)
@@ -592,14 +600,15 @@ def _limits(
         if endless or math.isinf(joint.velocity):
             without.add(name)
     for joint in model.movable.values():
-        mine = {name: rows[name] for name in own}
-        if joint.mimic is not None and not _limit_leader(model, joint, mine):
+        if joint.mimic is not None and not _limit_leader(model, joint, rows, own):
             without.add(model.leader(joint.name).joint)
     limits = torch.tensor(list(rows.values()), dtype=torch.float64)
     return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
 
 
-def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]]) -> bool:
+def _limit_leader(
+    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]], own: Collection[str]
+) -> bool:
     """Apply the limits of a joint that mimics another to that other, which moves with it.
 
     Limits that leave it a single point, as where a sign was forgotten, are none: the answer
@@ -612,7 +621,7 @@ def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[fl
         UnknownNameError,
     ):  # raised where it matters: for a link that depends on it
         return True
-    if leader.joint not in rows or leader.multiplier == 0:
+    if leader.joint not in own or leader.multiplier == 0:
         return True
     row, factor = rows[leader.joint], leader.multiplier
     rates = joint.velocity, joint.acceleration, joint.jerk
