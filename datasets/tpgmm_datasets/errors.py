@@ -57,6 +57,13 @@ class DatasetError(DataError):
             None if column is None else f"column {column!r}",
         ]
         place = ", ".join(part for part in where if part)
+        # without its description there is no set
+        whole = self.file is None or self.file.startswith("meta")
+        if check and "relax=" not in message and not (check == "missing" and whole):
+            lost = "the episode is" if episode is not None else "episodes that fail it are"
+            if check == "metadata" and episode is None:
+                lost = "it goes unchecked and no episode is"
+            message += f". With relax=[{check!r}] (--relax {check}) {lost} left out"
         super().__init__(f"{place}: {message}" if place else message)
 
 

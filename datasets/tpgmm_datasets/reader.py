@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from inspect import signature
 from pathlib import Path
@@ -28,12 +28,19 @@ from tpgmm_datasets.lerobot.event_flags import event_features
 from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout, open_layout
 from tpgmm_datasets.lerobot.statistics import stated_range
-from tpgmm_datasets.units import Unit, Units
+from tpgmm_datasets.units import Scale, Unit, Units, fits
 from tpgmm_torch.checks.report import Report
 from tpgmm_torch.data.demonstrations import Demonstration, check_robot
 from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["Recording", "iter_lerobot", "load_lerobot", "open_recording"]
+
+#: What helps where values in a unit of their own are out of range.
+RAW = (
+    "They are 'raw', and robot.unlimited([...]) has no limits for them; or units='lerobot', "
+    "where a gripper's 0 to 100 are its limits"
+)
 
 
 @dataclass(frozen=True)
@@ -109,12 +116,24 @@ class Recording:
         summaries = [RecordingSummary.of(one) for one in self.demonstrations(check=False)]
         return self._report(summaries)
 
+    def unlimited(self) -> Recording:
+        """The same for a robot that knows no limits of "raw" joints."""
+        robot, raw = self.assembly.robot, self.assembly.joints.raw
+        if not raw or not isinstance(robot, Robot):
+            return self
+        return replace(self, assembly=replace(self.assembly, robot=robot.unlimited(raw)))
+
     def _report(self, summaries: Sequence[RecordingSummary]) -> Report:
-        """Findings and doubtful events; values that were declared raw may have any unit."""
-        robot, joints = self.assembly.robot, self.assembly.joints
-        report = check_summaries(summaries, robot if isinstance(robot, Kinematics) else None)
-        raw = {n for n, u in zip(joints.names or (), joints.units, strict=False) if u == "raw"}
-        findings = [f for f in report if f.check != "units" or not set(f.names) <= raw]
+        """Findings and doubtful events."""
+        robot, raw = self.assembly.robot, self.assembly.joints.raw
+        known = robot if isinstance(robot, Kinematics) else None
+        report = check_summaries(summaries, known, raw)
+        findings = [
+            replace(one, remedy=RAW)
+            if {*one.names} <= raw and one.check in ("units", "limits")
+            else one
+            for one in report
+        ]
         doubtful = doubtful_events(self.assembly.doubtful, "episode")
         return Report.of([*findings, *doubtful], report.subject)
 
@@ -197,7 +216,9 @@ def _calibrated(
         message = "the metadata do not name the values: a calibration needs joint_names=[...]"
         raise DatasetError(message, column=feature.key)
     by_name: dict[str, Unit] = {**calibrated_units(calibration, names)}
-    return by_name | dict(units) if isinstance(units, Mapping) else by_name
+    told = {} if isinstance(units, str | Scale) else dict(units)
+    keys = told.keys() - {"*"}
+    return {n: u for n, u in by_name.items() if not any(fits(key, n) for key in keys)} | told
 
 
 def select_episodes(
@@ -281,8 +302,10 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         Names instead of the data set's: all of them in order, or name in the set to name of
         the robot's joint for those that differ.
     units : str, Scale, or mapping of name to these, default="auto"
-        ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is) or a
-        :class:`Scale`, for all values or by name. ``"auto"`` believes the metadata, else
+        ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, ``"raw"`` (taken as it is), ``"lerobot"``
+        (degrees, and a gripper's 0 to 100 as the limits of that joint of the robot, else raw)
+        or a :class:`Scale`, for all values, or by name or pattern: ``{"*": "deg", "*gripper":
+        "raw"}``. Names come first, then later patterns. ``"auto"`` believes the metadata, else
         assumes radians and refuses what cannot be radians.
     calibration : str, Path or mapping of str to these, optional
         LeRobot's calibration file of the robot, for values from -100 to 100 (grippers: 0 to

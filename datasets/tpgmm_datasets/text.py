@@ -89,18 +89,19 @@ def parse_episodes(text: str | None) -> slice | list[int] | str | None:
 def parse_units(texts: Sequence[str]) -> dict[str, Any]:
     """The arguments ``units`` and ``calibration``.
 
-    The texts are one unit for all, or any number of ``JOINT=UNIT``; and ``FILE.json`` or
-    ``PREFIX=FILE.json`` for LeRobot's calibration. Anything else is a DataError.
+    The texts are one unit for all, and any number of ``JOINT=UNIT`` or ``PATTERN=UNIT`` for
+    some; and ``FILE.json`` or ``PREFIX=FILE.json`` for LeRobot's calibration. Anything else is
+    a DataError.
     """
     pairs = [(name, unit) for name, _, unit in (text.rpartition("=") for text in texts)]
     calibration = {name: unit for name, unit in pairs if unit.endswith(".json")}
     named = {name: unit for name, unit in pairs if not unit.endswith(".json")}
     wrong = [text for text in texts if text.startswith("=") or text.endswith("=")]
     if wrong or len(calibration) + len(named) < len(pairs):
-        raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
-    units: Any = named or "auto"
-    if "" in named:
-        units = named[""]
-        if len(named) > 1:
-            raise DataError(f"units are one for all, or JOINT=UNIT for some; got {list(texts)}")
-    return {"units": units, "calibration": calibration or None}
+        raise DataError(
+            "units are one for all, and JOINT=UNIT or PATTERN=UNIT for some, each once; got "
+            f"{list(texts)}"
+        )
+    one = {*named} == {""}
+    units: Any = named[""] if one else {name or "*": unit for name, unit in named.items()}
+    return {"units": units or "auto", "calibration": calibration or None}

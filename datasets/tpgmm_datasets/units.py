@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,9 @@ __all__ = [
     "Units",
     "as_scale",
     "convert",
+    "fits",
     "guess_unit",
+    "units_of",
     "with_pose_units",
 ]
 
@@ -198,9 +201,10 @@ def _check_angles(
         because = f", because {others[0]} and joints have one unit" if others else ""
         raise UnknownUnitsError(
             f"these values are not radians{because}: {', '.join(unsure)}. Say what they are, "
-            "units='deg' or units={name: 'deg', other: Scale.calibrated(...), ...} (in "
-            "commands --units deg, NAME=deg or LeRobot's calibration file; in training "
-            "--policy.units); 'raw' takes them as they are",
+            "units='deg', 'lerobot' (arms in degrees, grippers 0 to 100) or units={'*': 'deg', "
+            "'*gripper': 'raw', name: Scale.calibrated(...), ...} (in commands --units deg, "
+            "--units PATTERN=raw or LeRobot's calibration file; in training --policy.units); "
+            "'raw' takes them as they are",
             column=column,
             **where,
         )
@@ -226,6 +230,73 @@ def as_scale(unit: Unit, column: str) -> Scale:
     if unit == "auto":
         return NAMED["raw"]
     if unit not in NAMED:
-        message = f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'auto', and Scale(...)"
+        message = (
+            f"unit {unit!r} is unknown; there are {sorted(NAMED)}, 'lerobot', 'auto' and Scale"
+        )
         raise DatasetError(message, column=column)
     return NAMED[unit]
+
+
+def fits(pattern: str, *names: str) -> bool:
+    """Whether a name, with or without LeRobot's ``.pos``, is or matches a ``pattern``."""
+    called = {*names, *(name.removesuffix(".pos") for name in names)}
+    return pattern in called or any(fnmatchcase(name, pattern) for name in called)
+
+
+def units_of(
+    units: Units, stored: Sequence[str], final: Sequence[str], robot: Any, column: str
+) -> list[Unit]:
+    """The unit of each value, ``"auto"`` where none is given.
+
+    Names come before patterns, of which later ones come first, and all of them before ``"*"``.
+
+    Parameters
+    ----------
+    units : str, Scale or mapping of str to these
+        For all, or by name or pattern. ``"lerobot"`` stands for degrees, and for a gripper's 0
+        to 100: the limits of that joint where the robot has them, else ``"raw"``.
+    stored, final : sequence of str
+        What the values are called in the data set and by the robot.
+    robot : object with ``joint_names``, or None
+        Its ``lower`` and ``upper`` limits are looked at.
+    column : str
+        Where the values come from.
+
+    Raises
+    ------
+    DatasetError
+        If a name or a pattern fits no value.
+
+    Examples
+    --------
+    >>> units_of({"*": "lerobot", "lift": "mm"}, ("pan", "lift", "jaw.pos"), ("a", "b", "c"),
+    ...          None, "action")
+    ['deg', 'mm', 'raw']
+    """
+    given = units if isinstance(units, Mapping) else {"*": units}
+    chosen: list[Unit] = ["auto"] * len(final)
+    called = list(zip(stored, final, strict=True))
+    unknown = [key for key in given if not any(fits(key, *names) for names in called)]
+    if unknown:
+        there = f"which fit no value; they are called {list(dict.fromkeys(stored))}"
+        raise DatasetError(f"units names {unknown}, {there}", column=column)
+    for key in sorted(given, key=lambda key: 2 if key in {*stored, *final} else key != "*"):
+        for place in (i for i, names in enumerate(called) if fits(key, *names)):
+            chosen[place] = given[key]
+    return [
+        _lerobot(*names, robot) if unit == "lerobot" else unit
+        for names, unit in zip(called, chosen, strict=True)
+    ]
+
+
+def _lerobot(stored: str, name: str, robot: Any) -> Unit:
+    """The unit in which LeRobot's motors say a value."""
+    if not is_gripper(stored) and not is_gripper(name):
+        return "deg"
+    limits = (getattr(robot, key, ()) for key in ("joint_names", "lower", "upper"))
+    low, high = {joint: (float(a), float(b)) for joint, a, b in zip(*limits, strict=False)}.get(
+        name, (0, math.inf)
+    )
+    if math.isinf(high - low):
+        return "raw"
+    return replace(Scale.between((0, 100), (low, high)), stored=(0.0, 100.0))

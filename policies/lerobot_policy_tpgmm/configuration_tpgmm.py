@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +15,11 @@ from lerobot.optim import AdamConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_tpgmm.settings import ControlConfig, EMConfig, FusionConfig, TrainingConfig
-from tpgmm_datasets.bottle.skill import HANDS
 from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.events import parse_event
-from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
+from tpgmm_datasets.robots import parse_robot
 from tpgmm_tools.cli.learning import Choices, parse_parts
-from tpgmm_torch import Hold, Robot, TaskParameterizedGMM
+from tpgmm_torch import Hold, TaskParameterizedGMM
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.exceptions import DataError, TPGMMError
 from tpgmm_torch.operators import Operator
@@ -37,11 +36,6 @@ OLD = (
     "a policy of release 0.1 or 0.2 is not read any more: fit it again, by lerobot-train or "
     "tpgmm fit --format lerobot"
 )
-#: Robots that come with the package: what describes each, and its hands.
-ROBOTS: dict[str, tuple[Callable[[], str], Sequence[str]]] = {
-    "upper_body": (upper_body_urdf, HANDS),
-    "so101": (so101_urdf, ("gripper_frame_link",)),
-}
 
 
 @dataclass
@@ -130,12 +124,14 @@ class TPGMMConfig(StatePolicyConfig):
         For how long before and after a via-point the skill is another [s].
     robot : dict or str, optional
         The description that :func:`tpgmm_torch.persistence.encode` gives, with the text of
-        the URDF in it; to begin with, the path of a URDF or an MJCF, ``"upper_body"`` or
-        ``"so101"``. None for joints alone.
+        the URDF in it; to begin with, the path of a URDF or an MJCF, ``"upper_body"``,
+        ``"so101"``, ``"bi_so101"``, or several robots as
+        :func:`tpgmm_datasets.robots.parse_robot` takes them,
+        ``"left=so101@0,0.2,0;right=so101@0,-0.2,0"``. None for joints alone.
     links, joints, coordinates : list of str, optional
-        For a robot given by its path, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links of
-        ``"upper_body"`` and ``"so101"`` are their hands if none are named. Joints may be
-        patterns, and one text with commas: ``"left_*,waist_yaw"``.
+        For a robot given so, as for :meth:`tpgmm_torch.Robot.from_urdf`; the links are by
+        default those that carry grippers. Joints may be patterns, and one text with commas:
+        ``"left_*,waist_yaw"``.
     state_names, action_names, environment_names : list of str, optional
         What the entries of ``observation.state``, ``action`` and
         ``observation.environment_state`` are, in the order in which they come and go. Joints
@@ -143,9 +139,10 @@ class TPGMMConfig(StatePolicyConfig):
         the data set: LeRobot gives a policy neither.
     units : str or dict, optional
         Unit of the joints in states and actions: ``"rad"``, ``"deg"``, ``"m"``, ``"mm"``, or
-        ``[factor, offset]`` that bring a value to radians; for all, or by name; to begin with,
-        the path of LeRobot's calibration file, ``"arm.json"``. By default what the data set
-        declares, else radians (and metres).
+        ``"raw"``, ``"lerobot"`` (arms in degrees, grippers 0 to 100) or ``[factor, offset]``
+        that bring a value to radians; for all, or by name or pattern, ``{"*": "deg",
+        "*gripper": "raw"}``; to begin with, the path of LeRobot's calibration file,
+        ``"arm.json"``. By default what the data set declares, else radians (and metres).
     frames : dict of str to list, optional
         Where the seven values x y z qw qx qy qz of each frame are: positions in
         ``observation.environment_state``, or names of entries of it or of
@@ -260,14 +257,11 @@ class TPGMMConfig(StatePolicyConfig):
         """The robot that ``robot`` describes, None for joints alone."""
         if self.robot is None or isinstance(self.robot, dict):
             return None if self.robot is None else decode(self.robot)
-        urdf, links = self.robot, self.links
-        if urdf in ROBOTS:
-            described, hands = ROBOTS[urdf]
-            urdf, links = described(), links or list(hands)
         joints = self.joints
         if isinstance(joints, str):
             joints = [name.strip() for name in joints.split(",")]
-        return Robot.from_file(urdf, links, joints=joints, coordinates=self.coordinates)
+        settings = {"joints": joints, "coordinates": self.coordinates}
+        return parse_robot(self.robot, self.links, **settings)
 
     def decoded_operators(self) -> list[Operator] | None:
         """The operators that ``operators`` describes; None if they are not given.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -11,13 +11,16 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.lerobot.calibration import calibrated_units
 from tpgmm_datasets.names import pose_groups, value_names
+from tpgmm_tools.cli.learning import asked_operators
 from tpgmm_torch.exceptions import DataError, UnknownNameError
 from tpgmm_torch.operators import Operator
-from tpgmm_torch.operators.text import default_operators
+from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.robots import Kinematics
 from tpgmm_torch.robots.joint_space import JointSpace
 
 __all__ = ["adopt", "check_dataset"]
+
+log = logging.getLogger(__name__)
 
 NAMES = {OBS_STATE: "state_names", ACTION: "action_names", OBS_ENV_STATE: "environment_names"}
 
@@ -55,16 +58,12 @@ def adopt(config: TPGMMConfig, dataset: Any) -> tuple[Kinematics, list[Operator]
     if kinematics is None:
         size = dataset.features[OBS_STATE]["shape"][0]
         kinematics = JointSpace(config.state_names or [f"joint_{i}" for i in range(size)])
-        if OBS_ENV_STATE in dataset.features:
-            logging.getLogger(__name__).warning(
-                "without a robot the policy learns the joints alone, wherever the objects of "
-                f"{OBS_ENV_STATE} are: --policy.robot=URDF --policy.links='[...]' describes one"
-            )
     _check_links(config, kinematics)
-    operators = config.decoded_operators()
-    if operators is None:
-        frames = _frames(config) if kinematics.links else []
-        operators = default_operators(kinematics.links, frames)
+    given = config.decoded_operators() or ()
+    frames = _frames(config, kinematics, given)
+    operators = asked_operators(given, kinematics, frames)
+    log.info("joints %s, links %s, frames %s", kinematics.joint_names, kinematics.links, frames)
+    log.info("units %s, operators %s", config.units, list(map(format_operator, operators)))
     return kinematics, operators
 
 
@@ -126,12 +125,14 @@ def _units(features: Mapping[str, Any]) -> dict[str, list[float] | str]:
     return units
 
 
-def _frames(config: TPGMMConfig) -> list[str]:
-    """The frames that there are, for operators that nobody named."""
+def _frames(config: TPGMMConfig, kinematics: Kinematics, given: Sequence[Any]) -> list[str]:
+    """The frames that there are."""
     if config.frames:
         return list(dict.fromkeys((*config.frames, *config.training.link_frames)))
     groups = pose_groups(config.environment_names) if config.environment_names else {}
     if not groups and config.env_state_feature is not None:
+        if given or not kinematics.links:
+            return [OBS_ENV_STATE]
         raise DataError(
             f"the names of {OBS_ENV_STATE} tell of no pose: name the frames, "
             """--policy.frames='{"bottle": [0, 1, 2, 3, 4, 5, 6]}'"""

@@ -48,7 +48,7 @@ from tpgmm_torch.operators import Operator
 from tpgmm_torch.operators.base import frame_names
 from tpgmm_torch.operators.text import format_operator
 from tpgmm_torch.persistence import decode, encode
-from tpgmm_torch.robots import Kinematics
+from tpgmm_torch.robots import Kinematics, Robot
 from tpgmm_torch.skills.skill import Skill
 from tpgmm_torch.skills.via_points import ViaPoints
 
@@ -170,7 +170,10 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._check_size("state_names", state_names, config.robot_state_feature)
         action_names = config.action_names or names
         self._check_size("action_names", action_names, config.action_feature)
-        self.joints = JointFeatures(names, state_names, action_names, config.units)
+        every = state_names, action_names, config.units
+        self.joints = JointFeatures(names, *every, self.kinematics)
+        if dataset_meta is not None and isinstance(self.kinematics, Robot):
+            self.kinematics = self.kinematics.unlimited(self.joints.raw)
         environment = config.env_state_feature
         width = environment.shape[0] if environment else None
         named = config.environment_names, state_names
@@ -523,6 +526,8 @@ class TPGMMPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _check_start(self, start: Tensor, wanted: Tensor) -> None:
         """Refuse to move robots that stand far from where the skill begins."""
         largest, gap = self.config.control.largest_start_gap, (wanted - start).abs()
+        if known := {*self.kinematics.angles, *self.kinematics.lengths}:
+            gap[..., [i for i in range(gap.shape[-1]) if i not in known]] = 0  # of any unit
         if largest is None or not bool((gap > largest).any()):
             return
         row, joint = divmod(int(gap.argmax()), gap.shape[-1])

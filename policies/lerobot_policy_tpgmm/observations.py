@@ -16,10 +16,11 @@ from torch import Tensor, nn
 
 from lerobot_policy_tpgmm.configuration_tpgmm import TPGMMConfig
 from tpgmm_datasets.names import match_names, pose_groups
-from tpgmm_datasets.units import Scale, as_scale
+from tpgmm_datasets.units import Scale, Units, as_scale, units_of
 from tpgmm_torch import Frame
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.robots import Kinematics
 
 __all__ = [
     "CONTROL_RATE", "FrameFeatures", "JointFeatures", "check_rate", "observed_frames",
@@ -50,6 +51,13 @@ class JointFeatures(nn.Module):
         Of the entries of the action, each of which must be a joint.
     units : str, mapping or None
         As in :class:`TPGMMConfig`; by the name of an entry or of a joint.
+    robot : Kinematics, optional
+        Whose limits grippers in LeRobot's units have.
+
+    Attributes
+    ----------
+    raw : set of str
+        Joints in a unit of their own.
 
     Raises
     ------
@@ -68,6 +76,7 @@ class JointFeatures(nn.Module):
         state_names: Sequence[str],
         action_names: Sequence[str],
         units: Mapping[str, Sequence[float] | str] | str | None,
+        robot: Kinematics | None = None,
     ) -> None:
         super().__init__()
         self.joint_names = tuple(joint_names)
@@ -82,12 +91,15 @@ class JointFeatures(nn.Module):
                 "the URDF, like a gripper, is in --policy.coordinates), or make a set without "
                 "them: tpgmm dataset convert SET NEW --robot ROBOT --robot-joint PATTERN"
             )
-        names = {*state_names, *action_names, *joint_names}
-        if isinstance(units, Mapping) and (unknown := sorted(set(units) - names)):
-            raise DataError(f"units are given for {unknown}; the joints are {sorted(names)}")
         entry = {joint: name for name, joint in in_state.items()}
-        state = [_scale(units, entry[joint], joint) for joint in joint_names]
-        action = [_scale(units, name, in_action[name]) for name in action_names]
+        called = [in_state.get(name, name) for name in state_names]
+        called += [in_action[name] for name in action_names]
+        every = *state_names, *action_names
+        told = units_of(_scales(units), every, called, robot, OBS_STATE)
+        self.raw = {name for name, unit in zip(called, told, strict=True) if unit == "raw"}
+        scales = [as_scale(unit, name) for name, unit in zip(every, told, strict=True)]
+        state = [scales[every.index(entry[joint])] for joint in joint_names]
+        action = scales[len(state_names) :]
         buffers = {
             "columns": torch.tensor([self.state_names.index(entry[j]) for j in joint_names]),
             "order": torch.tensor([self.joint_names.index(in_action[n]) for n in action_names]),
@@ -262,15 +274,17 @@ def observed_frames(
     return [name for name in required if name not in start or name in placed]
 
 
-def _scale(units: Any, name: str, joint: str) -> Scale:
-    unit = units or "rad"
-    if isinstance(units, Mapping):
-        unit = units.get(name, units.get(joint, "rad"))
-    if not isinstance(unit, str):
-        if len(unit) != 2 or not unit[0] or not all(map(math.isfinite, unit)):
+def _scales(units: Any) -> Units:
+    """Units as they are in a configuration, ``[factor, offset]`` among them."""
+    if not isinstance(units, Mapping):
+        return units or "auto"
+    for name, unit in units.items():
+        numbers = isinstance(unit, str) or (
+            len(unit) == 2 and unit[0] and all(map(math.isfinite, unit))
+        )
+        if not numbers:
             raise DataError(f"the unit of {name!r} is a name or [factor, offset], got {unit!r}")
-        unit = Scale(*unit)
-    return as_scale(unit, name)
+    return {n: unit if isinstance(unit, str) else Scale(*unit) for n, unit in units.items()}
 
 
 def poses_named(names: Sequence[str] | None) -> dict[str, list[int]]:

@@ -13,7 +13,7 @@ from lerobot_policy_tpgmm.dataset_contract import adopt
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
 from tests.support.lerobot_metadata import dataset
 from tests.support.policies import ENVIRONMENT, STATE, fitted
-from tpgmm_datasets.robots import upper_body_urdf
+from tpgmm_datasets.robots import parse_robot, upper_body_urdf
 from tpgmm_datasets.units import Scale
 from tpgmm_torch import Canonical, Robot
 from tpgmm_torch.exceptions import DataError
@@ -21,6 +21,7 @@ from tpgmm_torch.robots.joint_space import JointSpace
 
 NAMES = fitted().kinematics.joint_names
 POSE = [f"bottle.{part}" for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+JOINTS = {"operators": ["canonical"]}
 UPPER_BODY = {"robot": "upper_body", "links": ["l_hand", "r_hand"]}
 
 
@@ -76,7 +77,7 @@ def test_joints_alone_need_no_robot():
     [
         (UPPER_BODY, environment(None), r"tell of no pose: name the frames, --policy.frames="),
         ({"fps": 50.0}, {}, "20 steps per second, the policy was made for 50: resample it"),
-        ({"state_names": ["a", "b"]}, {}, r"state_names are \['a', 'b'\], 2 entries"),
+        (JOINTS | {"state_names": ["a", "b"]}, {}, r"state_names are \['a', 'b'\], 2 entries"),
         ({"robot": "no.urdf", "links": ["hand"]}, {}, "no.urdf"),
     ],
 )
@@ -84,6 +85,26 @@ def test_what_does_not_fit_a_data_set_is_refused(options, features, message):
     made = config(**options)
     with pytest.raises((DataError, OSError), match=message):
         TPGMMPolicy(made, dataset_meta=dataset(20, **features))
+
+
+@pytest.mark.parametrize("robot", [None, {"robot": "{folder}/body.urdf"}])
+def test_objects_are_forgotten_only_if_that_is_asked_for(robot, tmp_path):
+    (tmp_path / "body.urdf").write_text(upper_body_urdf().replace("_hand", "_end"))
+    given = {key: text.format(folder=tmp_path) for key, text in (robot or {}).items()}
+    for names in (POSE, None):
+        data = dataset(20, **environment(names))
+        with pytest.raises(DataError, match=r"\['(bottle|observation.environment_state)'\] wo"):
+            adopt(config(**given), data)
+        assert adopt(config(**given, **JOINTS), data)[1] == [Canonical()]
+    with pytest.raises(DataError, match=r"--link \(--policy.links\) of .*'l_end'"):
+        adopt(config(robot=str(tmp_path / "body.urdf")), dataset(20, **environment(POSE)))
+
+
+def test_several_robots_are_one_text():
+    text = "left=so101@0,0.2,0;right=so101@0,-0.2,0"
+    for given in (text, "bi_so101"):
+        made = draccus.parse(TPGMMConfig, args=[f"--robot={given}", "--device=cpu"])
+        assert made.robot == given and made.kinematics() == parse_robot("bi_so101")
 
 
 @pytest.mark.parametrize("joints", ["l_*, waist_yaw", ["l_*", "waist_yaw"], "l_*,waist_yaw"])

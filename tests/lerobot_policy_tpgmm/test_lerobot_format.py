@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lerobot_policy_tpgmm.modeling_tpgmm import TPGMMPolicy
-from tests.support.command_line import output, refusal
+from tests.support.command_line import output, run
 from tests.support.lerobot_commands import lerobot
 from tests.support.policies import STATE, act, batch, changed, fitted, pose, situations
 from tests.support.skills import bottle_demonstrations, generator, small_bottle
@@ -67,7 +67,7 @@ def test_a_data_set_in_degrees_makes_a_policy_in_degrees(tmp_path):
     first = act(policy, observed, 1)[:, 0]
     torch.testing.assert_close(first, observed[STATE], rtol=0, atol=1e-3)
     (tmp_path / "policy" / "config.json").write_text("{}")
-    assert "exists and is not a tpgmm policy" in refusal(*arguments, tmp_path / "policy")
+    assert "exists and is not a tpgmm policy" in run(*arguments, tmp_path / "policy").stderr
 
 
 def test_lerobot_eval_runs_it(directory, tmp_path):

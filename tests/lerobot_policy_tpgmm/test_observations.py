@@ -38,6 +38,9 @@ def test_units_are_converted_both_ways():
     torch.testing.assert_close(joints, torch.tensor([[torch.pi / 2, 0.4, 0.25]]).double())
     torch.testing.assert_close(made.action(joints), torch.tensor([[90.0, 20.0, 250.0]]))
     torch.testing.assert_close(made.targets(made.action(joints)), joints)
+    patterns = features({"*": "deg", "b*": "raw"})
+    assert patterns.raw == {"b"}
+    assert patterns.scale[:, 0].tolist() == [torch.pi / 180, 1, torch.pi / 180]
     assert features("deg").action(torch.tensor([[torch.pi] * 3])).tolist() == [[180.0] * 3]
 
 
@@ -51,7 +54,7 @@ def test_units_are_converted_both_ways():
         ({"state": ("a", "b", "c", "c_joint")}, None),
         ({"state": ("a", "b", "c.pos", "c_joint")}, "'c' fits several values"),
         ({"units": "turns"}, "unit 'turns' is unknown"),
-        ({"units": {"d": "deg"}}, r"units are given for \['d'\]; the joints are"),
+        ({"units": {"d": "deg"}}, r"units names \['d'\], .* called \['a', 'b', 'c'\]"),
         ({"units": {"a": [1.0]}}, r"\[factor, offset\], got \[1.0\]"),
         ({"units": {"a": [0.0, 1.0]}}, r"\[factor, offset\]"),
     ],

@@ -20,6 +20,7 @@ from tests.support.skills import bottle_demonstrations, bottle_model, thinned
 from tests.support.worlds import upper_body
 from tpgmm_datasets import FramePose, LinkPose, Scale, check, load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
+from tpgmm_datasets.robots import parse_robot
 from tpgmm_datasets.tables import (
     demonstrations_from_frame,
     demonstrations_to_frame,
@@ -39,7 +40,7 @@ from tpgmm_torch.data.pose_names import POSE_PARTS
 from tpgmm_torch.persistence import load_model
 from tpgmm_torch.robots import Poses
 
-__all__ = ["MISTAKES", "Mistake"]
+__all__ = ["MISTAKES", "Mistake", "written_arms"]
 
 DEGREES = 180 / math.pi
 
@@ -848,3 +849,95 @@ def a_model_that_was_edited(folder):
 @mistake("files", r"robot\.urdf")
 def a_robot_that_is_not_there(folder):
     Robot.from_urdf(folder / "robot.urdf", ["hand"])
+
+
+@cache
+def two_arms() -> tuple[Demonstration, ...]:
+    """Two SO-101 arms that go to a cup, in LeRobot's units."""
+    robot = parse_robot("bi_so101")
+    share = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None]
+    found = []
+    for n in range(5):
+        goal = 0.1 * torch.arange(12) - 0.5 + 0.02 * n
+        path = torch.rad2deg(share * goal)
+        path[:, [5, 11]] = 90 - 80 * share - n
+        cup = robot.state(goal).position("left_gripper_frame_link")
+        names = [f"{name}.pos" for name in robot.joint_names]
+        found.append(Demonstration(np.arange(40) / 20, path, {"cup": Frame(cup)}, names))
+    return tuple(found)
+
+
+def written_arms(folder, change=lambda item: item):
+    """The two arms as a stored set that says nothing of units."""
+    shown = [change(item) for item in two_arms()]
+    raw = dict.fromkeys(shown[0].joint_names, "raw")
+    root = save_lerobot(shown, folder / "arms", fps=20, task="take the cup", units=raw)
+    sets.undeclared(root, 1.0)
+    return root
+
+
+def recorded(folder, change=lambda item: item, **options):
+    root = written_arms(folder, change)
+    robot = options.pop("robot", "bi_so101")
+    return load_lerobot(root, robot=parse_robot(robot), **options)
+
+
+@mistake("units", r"not radians.*'lerobot'")
+def arms_in_lerobots_units_that_nobody_said(folder):
+    recorded(folder)
+
+
+@mistake("units", r"'left_gripper.pos' goes from .* normalised to 0 \.\.\. 100.*degrees")
+def grippers_beyond_their_hundred(folder):
+    recorded(folder, joints(1.6, 5), units="lerobot")
+
+
+@mistake("units", r"units: .*cannot be: 'left_gripper' .*'raw'.*unlimited.*'lerobot'")
+def raw_grippers_of_a_robot_with_limits(folder):
+    recorded(folder, units={"*": "deg", "*gripper": "raw"})
+
+
+@mistake("units", r"units names \['\*griper'\], which fit no value")
+def a_pattern_that_is_misspelt(folder):
+    recorded(folder, units={"*": "deg", "*griper": "raw"})
+
+
+@mistake("robots", r"20 m apart: are poses in metres, or in centimetres")
+def bases_in_centimetres(_):
+    parse_robot("left=so101@0,20,0;right=so101@0,0,0")
+
+
+def cups_at(place):
+    return lambda item: replace(item, frames={"cup": Frame(place(item.frames["cup"].position))})
+
+
+@mistake("robots", r"distance: .*'cup'.*frame of 'left_base_link', one would come to 0.00 m")
+def poses_seen_from_the_left_arm(folder):
+    seen = cups_at(lambda at: at - torch.tensor([0, 0.2, 0]))
+    recorded(folder, seen, robot="left=so101@0,2,0;right=so101@0,-1,0", units="lerobot")
+
+
+@mistake("robots", r"distance: none of the links .* nearer than 1.\d\d m to one of .*'cup'")
+def an_object_that_no_hand_comes_near(folder):
+    recorded(folder, cups_at(lambda _: [2.0, 1.0, 0.0]), units="lerobot")
+
+
+@mistake("robots", r"the pose of 'left' is a Frame, x y z in metres")
+def a_base_of_two_numbers(_):
+    arm = parse_robot("so101")
+    Robot.combine({"left": [0.0, 0.2]}, left=arm, right=arm)
+
+
+@mistake("robots", r"robot 'right=so101' is not NAME=FILE@X,Y,Z")
+def an_arm_that_is_nowhere(_):
+    parse_robot(["left=so101@0,0.2,0", "right=so101"])
+
+
+@mistake("robots", r"robot 'a=so101@0,1,0' is there twice")
+def two_arms_of_one_name(_):
+    parse_robot(["a=so101@0,0,0", "a=so101@0,1,0"])
+
+
+@mistake("robots", r"robot 'a=so101@0,0,0,90' is not .*YAW \(radians\)")
+def a_base_that_is_turned_by_degrees(_):
+    parse_robot("a=so101@0,0,0,90")

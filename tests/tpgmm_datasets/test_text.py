@@ -27,6 +27,7 @@ def test_episodes_units_and_frames_are_read_from_text():
         "units": {"gripper": "raw"},
         "calibration": {"": "arm.json"},
     }
+    assert parse_units(["deg", "*gripper=raw"])["units"] == {"*": "deg", "*gripper": "raw"}
     two = ["left_=l.json", "right_=r.json"]
     assert parse_units(two)["calibration"] == {"left_": "l.json", "right_": "r.json"}
     frames = parse_frames(["a", "b=poses", "c=poses[7:14]", "d=hand@close"])
@@ -76,7 +77,7 @@ def test_an_event_that_is_none_is_refused(texts, told):
         parse_events(texts)
 
 
-@pytest.mark.parametrize("texts", [["deg", "rad"], ["deg", "a=rad"], ["a="], ["=deg"]])
-def test_units_for_all_and_for_some_do_not_mix(texts):
+@pytest.mark.parametrize("texts", [["deg", "rad"], ["a=deg", "a=rad"], ["a="], ["=deg"]])
+def test_units_are_given_once(texts):
     with pytest.raises(DataError, match="units are one for all"):
         parse_units(texts)

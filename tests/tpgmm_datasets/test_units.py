@@ -16,7 +16,8 @@ from tests.support.lerobot_sets import (
     undeclared,
 )
 from tpgmm_datasets import DatasetError, Scale, load_lerobot
-from tpgmm_datasets.units import guess_unit, with_pose_units
+from tpgmm_datasets.robots import parse_robot
+from tpgmm_datasets.units import as_scale, guess_unit, units_of, with_pose_units
 
 
 def test_declared_units_are_believed(root):
@@ -100,3 +101,31 @@ def test_values_of_poses_have_the_units_of_poses():
     assert with_pose_units(names, ["deg"] * 8) == units
     assert with_pose_units(names[:-1], ["deg"] * 7) == ("deg",) * 7
     assert with_pose_units(None, ["deg"]) == ("deg",)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_names_come_before_patterns_and_these_before_the_default(order):
+    units = [("left_gripper.pos", "mm"), ("*", "deg"), ("lift", "m")][::order]
+    given = dict([*units, ("*gripper", "rad"), ("left_*", "raw")])
+    stored = ("left_gripper.pos", "left_elbow.pos", "right_gripper", "wrist", "up")
+    final = ("left_gripper", "left_elbow", "right_gripper", "wrist", "lift")
+    told = units_of(given, stored, final, None, "")
+    assert told == ["mm", "raw", "rad", "deg", "m"]
+    assert units_of({"*elbow": "deg"}, stored, final, None, "")[1:3] == ["deg", "auto"]
+
+
+def test_lerobots_units_are_degrees_and_a_grippers_range():
+    robot = parse_robot("bi_so101")
+    stored = [f"{name}.pos" for name in robot.joint_names]
+    known = units_of("lerobot", stored, robot.joint_names, robot, "")
+    for name, unit, low, high in zip(stored, known, robot.lower, robot.upper, strict=True):
+        scale, ends = as_scale(unit, ""), (float(low), float(high))
+        if "gripper" in name:
+            reached = [scale.factor * x + scale.offset for x in (0, 100)]
+            assert reached == pytest.approx(ends) and scale.stored == (0, 100)
+        else:
+            assert unit == "deg"
+    free = robot.unlimited(["left_gripper", "right_gripper"])
+    for other in (None, free, parse_robot("so101")):  # no limits of that joint are known
+        told = units_of("lerobot", stored, robot.joint_names, other, "")
+        assert told == ["raw" if "gripper" in name else "deg" for name in stored]

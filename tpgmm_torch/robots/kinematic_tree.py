@@ -13,7 +13,7 @@ import numpy as np
 
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.exceptions import DataError
-from tpgmm_torch.robots.urdf import FREEDOMS, UrdfJoint, UrdfModel, motion
+from tpgmm_torch.robots.urdf import FREEDOMS, Mimic, UrdfJoint, UrdfModel, motion
 
 __all__ = ["Body", "reduce"]
 
@@ -75,7 +75,8 @@ def reduce(
     Raises
     ------
     DataError
-        If a joint of several degrees of freedom lies between the base and a link.
+        If a joint of several degrees of freedom lies between the base and a link, or one of
+        which nothing is known.
     """
     bodies = [Body(0, np.eye(4))]
     places = {base: (0, np.eye(4))}  # of each link, the body that it is fixed to, and where
@@ -96,10 +97,20 @@ def reduce(
                 bodies.append(Body(carrier, pose @ before @ turn, *follow))
                 places[far] = len(bodies) - 1, turn.T @ after
             else:
-                at = leader.multiplier * locked[leader.joint] + leader.offset if leader else 0.0
+                at = _standing(leader, locked, link) if leader else 0.0
                 places[far] = carrier, pose @ before @ motion(joint.type, axis, at) @ after
     ends = [(places[link], pose) for link, pose in links]
     return (*bodies, *(Body(carrier, place @ pose) for (carrier, place), pose in ends))
+
+
+def _standing(leader: Mimic, locked: Mapping[str, float], link: str) -> float:
+    """Where a joint stands that is not in the joint vector."""
+    if leader.joint not in locked:
+        raise DataError(
+            f"joint {leader.joint!r} moves link {link!r}: it is measured in radians (or "
+            "metres), and cannot be a coordinate in a unit of its own"
+        )
+    return leader.multiplier * locked[leader.joint] + leader.offset
 
 
 def _steps_from(model: UrdfModel, base: str) -> dict[str, tuple[UrdfJoint, str]]:

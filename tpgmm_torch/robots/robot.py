@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 import math
 import os
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any, Self
 from xml.etree import ElementTree
 
@@ -15,9 +17,10 @@ import torch
 from torch import Tensor
 
 from tpgmm_torch import quaternions
+from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.arrays import Array, as_tensor
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, TPGMMError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots.chains import chain_to_urdf
 from tpgmm_torch.robots.forward_kinematics import TreeKinematics
 from tpgmm_torch.robots.kinematic_tree import reduce
@@ -38,6 +41,8 @@ __all__ = ["Kinematics", "Robot", "RobotState"]
 
 #: A joint vector or a chain longer than this is no robot's, and Jacobians grow with its square.
 MOST_JOINTS = 1000
+#: No robots that work together stand further apart [m].
+FARTHEST_BASES = 5.0
 
 
 class Robot(Described):
@@ -78,8 +83,9 @@ class Robot(Described):
             Where joints stand that are not in the joint vector [rad or m], 0 by default. A
             pattern stands for those that are neither named beside it nor in ``joints``.
         coordinates : sequence of str, default=()
-            Members of the joint vector without kinematics, like a gripper's opening. They
-            follow the joints unless ``joints`` names them.
+            Members of the joint vector without kinematics, like a gripper's opening, in a
+            unit of their own and without limits. They follow the joints unless ``joints``
+            names them, or they are joints of the URDF, which may move none of the links.
         base : str, optional
             The link in whose frame everything is expressed; it may itself be moved by
             joints. The default is the root.
@@ -108,8 +114,6 @@ class Robot(Described):
         """
         model = read_urdf(urdf)
         extra = _names("coordinates", coordinates)
-        for name in model.joint.keys() & extra:
-            raise DataError(f"{name!r} is a joint of the URDF: it cannot be a coordinate too")
         chosen = [joints] if isinstance(joints, str) else joints
         columns, fixed = _joint_vector(model, chosen, extra, locked or {})
         config = {
@@ -210,9 +214,9 @@ class Robot(Described):
     @classmethod
     def combine(
         cls,
-        poses: Mapping[str, Frame] | None = None,
+        poses: Mapping[str, Any] | None = None,
         *,
-        fixed: Mapping[str, Frame] | None = None,
+        fixed: Mapping[str, Any] | None = None,
         base: str = "world",
         **robots: Robot,
     ) -> Self:
@@ -222,8 +226,10 @@ class Robot(Described):
         ----------
         poses : mapping of str to Frame, optional
             Where the base of each robot is in the common frame, ``world``; there by default.
+            Also three numbers, a position [m], or seven, with a quaternion (w, x, y, z).
         fixed : mapping of str to Frame, optional
-            Links that stand still in the common frame, like a table between the robots.
+            Links that stand still in the common frame, like a table between the robots;
+            written likewise.
         base : str, default="world"
             The link in whose frame everything is expressed: ``world``, one of ``fixed``, or
             any other.
@@ -236,9 +242,14 @@ class Robot(Described):
         ------
         DataError
             If there is no robot, one was not made by this class, its base is moved by its own
-            joints, or names collide.
+            joints, names collide, or a pose is none.
         UnknownNameError
             If ``poses`` names no robot, or ``base`` no link.
+
+        Warns
+        -----
+        PlausibilityWarning
+            If bases are more than 5 m apart.
 
         Examples
         --------
@@ -247,7 +258,7 @@ class Robot(Described):
         ... <axis xyz="0 0 1"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
         ... </robot>'''
         >>> arm = Robot.from_urdf(urdf, links=["hand"])
-        >>> both = Robot.combine(left=arm, right=arm, poses={"left": Frame([0.0, 0.5, 0.0])})
+        >>> both = Robot.combine(left=arm, right=arm, poses={"left": [0.0, 0.5, 0.0]})
         >>> both.joint_names, both.links
         (('left_lift', 'right_lift'), ('left_hand', 'right_hand'))
         >>> both.state([0.1, 0.2]).positions.tolist()
@@ -257,10 +268,10 @@ class Robot(Described):
             raise DataError(f"combine takes robots by name, left=Robot..., got {robots!r}")
         for name in set(poses or ()) - set(robots):
             raise UnknownNameError("robot", name, "the robots to combine", robots)
-        roots = dict(fixed or {})
+        roots, places = _poses(fixed or {}, fixed or ()), _poses(poses or {}, robots)
+        _check_bases(places)
         for name, robot in robots.items():
-            place = (poses or {}).get(name, Frame([0.0, 0.0, 0.0])).to(torch.float64)
-            roots[f"{name}_{robot.model.root}"] = place.compose(robot._root())
+            roots[f"{name}_{robot.model.root}"] = places[name].compose(robot._root())
         options: dict[str, Any] = _side_by_side(robots)
         first = next(iter(robots.values())).lower
         options |= {"base": base, "dtype": first.dtype, "device": first.device}
@@ -274,17 +285,18 @@ class Robot(Described):
         self.model = model
         self.joint_names = tuple(config["joints"])
         self.links = tuple(config["links"])
-        column = {name: i for i, name in enumerate(self.joint_names) if name in model.joint}
+        own = model.joint.keys() - config["coordinates"]
+        column = {name: i for i, name in enumerate(self.joint_names) if name in own}
         self.lengths = tuple(
             i for name, i in column.items() if model.joint[name].type == "prismatic"
         )
         self.angles = tuple(i for i in column.values() if i not in self.lengths)
         #: Bodies that move the links with respect to the base, these last; see ``reduce``.
         self.tree = reduce(model, *_wanted(model, config), column, config["locked"])
-        moving = len(self.tree) - len(self.links) - 1
-        if max(self.n_joints, moving) > MOST_JOINTS:
+        between = len(self.tree) - len(self.links) - 1
+        if max(self.n_joints, between) > MOST_JOINTS:
             raise DataError(
-                f"the robot has {self.n_joints} joints, {moving} of them between its base and "
+                f"the robot has {self.n_joints} joints, {between} of them between its base and "
                 f"links; more than {MOST_JOINTS} are not supported: choose some, "
                 "joints=[...], or lock some, locked={...}"
             )
@@ -292,7 +304,7 @@ class Robot(Described):
         # a robot made while inference mode is on must serve where gradients are wanted, and
         # the library puts some of its constants on the default device
         with torch.inference_mode(False), torch.device("cpu"):
-            limits, self.without_limits = _limits(model, self.joint_names)
+            limits, self.without_limits = _limits(model, self.joint_names, column)
             self.lower, self.upper, self.velocity, self.acceleration, self.jerk = limits.to(
                 **options
             )
@@ -340,6 +352,43 @@ class Robot(Described):
             raise DataError("a robot's configuration holds the text of its URDF, not a path")
         dtype = checked_dtype(config["dtype"])
         return cls.from_urdf(**{**config, "dtype": dtype, "device": device})
+
+    def unlimited(self, names: Collection[str]) -> Self:
+        """The robot with some joints as coordinates: without limits, in any unit ("raw").
+
+        Parameters
+        ----------
+        names : collection of str
+            Of a gripper's joint, for example. Joints that move a link stay what they are.
+        """
+        moving = self.state(torch.zeros(self.n_joints)).jacobians.flatten(0, 1).any(0).tolist()
+        named = zip(self.joint_names, moving, strict=True)
+        more = {name for name, moves in named if name in names and not moves}
+        both = dict.fromkeys((*self._config["coordinates"], *sorted(more)))
+        return self.from_config({**self._config, "coordinates": [*both]}, self.lower.device)
+
+    def save(self, path: str | Path) -> None:
+        """Write the description as a URDF, tools as links of it.
+
+        Which links, joints and base are wanted is not in it; files of shapes are named as they
+        were.
+
+        Parameters
+        ----------
+        path : path or str
+            The file, ``"both.urdf"``.
+
+        Raises
+        ------
+        OSError
+            If it cannot be written.
+        """
+        urdf = parse_xml(self.model.text)
+        for name, (parent, *pose) in self._config["tools"].items():
+            ElementTree.SubElement(urdf, "link", name=name)
+            _mount(urdf, parent, name, Frame(*pose))
+        with replacing(path) as file:
+            ElementTree.ElementTree(urdf).write(file, "utf-8", xml_declaration=True)
 
     def _root(self) -> Frame:
         """Where the root of the description is in the frame of the base, which it must hold."""
@@ -439,6 +488,29 @@ def _tool(name: str, tool: Sequence[Any]) -> list[Any]:
     return [parent, frame.position.tolist(), orientation.tolist()]
 
 
+def _pose(name: str, given: Any) -> Frame:
+    """A pose as it is given to ``combine``."""
+    if isinstance(given, Frame):
+        return given.to(torch.float64)
+    values = as_tensor(given, f"the pose of {name!r}").to(torch.float64)
+    if tuple(values.shape) not in ((3,), (7,)):
+        allowed = "a Frame, x y z in metres, or x y z qw qx qy qz"
+        raise DataError(f"the pose of {name!r} is {allowed}; got {given!r}")
+    return Frame(values[:3], values[3:] if len(values) > 3 else None)
+
+
+def _poses(given: Mapping[str, Any], names: Iterable[str]) -> dict[str, Frame]:
+    return {name: _pose(name, given.get(name, [0, 0, 0])) for name in names}
+
+
+def _check_bases(places: Mapping[str, Frame]) -> None:
+    """Warn of bases that no robots have which work together."""
+    at = torch.stack([place.position for place in places.values()])
+    if (apart := float(torch.cdist(at, at).max())) > FARTHEST_BASES:
+        told = f"bases of {[*places]} are {apart:.4g} m apart: are poses in metres, or in "
+        warnings.warn(f"{told}centimetres?", PlausibilityWarning, stacklevel=3)
+
+
 def _wanted(model: UrdfModel, config: Mapping[str, Any]) -> tuple[str, list[tuple[str, Array]]]:
     """The base, and for each wanted link a link of the URDF and the pose in it."""
     here = np.eye(4)
@@ -465,12 +537,15 @@ def _mounted(
     urdf.extend(ElementTree.Element("link", name=link) for link in ("world", *fixed))
     for name, robot in robots.items():
         urdf.extend(_prefixed(name, robot))
-    taken = [part.get("name", "") for part in urdf]
     for link, frame in roots.items():
-        mount = free_name(f"{link}_mount", taken)
-        joint = UrdfJoint(mount, "fixed", "world", link, _matrix(frame), X_AXIS)
-        urdf.append(joint_element(joint))
+        _mount(urdf, "world", link, frame)
     return ElementTree.tostring(urdf, encoding="unicode")
+
+
+def _mount(urdf: ElementTree.Element, parent: str, link: str, pose: Frame) -> None:
+    """Fix a link to another one."""
+    name = free_name(f"{link}_mount", [part.get("name", "") for part in urdf])
+    urdf.append(joint_element(UrdfJoint(name, "fixed", parent, link, _matrix(pose), X_AXIS)))
 
 
 def _prefixed(prefix: str, robot: Robot) -> list[ElementTree.Element]:
@@ -508,7 +583,9 @@ def _matrix(pose: Frame) -> Array:
     return matrix
 
 
-def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
+def _limits(
+    model: UrdfModel, names: Sequence[str], own: Collection[str]
+) -> tuple[Tensor, tuple[str, ...]]:
     """Rows lower, upper, velocity, acceleration, jerk, and joints that lack a limit.
 
     Joints that mimic another limit it too. Coordinates without kinematics have no limits, and
@@ -516,20 +593,22 @@ def _limits(model: UrdfModel, names: Sequence[str]) -> tuple[Tensor, tuple[str, 
     """
     rows = {name: [-math.inf, *[math.inf] * 4] for name in names}
     without = set()
-    for name in rows.keys() & model.joint.keys():
+    for name in own:
         joint = model.joint[name]
         rows[name] = [joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk]
         endless = joint.type != "continuous" and math.isinf(joint.upper)
         if endless or math.isinf(joint.velocity):
             without.add(name)
     for joint in model.movable.values():
-        if joint.mimic is not None and not _limit_leader(model, joint, rows):
+        if joint.mimic is not None and not _limit_leader(model, joint, rows, own):
             without.add(model.leader(joint.name).joint)
     limits = torch.tensor(list(rows.values()), dtype=torch.float64)
     return limits.reshape(-1, 5).T, tuple(name for name in names if name in without)
 
 
-def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]]) -> bool:
+def _limit_leader(
+    model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[float]], own: Collection[str]
+) -> bool:
     """Apply the limits of a joint that mimics another to that other, which moves with it.
 
     Limits that leave it a single point, as where a sign was forgotten, are none: the answer
@@ -537,9 +616,12 @@ def _limit_leader(model: UrdfModel, joint: UrdfJoint, rows: Mapping[str, list[fl
     """
     try:
         leader = model.leader(joint.name)
-    except TPGMMError:  # raised where it matters: for a link that depends on it
+    except (
+        DataError,
+        UnknownNameError,
+    ):  # raised where it matters: for a link that depends on it
         return True
-    if leader.joint not in rows or leader.multiplier == 0:
+    if leader.joint not in own or leader.multiplier == 0:
         return True
     row, factor = rows[leader.joint], leader.multiplier
     rates = joint.velocity, joint.acceleration, joint.jerk

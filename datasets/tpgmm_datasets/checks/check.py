@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -39,7 +39,11 @@ FEWEST_PATHS = 5
 BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
 
 
-def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = None) -> Report:
+def check(
+    demonstrations: Iterable[Demonstration],
+    robot: Kinematics | None = None,
+    raw: Collection[str] = (),
+) -> Report:
     """Check whether recordings can be what they are taken for; nothing is changed.
 
     Checked are units, limits of position and speed, the order of unnamed joints, wraps, jumps,
@@ -53,6 +57,8 @@ def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = No
         Before or after alignment.
     robot : Kinematics, optional
         Its limits and links tell more.
+    raw : collection of str, default=()
+        Joints in a unit of their own.
 
     Returns
     -------
@@ -77,11 +83,13 @@ def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = No
     """
     check_robot(robot)
     ordered = in_order(check_demonstrations(demonstrations), robot)
-    return check_summaries([RecordingSummary.of(one) for one in ordered], robot)
+    return check_summaries([RecordingSummary.of(one) for one in ordered], robot, raw)
 
 
 def check_summaries(
-    episodes: Sequence[RecordingSummary], robot: Kinematics | None = None
+    episodes: Sequence[RecordingSummary],
+    robot: Kinematics | None = None,
+    raw: Collection[str] = (),
 ) -> Report:
     """The report of :func:`tpgmm_datasets.check` on summaries of recordings.
 
@@ -90,14 +98,15 @@ def check_summaries(
     episodes : sequence of RecordingSummary
         With the joints in the robot's order.
     robot : Kinematics, optional
+    raw : collection of str, default=()
     """
     units = list(unit_findings(episodes, robot))
     findings = [
         *units,
         *_time(episodes),
         *_events(episodes),
-        *joint_findings(episodes, robot),
-        *pose_findings(episodes, {name for found in units for name in found.names}),
+        *joint_findings(episodes, robot, raw),
+        *pose_findings(episodes, {name for found in units for name in found.names}, robot),
         *_copies(episodes),
         *_paths(episodes, robot),
     ]

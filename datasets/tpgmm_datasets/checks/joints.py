@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def quaternion_columns(
 
 
 def joint_findings(
-    episodes: Sequence[RecordingSummary], robot: Kinematics | None
+    episodes: Sequence[RecordingSummary], robot: Kinematics | None, raw: Collection[str]
 ) -> Iterator[Finding]:
     """Units where there are no limits, speeds, wraps, jumps, clipped and stuck values.
 
@@ -45,6 +45,8 @@ def joint_findings(
         With their joints in the robot's order.
     robot : Kinematics, optional
         Whose limits hold.
+    raw : collection of str
+        Joints in a unit of their own, which are no angles.
     """
     low = np.min([episode.low for episode in episodes], axis=0)
     high = np.max([episode.high for episode in episodes], axis=0)
@@ -52,7 +54,11 @@ def joint_findings(
         f"joint {i}" for i in range(len(low))
     )
     quaternion = {i for group in quaternion_columns(names, robot) for i in group}
-    angles = [i for i, name in enumerate(names) if i not in quaternion and not is_gripper(name)]
+    angles = [
+        i
+        for i, name in enumerate(names)
+        if i not in quaternion and name not in raw and not is_gripper(name)
+    ]
     largest = np.maximum(-low, high)
     limits: Array = np.full((2, len(low)), [[-np.inf], [np.inf]])
     if robot is not None:

@@ -12,11 +12,15 @@ from tpgmm_datasets.checks.recording_summaries import RecordingSummary
 from tpgmm_torch import quaternions
 from tpgmm_torch.checks.report import Finding, listed
 from tpgmm_torch.data.arrays import Array, as_array
+from tpgmm_torch.robots.kinematics import Kinematics
+from tpgmm_torch.robots.robot import Robot
 
 __all__ = ["pose_findings"]
 
 #: Objects within this distance [m] or angle [rad] of the usual place are where others are.
 NEAR, ALIKE = 0.15, float(np.deg2rad(60.0))
+#: A hand that handles an object comes so near to its origin [m].
+REACHED = 0.2
 #: A tracker that jumps does so by this [m], at this speed [m/s], so many times its usual steps.
 JUMP, JUMP_SPEED, JUMP_STEPS = 0.1, 5.0, 10.0
 #: Of this many orientations the one that is nearest to the others is the usual one.
@@ -24,16 +28,22 @@ MOST_COMPARED = 500
 
 
 def pose_findings(
-    episodes: Sequence[RecordingSummary], other_units: Collection[str]
+    episodes: Sequence[RecordingSummary],
+    other_units: Collection[str],
+    robot: Kinematics | None = None,
 ) -> Iterator[Finding]:
-    """Quaternion order, lost trackers, jumps, and places unlike the others.
+    """Quaternion order, lost trackers, jumps, places unlike the others or out of reach.
 
     Parameters
     ----------
     episodes : sequence of RecordingSummary
     other_units : collection of str
         Frames whose positions are not in metres: these say nothing more.
+    robot : Kinematics, optional
+        Whose links come near objects.
     """
+    if isinstance(robot, Robot) and robot.links and episodes[0].frames and not other_units:
+        yield from _distance(episodes, robot)
     for name in episodes[0].frames:
         if name not in other_units:
             yield from _places(name, episodes)
@@ -61,6 +71,34 @@ def _places(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding
         remedy = "Was the object tracked, and in the same base frame? Leave the episode out"
         about = tuple(sorted(odd))
         yield Finding("frames", message + listed(places), remedy, (name,), about)
+
+
+def _distance(episodes: Sequence[RecordingSummary], robot: Robot) -> Iterator[Finding]:
+    """Objects that no hand comes near, and the base in whose frame one would."""
+    paths = np.stack([episode.path for episode in episodes])
+    hands = as_array(robot.state(paths).positions)[:, :, None]
+    places = np.array([[one.position for one in e.frames.values()] for e in episodes])
+    root = robot.config()["base"]
+    fixed = (j for j in robot.model.joints if j.type == "fixed" and j.parent == root)
+    bases = {"": np.eye(4)} | {joint.child: joint.origin for joint in fixed}
+    gaps = {}
+    for base, pose in bases.items():
+        there = (places @ pose[:3, :3].T + pose[:3, 3])[:, None, :, None]
+        gaps[base] = float(np.linalg.norm(hands - there, axis=-1).min())
+    best = min(gaps, key=lambda base: gaps[base])
+    if gaps[""] <= REACHED:
+        return
+    message = (
+        f"none of the links {list(robot.links)} comes nearer than {gaps['']:.2f} m to one of "
+        f"the objects {list(episodes[0].frames)}"
+    )
+    remedy = "Are poses in metres, in the robot's base frame, and are these the hands?"
+    if gaps[best] <= REACHED:
+        remedy = (
+            f"If poses were in the frame of {best!r}, one would come to {gaps[best]:.2f} m: "
+            "put that base at the origin (combine: base=...), or convert the poses"
+        )
+    yield Finding("distance", message, remedy, (*episodes[0].frames,), value=gaps[""])
 
 
 def _angles(name: str, episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:

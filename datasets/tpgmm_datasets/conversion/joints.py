@@ -12,7 +12,7 @@ import numpy as np
 from tpgmm_datasets.errors import DatasetError, DatasetWarning
 from tpgmm_datasets.lerobot.layout import Feature, Layout
 from tpgmm_datasets.names import match_names
-from tpgmm_datasets.units import Unit, Units, as_scale, convert
+from tpgmm_datasets.units import Unit, Units, as_scale, convert, units_of
 
 __all__ = ["JointColumns", "joint_feature"]
 
@@ -55,6 +55,12 @@ class JointColumns:
         """
         final = _names(feature, names, robot)
         return cls(feature, final, _units(feature, final, units, robot))
+
+    @property
+    def raw(self) -> set[str]:
+        """Names of the values that are taken as they are."""
+        named = zip(self.names or (), self.units, strict=False)
+        return {name for name, unit in named if unit == "raw"}
 
     def values(self, stored: np.ndarray[Any, Any], **where: Any) -> np.ndarray[Any, Any]:
         """Stored values (T, width) in radians and metres."""
@@ -131,13 +137,7 @@ def _units(
     final = final or _numbered(feature)
     stored = feature.names or final
     declared = feature.units or ("auto",) * feature.width
-    given = units if isinstance(units, Mapping) else dict.fromkeys(final, units)
-    unknown = sorted(set(given) - {*stored, *final})
-    if unknown:
-        raise DatasetError(
-            f"units names {unknown}; the values are called {list(stored)}", column=feature.key
-        )
-    chosen = [given.get(f, given.get(o, "auto")) for o, f in zip(stored, final, strict=True)]
+    chosen = units_of(units, stored, final, robot, feature.key)
     others = [
         f"{name!r} in {declares!r}, not {unit!r}"
         for name, unit, declares in zip(stored, chosen, declared, strict=True)

@@ -202,8 +202,7 @@ class LinkPose:
             message = (
                 f"frame of link {self.link!r}: {error}. Say how to find it, as in "
                 f"events={{{self.event!r}: 'closing:*gripper*'}} or --event "
-                f"{self.event}='closing:*gripper*'; leave episodes without it "
-                "out by relax=['events'] or --episodes"
+                f"{self.event}='closing:*gripper*', or choose --episodes"
             )
             raise DatasetError(message, check="events", **where) from error
 

@@ -1,8 +1,25 @@
-"""Robot descriptions that come with the package."""
+"""Robot descriptions that come with the package, and robots written as text."""
 
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
 from importlib import resources
+from pathlib import Path
+from typing import Any
 
-__all__ = ["so101_urdf", "upper_body_urdf"]
+from tpgmm_torch.data.pose_names import is_gripper
+from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.robots.robot import Robot
+from tpgmm_torch.robots.urdf import UrdfModel
+
+__all__ = ["bi_so101_urdf", "end_links", "parse_robot", "so101_urdf", "upper_body_urdf"]
+
+#: Two arms as LeRobot's ``bi_so_follower`` has them, their bases side by side.
+BI_SO101 = "left=so101@0,0.2,0;right=so101@0,-0.2,0"
+#: How one of several robots is written.
+PART = "NAME=FILE@X,Y,Z (metres), perhaps with ,YAW (radians) or ,QW,QX,QY,QZ behind it"
 
 
 def upper_body_urdf() -> str:
@@ -34,10 +51,120 @@ def so101_urdf() -> str:
 
     Examples
     --------
-    >>> from tpgmm_torch import Frame, Robot
+    >>> from tpgmm_torch import Robot
     >>> arm = Robot.from_urdf(so101_urdf(), links=["gripper_frame_link"])
-    >>> places = {"left": Frame([0.0, 0.2, 0.0]), "right": Frame([0.0, -0.2, 0.0])}
+    >>> places = {"left": [0.0, 0.2, 0.0], "right": [0.0, -0.2, 0.0]}
     >>> Robot.combine(places, left=arm, right=arm).links
     ('left_gripper_frame_link', 'right_gripper_frame_link')
     """
     return resources.files(__name__).joinpath("so101.urdf").read_text(encoding="utf-8")
+
+
+def bi_so101_urdf() -> str:
+    """The URDF of two SO-101 arms, named as LeRobot's ``bi_so_follower`` names its motors.
+
+    The bases are 0.4 m apart in the frame ``world``: the left one at y = 0.2 m, the right one
+    at y = -0.2 m. Where yours stand otherwise, :func:`parse_robot` puts them there.
+
+    Returns
+    -------
+    str
+        The text, as :meth:`tpgmm_torch.Robot.from_urdf` takes it.
+    """
+    return parse_robot(BI_SO101).model.text
+
+
+#: Robots that can be named: what describes each.
+ROBOTS = {"bi_so101": bi_so101_urdf, "so101": so101_urdf, "upper_body": upper_body_urdf}
+
+
+def parse_robot(text: str | Sequence[str], links: Sequence[str] = (), **settings: Any) -> Robot:
+    """The robot that a text stands for.
+
+    Parameters
+    ----------
+    text : str or sequence of str
+        The path of a URDF or an MJCF, the text of one, or ``"so101"``, ``"bi_so101"`` or
+        ``"upper_body"``. Of several robots, in a list or joined by ``;``, each with its name
+        and the place of its base [m]: ``"left=so101@0,0.2,0;right=arm.urdf@0,-0.2,0"``; behind
+        the position perhaps a yaw [rad] or a quaternion (w, x, y, z).
+    links : sequence of str, optional
+        By default the :func:`end_links`.
+    **settings
+        As for :meth:`tpgmm_torch.Robot.from_urdf`.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If the text is none of these, or as for :meth:`tpgmm_torch.Robot.from_urdf`.
+
+    Examples
+    --------
+    >>> parse_robot("bi_so101").links
+    ('left_gripper_frame_link', 'right_gripper_frame_link')
+    """
+    texts = [text] if isinstance(text, str) else list(text)
+    one = len(texts) == 1 and (texts[0].lstrip().startswith("<") or Path(texts[0]).is_file())
+    texts = texts if one else [part.strip() for each in texts for part in each.split(";")]
+    robots: dict[str, Any] = {}
+    places = {}
+    for part in [] if one or (len(texts) == 1 and "=" not in texts[0]) else texts:
+        match = re.fullmatch(r"(?!poses=|fixed=|base=)([A-Za-z]\w*)=(.+)@([^@]+)", part)
+        if match is None or match[1] in robots:
+            twice = "is there twice; one" if match else "is not"
+            raise DataError(f"robot {part!r} {twice} {PART}; got {texts}")
+        places[match[1]], robots[match[1]] = _place(part, match[3]), _robot(match[2])
+    model = (Robot.combine(places, **robots) if robots else _robot(texts[0])).model
+    return Robot.from_urdf(model.text, links or end_links(model), **settings)
+
+
+def _robot(text: str) -> Robot:
+    return Robot.from_file(ROBOTS[text]() if text in ROBOTS else text, ())
+
+
+def _place(part: str, text: str) -> list[float]:
+    """Position and quaternion of a base."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 4, 7) or (len(numbers) == 4 and abs(numbers[3]) > math.tau):
+        raise DataError(f"robot {part!r} is not {PART}")
+    if len(numbers) == 4:
+        yaw = numbers.pop() / 2
+        numbers += [math.cos(yaw), 0.0, 0.0, math.sin(yaw)]
+    return numbers
+
+
+def end_links(model: UrdfModel) -> tuple[str, ...]:
+    """The links of interest that a description tells of; none where it does not.
+
+    What carries a gripper's joints, known by their names, or the one link at the end of what is
+    fixed to it; of the upper body that comes with the package, its hands.
+
+    Parameters
+    ----------
+    model : UrdfModel
+        Of a robot, ``robot.model``.
+
+    Examples
+    --------
+    >>> end_links(parse_robot("so101").model)
+    ('gripper_frame_link',)
+    """
+    above = {joint.child: joint for joint in model.joints}
+    carriers = {joint.parent for joint in model.movable.values() if is_gripper(joint.name)}
+    carriers |= {
+        link for link in model.links if re.fullmatch("(.*_)?(l|r|left|right)_hand", link)
+    }
+    parents, found = {joint.parent for joint in model.joints}, []
+    for carrier in (link for link in model.links if link in carriers):
+        link, fixed = carrier, [carrier]
+        while link in above and (link := above[link].parent) not in carriers:
+            pass
+        if link not in carriers - {carrier}:  # nothing above it carries a gripper
+            for link in fixed:  # which grows
+                fixed += [j.child for j in model.joints if j.parent == link and not j.movable]
+            tips = [link for link in fixed if link not in parents]
+            found.append(tips[0] if len(tips) == 1 else carrier)
+    return tuple(found)

@@ -230,7 +230,7 @@ class Learner:
         demonstrations = self._linked(
             {number: self._demonstration(episodes[number]) for number in numbers}, kinematics
         )
-        check(demonstrations, kinematics).act()
+        check(demonstrations, kinematics, self._joints.raw).act()
         training = config.training
         chosen = aligner(training.alignment, kinematics, training.alignment_features)
         steps = sum(map(len, demonstrations))

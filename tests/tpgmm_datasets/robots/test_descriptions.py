@@ -4,9 +4,11 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-from tpgmm_datasets.robots import so101_urdf
-from tpgmm_torch import Robot, quaternions
+from tests.support.robot_zoo import zoo
+from tpgmm_datasets.robots import bi_so101_urdf, end_links, parse_robot, so101_urdf
+from tpgmm_torch import Frame, Robot, quaternions
 
 ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 
@@ -43,3 +45,31 @@ def test_its_joints_turn_as_they_are_called() -> None:
     rolled, rotation = arm(0, 0, 0, 0, 0.5)
     assert rolled[0] == pytest.approx(straight[0])
     assert rotation[:, 2] == pytest.approx([1, 0, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("joined", [True, False])
+def test_several_robots_are_written_as_text(joined: bool, tmp_path) -> None:
+    (tmp_path / "arm.urdf").write_text(so101_urdf())
+    texts = ["left=so101@0,0.2,0,0.5", f"right={tmp_path}/arm.urdf@0,-0.2,0.1,0,0,0,1"]
+    both = parse_robot(";".join(texts) if joined else texts)
+    alone = parse_robot("so101")
+    turn = [math.cos(0.25), 0, 0, math.sin(0.25)]
+    poses = {"left": Frame([0, 0.2, 0], turn), "right": Frame([0, -0.2, 0.1], [0, 0, 0, 1])}
+    expected = Robot.combine(poses, left=alone, right=alone)
+    assert both.links == expected.links == end_links(both.model)
+    joints = torch.linspace(-1, 1, both.n_joints).double()
+    difference = both.state(joints).positions - expected.state(joints).positions
+    assert float(difference.abs().max()) < 1e-12
+
+
+def test_the_two_arms_are_named_as_lerobot_names_their_motors() -> None:
+    motors = [f"{side}_{name}" for side in ("left", "right") for name in (*ARM, "gripper")]
+    assert list(Robot.from_urdf(bi_so101_urdf(), []).joint_names) == motors
+
+
+def test_hands_are_known_by_their_grippers() -> None:
+    assert end_links(zoo(("tip",)).model) == ("flange",)  # which carries two fingers
+    assert parse_robot("upper_body").links == ("l_hand", "r_hand")
+    assert parse_robot("so101", ["wrist_link"]).links == ("wrist_link",)
+    assert parse_robot(so101_urdf()).links == ("gripper_frame_link",)
+    assert not parse_robot(so101_urdf().replace('"gripper"', '"roll"')).links

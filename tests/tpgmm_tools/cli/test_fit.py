@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from safetensors.torch import load_file
 
-from tests.support.command_line import UPPER_BODY, output, refusal
+from tests.support.command_line import UPPER_BODY, output, refusal, run
+from tests.support.mistakes import written_arms
 from tests.support.skills import waves
 from tpgmm_datasets import save_lerobot
 from tpgmm_torch import Demonstration, Hold
@@ -43,9 +45,11 @@ def test_fit_takes_operators_holds_and_joints_as_text(dataset, tmp_path):
     model = load_model(tmp_path / "model")
     assert [format_operator(operator) for operator in model.operators_] == operators
     assert model.holds_ == (Hold("bottle", "l_hand", 5, 6), Hold("bottle", "l_hand", 7))
-    assert "bottle held" in text
+    assert "held             bottle@l_hand:5.0-6.0, bottle@l_hand:7.0-" in text
     assert all(name.startswith("l_") for name in model.kinematics_.joint_names)
-    output("fit", dataset, *QUICK, "--out", tmp_path / "joints")
+    forgotten = refusal("fit", dataset, *QUICK, "--out", tmp_path / "x")
+    assert "['bottle'] would be forgotten" in forgotten and "--operator canonical" in forgotten
+    output("fit", dataset, *chosen[2:], *QUICK, "--out", tmp_path / "joints")
     [canonical] = load_model(tmp_path / "joints").operators_
     assert format_operator(canonical) == "canonical"
     line = refusal("fit", dataset, *robot[:-1], "left_*", "--out", tmp_path / "x")
@@ -69,11 +73,38 @@ def test_fit_takes_tracked_poses_in_place_of_a_robot(tmp_path):
 
 def test_implausible_recordings_and_files_in_the_way_are_refused(dataset, tmp_path):
     strictly = (*QUICK[:-1], "error")
-    line = refusal("fit", dataset, *strictly, "--out", tmp_path / "model")
-    assert "alignment: the demonstrations last from 10." in line
+    joints = ("--operator", "canonical")
+    result = run("fit", dataset, *joints, *strictly, "--out", tmp_path / "model")
+    assert result.exit_code == 2 and "joints           17 of observation.state" in result.stdout
+    assert "alignment: the demonstrations last from 10." in result.stderr
     (tmp_path / "file").write_text("")
-    line = refusal("fit", dataset, *QUICK, "--out", tmp_path / "file")
+    line = run("fit", dataset, *joints, *QUICK, "--out", tmp_path / "file").stderr
     assert "exists and is not a saved model" in line
+
+
+@pytest.mark.parametrize(
+    ("units", "good"),
+    [
+        (["lerobot"], True),
+        (["deg", "*gripper=raw"], True),
+        (["*gripper=raw", "deg"], True),
+        (["raw"], False),
+        (["deg", "*gripper=deg"], True),
+        ([], False),
+    ],
+)
+def test_check_and_fit_agree_on_the_units_of_two_arms(units, good, tmp_path):
+    data = written_arms(tmp_path)
+    robot = ("--robot", "left=so101@0,0.2,0", "--robot", "right=so101@0,-0.2,0")
+    given = ("--plausibility", "error", *robot, *(w for u in units for w in ("--units", u)))
+    checked = run("dataset", "check", "--strict", data, *given[2:])
+    learned = run("fit", data, *given, "--n-components", 3, "--out", tmp_path / "model")
+    assert (checked.exit_code == 0, learned.exit_code == 0) == (good, good), learned.stderr
+    if good:
+        printed = dict(line.split(maxsplit=1) for line in learned.stdout.splitlines()[:10])
+        assert printed["links"].startswith("left_gripper_frame_link, right_gripper_frame_link")
+        assert printed["frames"] == "cup (observation.environment_state)"
+        assert ("left_gripper" in printed["units"]) == ("*gripper=deg" not in units)
 
 
 def test_fit_finds_operators_parts_and_components_and_says_why(dataset, tmp_path):

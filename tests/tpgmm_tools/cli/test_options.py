@@ -82,8 +82,9 @@ def test_robots_are_files_of_either_format_or_come_with_the_package(tmp_path):
     (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
     (tmp_path / "body.urdf").write_text(upper_body_urdf())
     read = options.RobotOptions
-    assert read(str(tmp_path / "arm.xml"), ["hand"]).read().joint_names == ("lift",)
-    body = read(str(tmp_path / "body.urdf"), ["l_hand"], ["l_*"], ["grip"]).read()
+    assert read([str(tmp_path / "arm.xml")], ["hand"]).read().joint_names == ("lift",)
+    body = read([str(tmp_path / "body.urdf")], ["l_hand"], ["l_*"], ["grip"]).read()
     assert body.joint_names[-2:] == ("l_wrist_roll", "grip")
-    assert read("so101", ["gripper_frame_link"]).read().n_joints == 6
+    two = read(["left=so101@0,0.2,0", f"body={tmp_path / 'body.urdf'}@0,0,1"]).read()
+    assert two.links == ("left_gripper_frame_link", "body_l_hand", "body_r_hand")
     assert read().read() is None

@@ -5,6 +5,7 @@ import json
 import math
 import pickle
 import time
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -29,7 +30,7 @@ from tests.support.robot_zoo import (
 from tpgmm_datasets.robots import so101_urdf, upper_body_urdf
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import DataError, ShapeError, UnknownNameError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning, ShapeError, UnknownNameError
 from tpgmm_torch.robots import robot as robot_module
 from tpgmm_torch.robots.joint_space import JointSpace
 from tpgmm_torch.robots.kinematics import RobotState
@@ -372,6 +373,32 @@ class TestCombining:
             Robot.combine(left=arm, fixed={"left_tip": self.left})
         with pytest.raises(ShapeError, match="one constant pose"):
             Robot.combine({"left": Frame(np.zeros((2, 3)))}, left=arm)
+        for pose in ([0, 0.2], [[0, 0, 0]], "here", [0, 0, 0, 1]):
+            with pytest.raises(DataError, match="the pose of 'left'"):
+                Robot.combine({"left": pose}, left=arm)
+        with pytest.warns(PlausibilityWarning, match=r"\['left', 'right'\] are 20 m"):
+            Robot.combine({"left": [0, 20, 0]}, left=arm, right=arm)
+
+    def test_a_saved_description_has_all_of_it(self, tmp_path: Path) -> None:
+        cup = {"cup": ("l_finger", Frame([0.1, 0.0, 0.2]))}
+        poses = {"left": [0.1, 0.3, 0.8, 0.5, 0.5, -0.5, 0.5], "right": self.right}
+        both = Robot.combine(poses, left=zoo(("tip", "cup"), tools=cup), right=upper_body())
+        both.save(tmp_path / "both.urdf")
+        again = Robot.from_urdf(tmp_path / "both.urdf", both.links)
+        assert again.joint_names == both.joint_names
+        joints = random_joints(both, 3)
+        assert torch.equal(again.state(joints).positions, both.state(joints).positions)
+
+    def test_joints_of_any_unit_have_no_limits_where_they_move_no_link(self) -> None:
+        robot = zoo(("tip", "flange"))
+        free = robot.unlimited(robot.joint_names)
+        assert [bool(x) for x in free.upper.isinf()] == [
+            name == "grip" or bool(robot.upper[i].isinf())
+            for i, name in enumerate(robot.joint_names)
+        ]
+        joints = random_joints(robot, 3)
+        assert torch.equal(free.state(joints).jacobians, robot.state(joints).jacobians)
+        assert free == robot.unlimited(["grip"]) == Robot.from_config(free.config())
 
 
 class TestErrors:
@@ -390,7 +417,7 @@ class TestErrors:
             ({"locked": {"wag_too": 0.0}}, DataError, "mimics 'elbow'"),
             ({"locked": {"lift": math.nan}}, DataError, "finite numbers, got .*'lift': nan"),
             ({"locked": {"lift": 0.1}, "joints": ["lift"]}, DataError, "both in the joint"),
-            ({"coordinates": ["lift"]}, DataError, "'lift' is a joint of the URDF"),
+            ({"coordinates": ["elbow"]}, DataError, "'elbow' moves link 'tip'.* of its own"),
             ({"coordinates": "hand"}, DataError, "coordinates is a sequence of names"),
             ({"tools": {"cup": ("nose", [0, 0, 0])}}, UnknownNameError, "tool 'cup'"),
             ({"tools": {"tip": ("arm", [0, 0, 0])}}, DataError, "'tip' has the name of a link"),

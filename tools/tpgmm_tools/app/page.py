@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from tpgmm_datasets.checks.check import check
+from tpgmm_datasets.robots import ROBOTS
 from tpgmm_datasets.tables import trajectories_to_frame, write_table
 from tpgmm_tools.app.sources import Recorded, generated_bottle, uploaded
 from tpgmm_tools.cli.application import explain
 from tpgmm_tools.cli.learning import prepared
-from tpgmm_tools.cli.options import ROBOTS, RobotOptions, align
+from tpgmm_tools.cli.options import RobotOptions, align
 from tpgmm_tools.viewing import write_motion
 from tpgmm_torch import quaternions
 from tpgmm_torch.data.demonstrations import Demonstration, Situation
@@ -117,7 +118,7 @@ def learn(
             if source == UPLOADED:
                 described = robot_file if robot == ROBOT_FILE else robot
                 given = None if described == NO_ROBOT else described
-                kinematics = RobotOptions(given, _names(links)).read()
+                kinematics = RobotOptions([given] if given else None, _names(links)).read()
                 read = uploaded(files or (), kinematics, _names(frames))
             else:
                 known: dict[str, Callable[[], Recorded]] = {GENERATED: generated_bottle}

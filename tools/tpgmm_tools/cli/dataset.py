@@ -79,7 +79,6 @@ def check(
         UnknownUnitsError,
         summed_up,
     )
-    from tpgmm_datasets.reader import open_recording
 
     description = describe_lerobot(path)
     for problem in summed_up(description.problems):
@@ -90,7 +89,7 @@ def check(
         f"no problems in {len(description.lengths)} episodes, {sum(description.lengths)} rows"
     )
     # all problems in one go, not the first
-    recording = open_recording(path, **data.arguments(described.read()), relax=CHECKS)
+    recording = data.opened(path, described.read(), relax=CHECKS)
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DatasetWarning)
@@ -215,9 +214,7 @@ def convert(
     task : str
         What is done, for all. Default: each episode's own.
     """
-    from tpgmm_datasets.reader import open_recording
-
-    recording = open_recording(source, **data.arguments(described.read()))
+    recording = data.opened(source, described.read())
     demonstrations = list(recording.demonstrations())
     layout, columns = recording.assembly.layout, recording.assembly.joints
     kept = demonstrations[0].joint_names or ()

@@ -9,17 +9,27 @@ from typing import Any, Literal
 import numpy as np
 import typer
 
+from tpgmm_datasets.conversion.poses import LinkPose
 from tpgmm_datasets.episode_batches import EpisodeBatches
-from tpgmm_datasets.reader import load_lerobot
+from tpgmm_datasets.lerobot.columns import EVENT
+from tpgmm_datasets.lerobot.event_flags import event_features
+from tpgmm_datasets.reader import Recording
 from tpgmm_datasets.signals import Signals
 from tpgmm_tools.cli import options
-from tpgmm_tools.cli.learning import Choices, aligner, learn, parse_parts, prepared
+from tpgmm_tools.cli.learning import (
+    Choices,
+    aligner,
+    asked_operators,
+    learn,
+    parse_parts,
+    prepared,
+)  # fmt: skip
 from tpgmm_tools.cli.plugins import OWN, model_format
 from tpgmm_torch.constraints import check_parameters
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
 from tpgmm_torch.mixture.processes import joined_processes
-from tpgmm_torch.operators.text import default_operators, format_operator, parse_operator
+from tpgmm_torch.operators.text import format_operator, parse_operator
 from tpgmm_torch.persistence import save
 from tpgmm_torch.regression.fusion_forms import CovarianceFusion, InformationFusion
 from tpgmm_torch.training.hold_detection import with_holds
@@ -92,7 +102,8 @@ def fit(
         'orientation:LINK@FRAME', 'pose:LINK@FRAME' (both), without @FRAME in the base frame;
         FRAME may be another link, or held:FRAME an object as it is carried, which LINK may be
         too; 'canonical:left_*' some joints; '+' stacks. 'auto' finds what matters and says why.
-        Default: the poses of all links in all frames, stacked, and canonical.
+        Default: the poses of all links in all frames, stacked, and canonical; objects are
+        forgotten only if canonical is asked for.
     hold : str
         When a link holds an object, repeatable: FRAME@LINK:BEGIN-END in seconds, as in
         'bottle@l_hand:4.3-' to the end; or 'none'. Default: found in episodes whose frames were
@@ -133,21 +144,23 @@ def fit(
         **settings,
     )
     check_parameters(model)
+    recording = data.opened(dataset, robot)
+    model.robot = robot = recording.assembly.robot
     about = data.arguments(robot)
     with joined_processes() as processes:
         episodes: Any
         if batch_episodes is None:
-            read = load_lerobot(dataset, **about)
+            read = list(recording.demonstrations())
             first, fitted = options.align(read, alignment, robot), None
         else:
             read, first = [], next(iter(EpisodeBatches(dataset, batch_episodes, **about)))
             fitted = aligner(alignment, robot)
             fitted = fitted and fitted.fit(first)
             first = fitted.transform(first) if fitted else first
-        if not operators:
-            links = robot.links if robot is not None else ()
-            model.operators = default_operators(links, list(first[0].frames))
-        kept = prepared(first, list(model.operators or ()), robot, robust, holds)
+        model.operators = asked_operators(operators, robot, list(first[0].frames))
+        kept = prepared(first, model.operators, robot, robust, holds)
+        if processes.rank == 0:
+            _echo(_understood(recording, read, kept, described.link))
         episodes = processes.share(kept)
         if batch_episodes is not None:
             batches = EpisodeBatches(dataset, batch_episodes, processes=processes, **about)
@@ -190,20 +203,50 @@ class Aligned:
             yield with_holds(aligned, self.holds)
 
 
+def _understood(
+    recording: Recording, read: Any, kept: Any, named: list[str] | None
+) -> dict[str, object]:
+    """What the data set and the robot are taken for, before anything is learned."""
+    assembly, joints = recording.assembly, recording.assembly.joints
+    names = assembly.robot.joint_names if assembly.robot is not None else joints.names or ()
+    lines: dict[str, object] = {}
+    if read:
+        seconds, steps = [one.duration for one in read], sum(map(len, kept))
+        lost = len(recording.episodes) - len(kept)
+        lines["demonstrations"] = (
+            f"{len(read)} of {min(seconds):.2f} to {max(seconds):.2f} s, {steps} steps after "
+            f"alignment; {lost or 'none'} left out"
+        )
+    lines["joints"] = f"{kept[0].n_joints} of {joints.feature.key}: {', '.join(names)}"
+    units: dict[str, list[str]] = {}
+    for name, unit in zip(joints.names or ("all",), joints.units, strict=False):
+        if name in names or not names:
+            units.setdefault("rad or m" if unit == "auto" else str(unit), []).append(name)
+    lines["units"] = "; ".join(
+        f"{unit}: {', '.join(of)}" if len(units) > 1 else unit for unit, of in units.items()
+    )
+    links = ", ".join(assembly.robot.links) if assembly.robot is not None else ""
+    lines["links"] = links + " (its hands; --link names others)" * bool(links and not named)
+    places = {
+        name: f"{at.link}@{at.event}" if isinstance(at, LinkPose) else vars(at).get("feature")
+        for name, at in assembly.frames.items()
+    }
+    lines["frames"] = ", ".join(f"{name} ({at or 'given'})" for name, at in places.items())
+    stored = [one.key.removeprefix(EVENT) for one in event_features(assembly.layout)]
+    found = [f"{name} (looked for)" for name in assembly.events]
+    lines["events"] = ", ".join((*stored, *found))
+    lines["held"] = ", ".join(map(str, kept[0].holds or ()))
+    return {name: text or "none" for name, text in lines.items()}
+
+
+def _echo(lines: dict[str, object]) -> None:
+    for name, text in lines.items():
+        typer.echo(f"{name:<16} {text}")
+
+
 def _report(learned: Any, read: Any, aligned: Any) -> None:
     skill = getattr(learned, "skill", learned)
     lines: dict[str, object] = {}
-    if read:
-        seconds = [one.duration for one in read]
-        lines["demonstrations"] = (
-            f"{len(read)} of {min(seconds):.2f} to {max(seconds):.2f} s, "
-            f"{sum(map(len, aligned))} steps after alignment"
-        )
-    lines["joints"] = skill.kinematics.n_joints
-    lines["links"] = ", ".join(skill.kinematics.links) or "none"
-    lines["frames"] = ", ".join(skill.frame_names) or "none"
-    for hold in skill.holds:
-        lines[f"{hold.frame} held"] = hold
     for number, one in enumerate(getattr(learned, "skills", ()), start=1):
         texts = ", ".join(map(format_operator, one.operators))
         lines[f"{'part' if one.begin > skill.begin or number == 1 else 'way'} {number}"] = (
@@ -211,8 +254,7 @@ def _report(learned: Any, read: Any, aligned: Any) -> None:
         )
     if isinstance(learned, TaskParameterizedGMM):
         lines |= _learning(learned, read, aligned)
-    for name, text in lines.items():
-        typer.echo(f"{name:<16} {text}")
+    _echo(lines)
 
 
 def _learning(model: TaskParameterizedGMM, read: Any, aligned: Any) -> dict[str, object]:

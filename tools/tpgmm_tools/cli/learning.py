@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,9 +15,11 @@ from tpgmm_torch.alignment.text import parse_alignment
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM
-from tpgmm_torch.exceptions import DataError
+from tpgmm_torch.exceptions import DataError, PlausibilityWarning
 from tpgmm_torch.mixture.processes import ALONE, Processes
 from tpgmm_torch.operators import Operator
+from tpgmm_torch.operators.base import frame_names
+from tpgmm_torch.operators.text import default_operators
 from tpgmm_torch.robots.kinematics import Kinematics
 from tpgmm_torch.structure.fit_parts import fit_parts
 from tpgmm_torch.structure.segmentation import Segmentation
@@ -26,7 +29,7 @@ from tpgmm_torch.structure.select_ways import SelectWays
 from tpgmm_torch.training.hold_detection import attach_holds, with_holds
 from tpgmm_torch.training.outlying_demonstrations import drop_outliers
 
-__all__ = ["Choices", "aligner", "learn", "parse_parts", "prepared"]
+__all__ = ["Choices", "aligner", "asked_operators", "learn", "parse_parts", "prepared"]
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,50 @@ def aligner(
     if method != "parts":
         return parse_alignment(method, robot, features)
     return make_pipeline(Segmentation(robot), EventAlignment(["part *"], robot=robot))
+
+
+def asked_operators(
+    given: Sequence[Operator], robot: Kinematics | None, frames: Sequence[str]
+) -> list[Operator]:
+    """The operators that are given, or all links seen from all frames, and the joints.
+
+    Parameters
+    ----------
+    given : sequence of Operator
+        Empty for the default.
+    robot : Kinematics or None
+    frames : sequence of str
+        Objects in the demonstrations.
+
+    Raises
+    ------
+    DataError
+        If there are objects and no links, so that the objects would be forgotten.
+
+    Warns
+    -----
+    PlausibilityWarning
+        If links are seen from no object, though there are objects.
+    """
+    links = () if robot is None else robot.links
+    if given:
+        moving = [link for one in given for link in one.links()]
+        if frames and robot is not None and moving and not frame_names(given, robot):
+            warnings.warn(
+                f"none of the operators refers to the objects {list(frames)}: LINK@FRAME does",
+                PlausibilityWarning,
+                stacklevel=2,
+            )
+        return list(given)
+    if frames and not links:
+        model = getattr(robot, "model", None)
+        what = f"of {list(model.links)}" if model else "with --robot (--policy.robot)"
+        raise DataError(
+            f"the objects {list(frames)} would be forgotten: no links are seen from them. "
+            f"Name the hands, --link (--policy.links) {what}; or ask for the joints alone, "
+            """--operator canonical (--policy.operators='["canonical"]')"""
+        )
+    return default_operators(links, frames)
 
 
 def prepared(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 if TYPE_CHECKING:
+    from tpgmm_datasets.reader import Recording
     from tpgmm_torch.data.demonstrations import Demonstration, Situation
     from tpgmm_torch.robots.kinematics import Kinematics
 
@@ -23,8 +24,6 @@ __all__ = [
     "options_of", "wanted",
 ]  # fmt: skip
 
-#: Robots that come with the package.
-ROBOTS = ("so101", "upper_body")
 Alignments = Literal["dtw", "barycenter", "linear", "events", "events+dtw", "parts", "none"]
 
 
@@ -46,9 +45,9 @@ class DataOptions:
     episodes : ``0:10 | 0,3,5 | TASK``
         Which episodes; default all.
     units : ``[JOINT=]UNIT``
-        Unit of the stored joints: rad, deg, m, mm or raw; with JOINT= of one of them,
-        repeatable. FILE.json is LeRobot's calibration, with PREFIX= of one arm. Default: as
-        the set declares.
+        Unit of the stored joints: rad, deg, m, mm, raw, or lerobot (arms in degrees, grippers 0
+        to 100); with JOINT= of one or, as '*gripper=', of some of them, repeatable. FILE.json
+        is LeRobot's calibration, with PREFIX= of one arm. Default: as the set declares.
     joints : ``FEATURE``
         The feature that holds the joints, or 'measured' or 'commanded'; default
         observation.state or the like.
@@ -56,6 +55,9 @@ class DataOptions:
         The robot's name of a stored joint, repeatable, where the names differ.
     rate : float >= 0.001
         Resample to this number of steps per second.
+    relax : ``CHECK``
+        Leave out episodes that fail a check, repeatable: duplicates, events, gaps, missing,
+        nan, poses or time; or metadata, and go on without it.
     """
 
     frame: list[str] | None = None
@@ -65,6 +67,7 @@ class DataOptions:
     joints: str | None = None
     joint_name: list[str] | None = None
     rate: float | None = None
+    relax: list[str] | None = None
 
     def arguments(self, robot: Kinematics | None = None) -> dict[str, Any]:
         """Keyword arguments of :func:`tpgmm_datasets.load_lerobot`, ``robot`` among them.
@@ -85,7 +88,14 @@ class DataOptions:
             "joints": self.joints,
             "joint_names": text.parse_joint_names(self.joint_name or ()),
             "rate": self.rate,
+            "relax": self.relax or (),
         }
+
+    def opened(self, dataset: str, robot: Kinematics | None, **options: Any) -> Recording:
+        """A ``dataset`` with a robot that has no limits for what is in a unit of its own."""
+        from tpgmm_datasets.reader import open_recording
+
+        return open_recording(dataset, **(self.arguments(robot) | options)).unlimited()
 
     def read(self, dataset: str, robot: Kinematics | None = None) -> list[Demonstration]:
         """The demonstrations in a ``dataset``, joints in the order of a ``robot``."""
@@ -100,11 +110,12 @@ class RobotOptions:
 
     Parameters
     ----------
-    robot : ``FILE``
-        The robot's URDF or MJCF file; 'upper_body' and 'so101' come with the package. Without
-        a robot, joints alone.
+    robot : ``FILE | NAME=FILE@X,Y,Z``
+        The robot's URDF or MJCF file; 'upper_body', 'so101' and 'bi_so101' come with the
+        package. Several, repeatable: the name of each, and where its base is [m], perhaps with
+        ,YAW [rad] or ,QW,QX,QY,QZ behind it. Without a robot, joints alone.
     link : str
-        A link of interest (a hand), repeatable.
+        A link of interest (a hand), repeatable. Default: what carries a gripper.
     robot_joint : ``PATTERN``
         Joints that move, repeatable, like 'left_*'; the others stand still. Default: all.
     coordinate : ``NAME``
@@ -113,7 +124,7 @@ class RobotOptions:
         Instead of a robot: a tracked body whose pose the data set holds, repeatable.
     """
 
-    robot: str | None = None
+    robot: list[str] | None = None
     link: list[str] | None = None
     robot_joint: list[str] | None = None
     coordinate: list[str] | None = None
@@ -127,9 +138,8 @@ class RobotOptions:
         DataError
             If the options do not go together.
         """
-        from tpgmm_datasets import robots
+        from tpgmm_datasets.robots import parse_robot
         from tpgmm_torch.exceptions import DataError
-        from tpgmm_torch.robots.robot import Robot
         from tpgmm_torch.robots.tracked_poses import Poses
 
         parts = self.link or self.robot_joint or self.coordinate
@@ -137,17 +147,12 @@ class RobotOptions:
             if self.robot or parts:
                 raise DataError("--poses are instead of --robot and its links and joints")
             return Poses(self.poses)
-        if self.robot is None:
+        if not self.robot:
             if parts:
                 raise DataError("--link, --robot-joint and --coordinate need --robot FILE")
             return None
-        given = self.robot
-        return Robot.from_file(
-            getattr(robots, f"{given}_urdf")() if given in ROBOTS else given,
-            self.link or (),
-            joints=self.robot_joint or None,
-            coordinates=self.coordinate or (),
-        )
+        chosen = {"joints": self.robot_joint or None, "coordinates": self.coordinate or ()}
+        return parse_robot(self.robot, self.link or (), **chosen)
 
 
 def filter_plausibility(action: str) -> None:
