@@ -13,7 +13,7 @@ from tpgmm_torch.exceptions import DataError
 
 __all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]
 
-#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
+#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT+OFFSET``.
 FRAME = re.compile(
     r"(?P<name>[^=@\[\]]+)"
     r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
@@ -23,20 +23,24 @@ FRAME = re.compile(
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
     """The argument ``frames``; None without texts.
 
-    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``;
-    anything else is a DataError.
+    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]``, ``NAME=POSES.csv``,
+    ``NAME=LINK@EVENT`` or ``NAME=LINK@EVENT+x,y,z``; anything else is a DataError.
     """
     frames: dict[str, Any] = {}
     for text in texts:
+        name, _, table = text.partition("=")
+        if name and table.endswith((".csv", ".parquet")):
+            frames[name] = table
+            continue
         match = FRAME.fullmatch(text)
         if match is None:
             raise DataError(
-                f"frame {text!r} is not NAME, NAME=FEATURE, NAME=FEATURE[7:14] or "
-                "NAME=LINK@EVENT"
+                f"frame {text!r} is not NAME, NAME=FEATURE, NAME=FEATURE[7:14], "
+                "NAME=POSES.csv or NAME=LINK@EVENT"
             )
         source, event, start = match["source"], match["event"], match["start"]
         if event:
-            frames[match["name"]] = LinkPose(source, event)
+            frames[match["name"]] = LinkPose.parse(f"{source}@{event}")
         elif source is None:
             frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
         else:
