@@ -34,6 +34,8 @@ def test_episodes_units_and_frames_are_read_from_text():
     assert (frames["b"].feature, frames["b"].columns) == ("poses", None)
     assert frames["c"].columns == slice(7, 14)
     assert (frames["d"].link, frames["d"].event) == ("hand", "close")
+    assert parse_frames(["e=a@b/poses.csv"]) == {"e": "a@b/poses.csv"}
+    assert parse_frames(["f=hand@close+0,0,-0.1"])["f"].offset.position.tolist() == [0, 0, -0.1]
     assert parse_frames([]) is None
 
 

@@ -218,7 +218,7 @@ def unit_findings(
             message = f"frame {name!r} is {distance:.4g} m away from the base of the robot"
             remedy = (
                 "Positions are in metres: are these in millimetres or centimetres? "
-                "(load_lerobot: FramePose(..., scale=0.001); a table: columns x_mm, y_mm, z_mm)"
+                "(load_lerobot: FramePose(..., scale=0.001))"
             )
             yield Finding("units", message, remedy, (name,), value=distance)
     step = float(np.median([episode.step for episode in episodes]))

@@ -17,6 +17,7 @@ from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.tables import numbers, read_table
 from tpgmm_torch import quaternions
+from tpgmm_torch.checks.training import FAR
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
@@ -219,6 +220,8 @@ class MeasuredPoses:
         try:
             table = read_table(path).rename(columns=lambda column: str(column).strip())
             used = _pose_columns(name, list(table.columns))
+            if table.empty:
+                raise DataError("the table has no rows")
             key = used["episode"][0]
             index = numbers(table, [key])[:, 0]
             if (index != index.round()).any():
@@ -351,6 +354,11 @@ def _check_rows(values: Array, parts: Sequence[str], moves: bool) -> None:
         raise DataError(
             f"an angle of {largest:.4g} rad is more than a turn: is it in degrees? Then call "
             f"the columns {', '.join(f'{parts[i]}_deg' for i in turns)}"
+        )
+    if (distance := float(np.linalg.norm(values[:, :3], axis=1).max())) > FAR:
+        raise DataError(
+            f"it is {distance:.4g} m away from the base of the robot: in millimetres or "
+            "centimetres? Then call the columns x_mm, y_mm, z_mm, or x_cm, ..."
         )
 
 
