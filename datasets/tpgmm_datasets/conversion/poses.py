@@ -182,13 +182,13 @@ class MeasuredPoses:
         By the episode's index in the set: one pose, one for each of its steps, or at ``times``.
     times : mapping of int to Tensor of shape (T,)
         When those that move were measured, from the start of the episode [s].
-    source : str
-        Where they are from, for errors.
+    feature : str
+        Where they are from, in place of a feature of the set.
     """
 
     poses: Mapping[int, Frame]
     times: Mapping[int, torch.Tensor] = field(default_factory=dict)
-    source: str = "the frames that were given"
+    feature: str = "the frames that were given"
 
     @classmethod
     def read(
@@ -299,7 +299,7 @@ class MeasuredPoses:
             if end <= 0 or begin >= length or end - begin > LONGEST * length:
                 raise DatasetError(
                     f"frame {name!r} was measured from {begin:.6g} to {end:.6g}, the episode "
-                    f"takes {length:.4g} s: times in {self.source} are in seconds, from the "
+                    f"takes {length:.4g} s: times in {self.feature} are in seconds, from the "
                     "start of each episode",
                     **where,
                 )
