@@ -638,19 +638,39 @@ def moving(start, step):
 STILL, ONES = "episode,x,y,z", ["0,0.3,0.1,0.0", "1,0.3,0.2,0.0", "2,0.4,0.2,0.0"]
 #: A table of a cup's poses beside a set of three episodes: name, header, rows, what is told.
 MEASURED = (
-    ("an_episode_without_a_pose", STILL, ONES[:2], r"episode 2: .*: no row .*--episodes"),
-    ("two_poses_for_an_episode", STILL, [*ONES, ONES[1]], r"episode 1: .*2 rows are .*'time'"),
-    ("episodes_from_one", STILL, ["1,0,0,0", "2,0,0,0", "3,0,0,0"], r"has episodes 0 to 2"),
+    (
+        "an_episode_without_a_pose",
+        STILL,
+        ONES[:2],
+        r"episode 2: .* 0 rows for this .*--episodes",
+    ),
+    (
+        "two_poses_for_an_episode",
+        STILL,
+        [*ONES, ONES[1]],
+        r"episode 1: .*2 rows for this .*'time'",
+    ),
+    (
+        "episodes_from_one",
+        STILL,
+        ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
+        r"episodes 3, the set has 0 to 2",
+    ),
     ("episodes_by_name", STILL, ["a,0,0,0", "b,0,0,0"], r"'episode' holds no numbers"),
-    ("half_episodes", STILL, ["0.5,0,0,0"], r"'episode' counts episodes"),
+    ("half_episodes", STILL, ["0.5,0,0,0"], r"episodes 0.5, the set has 0 to 2"),
     ("no_rows", STILL, [], r"no rows"),
-    ("no_episodes", "x,y,z", ["0,0,0"], r"a pose is 'episode'"),
-    ("no_height", "episode,x,y", ["0,0.3,0.1"], r"a pose is .*x, y, z"),
+    ("no_episodes", "x,y,z", ["0,0,0"], r"columns .* Name them episode"),
+    ("no_height", "episode,x,y", ["0,0.3,0.1"], r"Name them episode, x, y, z"),
     ("half_a_quaternion", f"{STILL},qx,qy,qz", ["0,0,0,0,0,0,0"], r"qw, qx, qy, qz"),
-    ("two_rotations", f"{STILL},yaw,yaw_deg", ["0,0,0,0,0,0"], r"'yaw_deg' are both 'yaw'"),
-    ("semicolons", "episode;x;y;z", ["0;0;0;0"], r"of which .* are unknown"),
-    ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"of which \['score'\] are unknown"),
-    ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"some are of \['mug'\]"),
+    (
+        "two_rotations",
+        f"{STILL},yaw,yaw_deg",
+        ["0,0,0,0,0,0"],
+        r"\['yaw_deg'\] are unknown or there twice",
+    ),
+    ("semicolons", "episode;x;y;z", ["0;0;0;0"], r"are unknown"),
+    ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"\['score'\] are unknown"),
+    ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"'mug.z'\]. Name them .*cup.x"),
     ("millimetres", STILL, ["0,300,100,0", *ONES[1:]], r"episode 0: .*316.2 m away.*x_mm"),
     ("degrees", f"{STILL},yaw", [f"{row},90" for row in ONES], r"in degrees\? .*yaw_deg"),
     ("a_gap", STILL, ["0,0.3,,0.0", *ONES[1:]], r"episode 0: .*'y' lacks a value"),
@@ -673,13 +693,13 @@ for name, header, rows, told in MEASURED:
     MISTAKES.append(Mistake("poses", name, told, make))
 
 
-@mistake("poses", r"a list holds a Frame for each episode, got float.*Frame\(\[x, y, z\]\)")
+@mistake("poses", r"a Frame for all, or one for each of .*; got list of 3 float")
 def a_position_in_place_of_a_frame(folder):
     sets.write(folder / "set")
     load_lerobot(folder / "set", frames={"cup": [0.3, 0.1, 0.0]})
 
 
-@mistake("poses", r"turn: bottle: .*'l_hand' at 'grasp'.*offset=")
+@mistake("poses", r"turn: bottle: .*the pose of l_hand at grasp .*offset=")
 def the_object_for_the_hand_that_held_it(_):
     def grasped(item):
         frame = upper_body().state(item.joints[len(item) // 2]).pose("l_hand")

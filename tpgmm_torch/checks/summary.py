@@ -421,16 +421,14 @@ class TrainingSummary:
         remedy = "Is the quaternion (w, x, y, z)? Else show the skill so too"
         if known.turn.distance(swapped) <= UNLIKELY * self.limit:
             remedy = "Read as (x, y, z, w) it would fit: quaternions are (w, x, y, z)"
-        shown = f"deg from the mean, shown up to {np.rad2deg(known.angle):.0f}"
-        message = f"{name}: turned by {np.rad2deg(angle):.0f} {shown}"
         if known.at is not None:
-            link, _, event = known.at.rpartition("@")
-            message += f"; there it was the pose of {link!r} at {event!r}, not an object's"
             remedy = (
-                f"Give the pose that {link!r} is to have there; or learn the object's, "
+                f"It was the pose of {known.at.replace('@', ' at ')} in the demonstrations: "
+                "give where that is to be, and not an object's pose; or learn the object's, "
                 f"LinkPose(..., offset=Frame(...)) (--frame {name}={known.at}+X,Y,Z,YAW)"
             )
-        return message, remedy, ()
+        degrees = f"{np.rad2deg(angle):.0f} deg from the mean, shown up to "
+        return f"{name}: turned by {degrees}{np.rad2deg(known.angle):.0f}", remedy, ()
 
 
 def _largest_distance(vectors: Sequence[tuple[str, Array]]) -> float:

@@ -67,13 +67,8 @@ def _frame_source(
         if path.suffix in (".csv", ".parquet") or path.is_file():
             return MeasuredPoses.read(name, path, wanted, known)
         return LinkPose.parse(text) if "@" in text else FramePose(text)
-    if isinstance(source, Pose):
-        return source
-    if isinstance(source, Mapping | Sequence):
-        return MeasuredPoses.given(name, source, wanted, known)
-    raise DatasetError(
-        f"frame {name!r} is a feature's name, a table of poses, FramePose, LinkPose, Frame, or "
-        f"a Frame for each episode, got {type(source).__name__}"
+    return (
+        source if isinstance(source, Pose) else MeasuredPoses.given(name, source, wanted, known)
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi
 from pathlib import Path
@@ -17,6 +17,7 @@ from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import pose_groups
 from tpgmm_datasets.tables import numbers, read_table
 from tpgmm_torch import quaternions
+from tpgmm_torch.checks.report import listed
 from tpgmm_torch.checks.training import FAR
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
@@ -27,22 +28,17 @@ __all__ = ["FramePose", "LinkPose", "MeasuredPoses"]
 
 #: Number of values of each way to write a rotation.
 ROTATIONS = {"wxyz": 4, "xyzw": 4, "rotvec": 3, "euler": 3, "yaw": 1, None: 0}
-#: How a table of poses writes them, and how its columns may be called: also as ROS does, with
-#: the object's name before them and the unit behind.
+#: How the rotation is written in a table, by the parts of a pose that it has.
 WRITTEN = {
-    ("x", "y", "z"): None,
-    ("x", "y", "z", "yaw"): "yaw",
-    ("x", "y", "z", "roll", "pitch", "yaw"): "euler",
-    ("x", "y", "z", "qw", "qx", "qy", "qz"): "wxyz",
+    "x y z": None,
+    "x y z yaw": "yaw",
+    "x y z roll pitch yaw": "euler",
+    "x y z qw qx qy qz": "wxyz",
 }
-COLUMN = re.compile(
-    r"(?P<key>episode|time)(?:_index|stamp)?|"
-    r"(?:(?P<object>.+?)[._/])??(?:(?:field|pose|transform)[._/])*(?:"
-    r"(?:(?:position|translation)[._/])?(?P<place>[xyz])(?:_(?P<length>mm|cm|m))?|"
-    r"(?:(?:orientation|rotation|q)[._/]|q)(?P<quaternion>[wxyz])|"
-    r"(?P<turn>roll|pitch|yaw)(?:_(?P<angle>deg|rad))?)",
-    re.IGNORECASE,
-)
+#: A column of it: the object's name, the part, its unit. What ROS says in between is left out.
+COLUMN = r"(?:(.+?)[._/])??(\w+?)(?:_index|stamp)?(?:_(mm|cm|m|deg|rad))?"
+PLACE = r"(?<![a-z])(field|pose|transform|position|translation)[._/]"
+TURN = r"(?<![a-z])(orientation|rotation)[._/]"
 UNITS = {"mm": 1e-3, "cm": 1e-2, "deg": pi / 180}
 #: The object is not further from the link that holds it [m].
 REACH = 1.0
@@ -218,36 +214,34 @@ class MeasuredPoses:
         """
         where: dict[str, Any] = {"file": path}
         try:
-            table = read_table(path).rename(columns=lambda column: str(column).strip())
-            used = _pose_columns(name, list(table.columns))
+            table = read_table(path)
+            used = _pose_columns(name, table.columns)
             if table.empty:
                 raise DataError("the table has no rows")
-            key = used["episode"][0]
-            index = numbers(table, [key])[:, 0]
-            if (index != index.round()).any():
-                raise DataError(f"column {key!r} counts episodes: it holds whole numbers")
-            present = {*index.astype(int).tolist()}
-            if strange := present - {*known}:
-                raise DataError(f"rows are for episodes {_few(strange)}; {_numbered(known)}")
-            parts = [part for part in used if part not in ("episode", "time")]
-            rotation = WRITTEN[tuple(parts)]
-            pose = FramePose(" ".join(used[part][0] for part in parts), None, rotation, None)
+            episodes = numbers(table, [used.pop("episode")[0]])[:, 0]
+            if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
+                raise DataError(
+                    f"rows are for episodes {listed(strange)}, the set has {min(known)} to "
+                    f"{max(known)}, as 'tpgmm dataset info' counts"
+                )
+            time = used.pop("time", ("", 1.0))[0]
+            columns, factors = zip(*used.values(), strict=True)
+            pose = FramePose(" ".join(columns), None, WRITTEN[" ".join(used)], None)
             poses, times = dict[int, Frame](), dict[int, torch.Tensor]()
             for episode in wanted:
                 where = {"file": path, "episode": episode}
-                rows = table[index == episode]
-                values = numbers(rows, [used[part][0] for part in parts])
-                values *= [used[part][1] for part in parts]
-                if not len(values):
+                rows = table[episodes == episode]
+                if len(rows) != 1 and not (time and len(rows)):
                     raise DataError(
-                        f"no row is for this episode, rows are for {_few(present)}; "
-                        f"{_numbered(known)}. Leave episodes without a pose out (episodes=, "
-                        "--episodes)"
+                        f"the table has {len(rows)} rows for this episode, and needs one; more "
+                        "where an object moves, with a column 'time' [s]. Episodes without a "
+                        "pose can be left out (episodes=, --episodes)"
                     )
-                _check_rows(values, parts, "time" in used)
-                poses[episode] = pose.frame(values, list(range(len(parts))), **where)
+                values = numbers(rows, columns) * factors
+                _check_units(values, list(used))
+                poses[episode] = pose.frame(values, list(range(len(columns))), **where)
                 if poses[episode].batch_shape:
-                    times[episode] = torch.from_numpy(numbers(rows, [used["time"][0]])[:, 0])
+                    times[episode] = torch.from_numpy(numbers(rows, [time])[:, 0])
                     if bool((times[episode].diff() <= 0).any()):
                         raise DataError("time does not increase: two rows are for one instant")
         except DatasetError:
@@ -267,22 +261,20 @@ class MeasuredPoses:
         DatasetError
             If there are others, or more or less of them.
         """
-        count = len(frames)
-        if not isinstance(frames, Mapping):
-            frames = dict(zip(wanted, frames, strict=False))
-        for one in frames.values():
-            if not isinstance(one, Frame):
-                raise DatasetError(
-                    f"frame {name!r}: a list holds a Frame for each episode, got "
-                    f"{type(one).__name__}. The pose that all have is Frame([x, y, z])"
-                )
-        if count != len(frames) or not {*wanted} <= frames.keys() <= {*known}:
+        given = frames if isinstance(frames, Mapping | Sequence) else ()
+        several = dict(
+            given if isinstance(given, Mapping) else zip(wanted, given, strict=False)
+        )
+        fits = len(several) == len(given) and {*wanted} <= {*several} <= {*known}
+        if not fits or not all(isinstance(frame, Frame) for frame in several.values()):
+            kinds = {type(frame).__name__ for frame in several.values()}
             raise DatasetError(
-                f"frame {name!r}: {count} poses are given, for episodes {_few(frames)}, and "
-                f"{len(wanted)} are read, {_few(wanted)}: give a list with one for each of "
-                "these, or {episode: Frame}"
+                f"frame {name!r} is a feature's name, a table of poses, LINK@EVENT, FramePose, "
+                "LinkPose, a Frame for all, or one for each of the episodes that are read, "
+                f"{listed([*map(str, wanted)])}, in a list or {{episode: Frame}}; got "
+                f"{type(frames).__name__} of {len(given)} {', '.join(sorted(kinds))}"
             )
-        return cls(frames)
+        return cls(several)
 
     def frame(self, name: str, time: Array, *, episode: int, file: Path) -> Frame:
         """The frame in an episode whose steps are at ``time`` [s].
@@ -296,7 +288,7 @@ class MeasuredPoses:
         where: dict[str, Any] = {"file": file, "episode": episode}
         if measured is not None:
             begin, end, length = float(measured[0]), float(measured[-1]), float(time[-1])
-            if end <= 0 or begin >= length or end - begin > LONGEST * length:
+            if end <= 0 or begin > length or end - begin > LONGEST * length:
                 raise DatasetError(
                     f"frame {name!r} was measured from {begin:.6g} to {end:.6g}, the episode "
                     f"takes {length:.4g} s: times in {self.feature} are in seconds, from the "
@@ -312,43 +304,33 @@ class MeasuredPoses:
         return pose
 
 
-def _pose_columns(name: str, columns: Sequence[str]) -> dict[str, tuple[str, float]]:
-    """Column and factor of each part of the pose of ``name``, in the order of a pose."""
+def _pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str, float]]:
+    """Column and factor of episode, time, and the parts of the pose of ``name`` in order."""
     found: dict[str, tuple[str, float]] = {}
-    unknown, others = [], set()
+    known, wrong = {"episode", "time", *" ".join(WRITTEN).split()}, []
     for column in columns:
-        match = COLUMN.fullmatch(column)
-        if match is None:
-            unknown.append(column)
-            continue
-        if (match["object"] or name).strip("/") != name:
-            others.add(match["object"])
-            continue
-        quaternion = match["quaternion"] and f"q{match['quaternion']}"
-        part = (match["key"] or match["place"] or quaternion or match["turn"]).lower()
-        if part in found:
-            raise DataError(f"columns {found[part][0]!r} and {column!r} are both {part!r}")
-        unit = (match["length"] or match["angle"] or "").lower()
-        found[part] = column, UNITS.get(unit, 1.0)
-    ordered = next((p for p in WRITTEN if {*p} == {*found} - {"episode", "time"}), None)
-    if unknown or ordered is None or "episode" not in found:
+        text = re.sub(PLACE, "", str(column).strip(" /").lower())
+        match = re.fullmatch(COLUMN, re.sub(TURN, "q", text))
+        thing, part, unit = match.groups() if match else ("", "", "")
+        ours = (thing or name.lower()) == name.lower()
+        if part not in known or (ours and part in found):
+            wrong.append(column)
+        elif ours:
+            found[part] = column, UNITS.get(unit, 1.0)
+    ordered = [p for p in WRITTEN if {*p.split(), "episode"} == {*found} - {"time"}]
+    if wrong or not ordered:
         raise DataError(
-            f"the table has the columns {columns}"
-            + f", of which {unknown} are unknown" * bool(unknown)
-            + f", of which some are of {sorted(others)}" * bool(others)
-            + "; a pose is 'episode' (and 'time', if it moves), x, y, z, and nothing, or yaw, "
-            "or qw, qx, qy, qz. Name them so (x_mm, yaw_deg in other units), without others"
+            f"the table has columns {list(columns)}"
+            + f", and {wrong} are unknown or there twice" * bool(wrong)
+            + f". Name them episode, x, y, z (or {name}.x, ...), and yaw, or qw, qx, qy, qz; "
+            "time if it moves; x_mm or yaw_deg in other units. Leave others out"
         )
-    return {part: found[part] for part in ("episode", "time", *ordered) if part in found}
+    parts = ("episode", "time", *ordered[0].split())
+    return {part: found[part] for part in parts if part in found}
 
 
-def _check_rows(values: Array, parts: Sequence[str], moves: bool) -> None:
-    """Whether these rows (T, parts) can be the poses of one episode."""
-    if len(values) > 1 and not moves:
-        raise DataError(
-            f"{len(values)} rows are for this episode: keep one, or add a column 'time' [s] if "
-            "the object moves"
-        )
+def _check_units(values: Array, parts: Sequence[str]) -> None:
+    """Refuse poses (T, parts) that cannot be in metres and radians."""
     turns = [i for i, part in enumerate(parts) if part in ("roll", "pitch", "yaw")]
     if (largest := float(np.abs(values[:, turns]).max(initial=0.0))) > 2 * pi:
         raise DataError(
@@ -360,14 +342,6 @@ def _check_rows(values: Array, parts: Sequence[str], moves: bool) -> None:
             f"it is {distance:.4g} m away from the base of the robot: in millimetres or "
             "centimetres? Then call the columns x_mm, y_mm, z_mm, or x_cm, ..."
         )
-
-
-def _few(items: Collection[int]) -> str:
-    return f"{sorted(items)[:10]}".replace("]", ", ...]" if len(items) > 10 else "]")
-
-
-def _numbered(known: Collection[int]) -> str:
-    return f"the set has episodes {min(known)} to {max(known)}, as 'tpgmm dataset info' counts"
 
 
 @dataclass(frozen=True)
@@ -403,12 +377,11 @@ class LinkPose:
     offset: Frame | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.offset, Frame | None):
-            raise DatasetError(f"offset is the object's Frame in the link: {self.offset!r}")
-        if self.offset is not None and float(self.offset.position.norm()) > REACH:
+        is_frame = isinstance(self.offset, Frame)
+        if self.offset is not None and not (is_frame and self.offset.position.norm() < REACH):
             raise DatasetError(
-                f"the offset of an object in link {self.link!r} is in metres: "
-                f"{self.offset.position.tolist()} is further away than {REACH:g} m"
+                f"an offset is the Frame of an object in link {self.link!r}, in metres and "
+                f"nearer than {REACH:g} m; got {self.offset}"
             )
 
     @classmethod
@@ -429,14 +402,12 @@ class LinkPose:
         if offset is None:
             return cls(link, event)
         try:
-            values = np.array([[float(value) for value in offset.split(",")]])
+            values = np.array([offset.split(",")], dtype=float)
             rotation = {3: None, 4: "yaw", 7: "wxyz"}[values.shape[1]]
             pose = FramePose(text, None, rotation).frame(values, list(range(values.shape[1])))
         except (ValueError, KeyError) as error:
-            raise DatasetError(
-                f"{text!r}: behind + is the object's pose in the link, x,y,z or x,y,z,yaw or "
-                f"x,y,z,qw,qx,qy,qz in metres and radians ({error})"
-            ) from error
+            message = "the object in the link: x,y,z or x,y,z,yaw or x,y,z,qw,qx,qy,qz"
+            raise DatasetError(f"{text!r}: behind + is {message} ({error})") from error
         return cls(link, event, pose)
 
     def time(self, demonstration: Demonstration, **where: Any) -> float:

@@ -97,16 +97,16 @@ def with_frames(
     DatasetError
         If one of the frames is there already.
     """
-    parts = [f"{frame}.{part}" for frame in frames for part in POSE_PARTS]
-    if old is None:
-        return _vector(dtype, len(parts), parts, POSE_UNITS * len(frames))
-    names = [*(old.names or map(str, range(old.width))), *parts]
-    if twice := [name for name in frames if f"{name}.x" in (old.names or ())]:
-        raise DatasetError(f"the set has frames {twice} already", column=ENVIRONMENT)
-    if old.units is None:
-        return {"dtype": old.dtype, "shape": [len(names)], "names": names}
-    units = (*old.units, *POSE_UNITS * len(frames))
-    return _vector(old.dtype, len(names), names, units)
+    names, units = (
+        [f"{f}.{part}" for f in frames for part in POSE_PARTS],
+        POSE_UNITS * len(frames),
+    )
+    if old is not None:
+        before = old.names or tuple(map(str, range(old.width)))
+        if {*before} & {*names}:
+            raise DatasetError(f"of frames {frames} some are in the set", column=ENVIRONMENT)
+        names, units = [*before, *names], (*(old.units or ("",) * old.width), *units)
+    return _vector(old.dtype if old else dtype, len(names), names, units)
 
 
 def _vector(
