@@ -60,8 +60,9 @@ def uploaded(
         with TemporaryDirectory() as place:
             folder = _unpacked(paths[0], Path(place))
             sources = parse_frames(frames) or {}
-            if tables := [each for each in sources.values() if isinstance(each, str)]:
-                raise DataError(f"{tables} are not in the set: tpgmm dataset add-frames")
+            for one in map(str, sources.values()):
+                if one.endswith((".csv", ".parquet")):
+                    raise DataError(f"{one} is not in the set: tpgmm dataset add-frames")
             return load_lerobot(folder, robot=robot, frames=sources or None)
     if not paths or not kinds <= {".csv", ".parquet"}:
         names = ", ".join(path.name for path in paths) or "no file"
