@@ -125,10 +125,10 @@ class FrameSummary:
 
     def __post_init__(self) -> None:
         _check_numbers(self, low=(3,), high=(3,), orientation=(4,), angle=())
-        if self.at is not None and not (isinstance(self.at, str) and "@" in self.at):
-            raise DataError(f"a frame is at LINK@EVENT, got {self.at!r:.60}")
         if not len(self.place.mean) == len(self.turn.mean) == 3 or type(self.moves) is not bool:
             raise DataError("a frame has a place and a turn of 3 numbers, and moves or not")
+        if "@" not in ("@" if self.at is None else self.at):
+            raise DataError(f"a frame is at LINK@EVENT, got {self.at!r:.60}")
 
     @classmethod
     def of(cls, paths: Sequence[PathSummary], links: Mapping[str, Frame]) -> Self:
