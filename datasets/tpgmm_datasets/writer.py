@@ -20,7 +20,6 @@ from tpgmm_datasets.conversion.poses import MeasuredPoses
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import (
     ENVIRONMENT,
-    Features,
     action_column,
     demonstration_columns,
     feature_table,
@@ -181,22 +180,21 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
     layout = open_layout(path)
     for problem in layout.problems:
         raise problem
-    if layout.version != "v3.0":
+    if layout.version != "v3.0" or not layout.episodes:
         raise DatasetError(
-            f"frames are added to sets of v3.0, this is {layout.version}: convert it first "
-            "(tpgmm dataset convert, or LeRobot's own converter, which keeps videos)"
+            f"frames are added to sets of v3.0, this is {layout.version} with "
+            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
+            "LeRobot's own converter, which keeps videos)"
         )
     sources = frame_sources(layout, frames, layout.episodes)
-    for name, source in sources.items():
-        if not isinstance(source, MeasuredPoses):
-            raise DatasetError(
-                f"frame {name!r} is not measured: add what a table (NAME=POSES.csv) or frames "
-                "by episode give. LINK@EVENT and features are learned from the set as it is"
-            )
-    features: Features = {**layout.info["features"]}
+    if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
+        raise DatasetError(
+            f"a table (NAME=POSES.csv) or frames by episode can be added, got {dict(frames)}; "
+            "LINK@EVENT and features are learned from the set as it is"
+        )
     old = layout.features.get(ENVIRONMENT)
-    features[ENVIRONMENT] = with_frames(old, list(sources))
-    declared = {ENVIRONMENT: features[ENVIRONMENT]}
+    declared = {ENVIRONMENT: with_frames(old, list(sources))}
+    features = {**layout.info["features"], **declared}
     with replacing(out) as new:
         if out.exists():
             raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
@@ -226,7 +224,10 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
                 columns[key] = pa.array(listing, _episode_type(key))
             _rewrite(path, new, file, columns)
         meta = new / "meta"
-        stored = json.loads((meta / "stats.json").read_text(encoding="utf-8"))
+        try:
+            stored = {**json.loads((meta / "stats.json").read_text(encoding="utf-8"))}
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise DatasetError(f"no statistics: {error}", file="meta/stats.json") from error
         stored[ENVIRONMENT] = {name: v.tolist() for name, v in whole[ENVIRONMENT].items()}
         _write_json(meta / "stats.json", stored)
         _write_json(meta / "info.json", {**layout.info, "features": features})
@@ -235,7 +236,7 @@ def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSour
 
 def _link_videos(source: str, target: str) -> None:
     """Link what is large and never changed in place, else copy."""
-    if {"videos", "images"} & {*Path(source).parts}:
+    if Path(source).suffix in (".mp4", ".png", ".jpg"):
         with suppress(OSError):
             os.link(os.path.realpath(source), target)
             return

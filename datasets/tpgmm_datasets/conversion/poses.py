@@ -239,13 +239,11 @@ class MeasuredPoses:
                     )
                 values = numbers(rows, columns) * factors
                 _check_units(values, list(used))
-                poses[episode] = pose.frame(values, list(range(len(columns))), **where)
+                poses[episode] = pose.frame(values, list(range(len(columns))))
                 if poses[episode].batch_shape:
                     times[episode] = torch.from_numpy(numbers(rows, [time])[:, 0])
                     if bool((times[episode].diff() <= 0).any()):
                         raise DataError("time does not increase: two rows are for one instant")
-        except DatasetError:
-            raise
         except (DataError, UnknownNameError) as error:
             raise DatasetError(f"frame {name!r}: {error}", **where) from error
         return cls(poses, times, str(path))
@@ -276,7 +274,7 @@ class MeasuredPoses:
             )
         return cls(several)
 
-    def frame(self, name: str, time: Array, *, episode: int, file: Path) -> Frame:
+    def frame(self, name: str, time: Array, **where: Any) -> Frame:
         """The frame in an episode whose steps are at ``time`` [s].
 
         Raises
@@ -284,8 +282,7 @@ class MeasuredPoses:
         DatasetError
             If there are other times, or not as many poses as steps.
         """
-        pose, measured = self.poses[episode], self.times.get(episode)
-        where: dict[str, Any] = {"file": file, "episode": episode}
+        pose, measured = self.poses[where["episode"]], self.times.get(where["episode"])
         if measured is not None:
             begin, end, length = float(measured[0]), float(measured[-1]), float(time[-1])
             if end <= 0 or begin > length or end - begin > LONGEST * length:

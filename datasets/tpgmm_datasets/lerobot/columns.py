@@ -106,7 +106,8 @@ def with_frames(
         if {*before} & {*names}:
             raise DatasetError(f"of frames {frames} some are in the set", column=ENVIRONMENT)
         names, units = [*before, *names], (*(old.units or ("",) * old.width), *units)
-    return _vector(old.dtype if old else dtype, len(names), names, units)
+        dtype = "float64" if old.dtype == "float64" else dtype
+    return _vector(dtype, len(names), names, units)
 
 
 def _vector(
