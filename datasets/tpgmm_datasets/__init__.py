@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tpgmm_datasets.motors import MotorMap, estimate_motor_map
     from tpgmm_datasets.reader import iter_lerobot, load_lerobot
     from tpgmm_datasets.units import Scale
-    from tpgmm_datasets.writer import save_lerobot
+    from tpgmm_datasets.writer import add_frames, save_lerobot
 
 __all__ = [
     "CHECKS",
@@ -31,6 +31,7 @@ __all__ = [
     "LinkPose",
     "MotorMap",
     "Scale",
+    "add_frames",
     "check",
     "describe_lerobot",
     "drop_outliers",
@@ -53,7 +54,7 @@ _HOMES = {
     "motors": ("MotorMap", "estimate_motor_map"),
     "reader": ("iter_lerobot", "load_lerobot"),
     "units": ("Scale",),
-    "writer": ("save_lerobot",),
+    "writer": ("add_frames", "save_lerobot"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
 

@@ -186,7 +186,8 @@ def open_recording(
             "is no joint",
             column=feature.key,
         )
-    sources = frame_sources(layout, frames)
+    chosen = tuple(select_episodes(layout, episodes))
+    sources = frame_sources(layout, frames, chosen)
     stored = [feature.key.removeprefix(EVENT) for feature in event_features(layout)]
     detectors = event_sources(events, sources, stored, columns.names)
     assembly = Assembly(layout, columns, sources, detectors, robot, rate, trim)
@@ -194,7 +195,6 @@ def open_recording(
     stated = stated_range(layout.root, feature.key, feature.width)
     if stated is not None:
         assembly.joints.values(stated, file="meta/stats.json")
-    chosen = tuple(select_episodes(layout, episodes))
     return Recording(chosen, assembly, policy.names)
 
 
@@ -312,11 +312,14 @@ def load_lerobot(recording: Recording) -> list[Demonstration]:
         100): they become radians from the middle of each motor's range. Of several arms,
         files by prefix of the names, ``{"left_": ..., "right_": ...}``. ``units`` given by
         name come first.
-    frames : mapping of str to str, FramePose, LinkPose or Frame, optional
+    frames : mapping of str to str, Path, FramePose, LinkPose, Frame or several, optional
         Where the pose of each frame is: in a feature (its name alone stands for x y z and a
         quaternion w x y z, constant from the first row on; if the feature names the poses
-        in it, the one of this name), where a link is at an event (``"r_hand@close"``, a
-        :class:`LinkPose`), or given. The default is every pose that the names of
+        in it, the one of this name), in a table that was measured apart (``"poses.csv"``, with
+        columns ``episode``, ``x``, ``y``, ``z``, and ``yaw`` or ``qw`` to ``qz`` if it is
+        turned, and ``time`` if it moves), where a link is at an event (``"r_hand@close"``, a
+        :class:`LinkPose`), or given: one, a list with one for each episode that is read, or a
+        mapping from the episode's index. The default is every pose that the names of
         ``observation.environment_state`` tell of (``bottle.x`` ... ``bottle.qz``), constant
         if it never changes.
     events : mapping of str to str, Detector or callable, optional

@@ -72,7 +72,8 @@ class Signals:
             If the data set cannot be read, or states and actions have different units.
         """
         options["joint_names"] = joint_names
-        assembly = open_recording(path, robot=robot, **options).assembly
+        recording = open_recording(path, robot=robot, **options)
+        assembly = recording.assembly
         layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
         called = joint_names if isinstance(joint_names, Mapping) else {}
         state = _renamed(layout.features.get(STATE, source), called)
@@ -89,7 +90,7 @@ class Signals:
                 _check_units(feature, scales)
         places = {
             name: tuple(pose.select(name, environment))
-            for name, pose in frame_sources(layout, frames).items()
+            for name, pose in frame_sources(layout, frames, recording.episodes).items()
             if isinstance(pose, FramePose) and environment and _plain(pose)
         }
         return cls(

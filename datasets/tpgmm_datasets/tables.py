@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 __all__ = [
     "demonstrations_from_frame",
     "demonstrations_to_frame",
+    "numbers",
     "read_table",
     "trajectories_to_frame",
     "write_table",
@@ -176,8 +177,8 @@ def demonstrations_from_frame(
         try:
             made.append(
                 Demonstration(
-                    torch.from_numpy(_numbers(kept, [time])[:, 0]),
-                    torch.from_numpy(_numbers(kept, names)),
+                    torch.from_numpy(numbers(kept, [time])[:, 0]),
+                    torch.from_numpy(numbers(kept, names)),
                     _poses(kept, {time, episode, *names}),
                     None if names == [str(i) for i in range(len(names))] else tuple(names),
                     {
@@ -373,7 +374,7 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
     columns = _others(part, others)
     frames: dict[str, Frame] = {}
     for name, group in pose_groups(columns).items():
-        pose = _numbers(part, [columns[i] for i in group])
+        pose = numbers(part, [columns[i] for i in group])
         pose = pose[0] if bool((pose == pose[0]).all()) else pose
         frames[name] = Frame(pose[..., :3], pose[..., 3:])
     return frames
@@ -381,14 +382,26 @@ def _poses(part: pd.DataFrame, others: set[str]) -> dict[str, Frame]:
 
 def _only(part: pd.DataFrame, name: str) -> float:
     """The one value that an event's column repeats."""
-    values = _numbers(part, [name])
+    values = numbers(part, [name])
     if bool((values != values[0]).any()):
         raise DataError(f"column {name!r} is one time [s], but it changes")
     return float(values[0, 0])
 
 
-def _numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
-    """Columns as numbers, none of them missing."""
+def numbers(part: pd.DataFrame, names: Sequence[str]) -> Array:
+    """Columns of a table as numbers (rows, columns), none of them missing.
+
+    Parameters
+    ----------
+    part : pandas.DataFrame
+    names : sequence of str
+        Of the columns.
+
+    Raises
+    ------
+    DataError, UnknownNameError
+        If a column is missing, or holds something else.
+    """
     columns = []
     for name in names:
         if name not in part.columns:

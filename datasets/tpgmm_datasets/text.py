@@ -6,42 +6,35 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.conversion.poses import FramePose
 from tpgmm_datasets.events import parse_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_torch.exceptions import DataError
 
 __all__ = ["parse_episodes", "parse_events", "parse_frames", "parse_joint_names", "parse_units"]
 
-#: ``bottle``, ``bottle=FEATURE``, ``bottle=FEATURE[7:14]`` or ``bottle=LINK@EVENT``.
-FRAME = re.compile(
-    r"(?P<name>[^=@\[\]]+)"
-    r"(=(?P<source>[^=@\[\]]+)(@(?P<event>[^=@\[\]]+)|\[(?P<start>\d+):(?P<stop>\d+)\])?)?"
-)
+#: ``FEATURE``, ``FEATURE[7:14]``, ``LINK@EVENT`` or ``LINK@EVENT+x,y,z``; and a table's file.
+SOURCE = re.compile(r"([^=@\[\]]+)(?:@[^=@\[\]]+|\[(\d+):(\d+)\])?|.+\.(?:csv|parquet)")
 
 
 def parse_frames(texts: Sequence[str]) -> dict[str, Any] | None:
     """The argument ``frames``; None without texts.
 
-    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]`` or ``NAME=LINK@EVENT``;
-    anything else is a DataError.
+    Each text is ``NAME``, ``NAME=FEATURE``, ``NAME=FEATURE[7:14]``, ``NAME=POSES.csv``,
+    ``NAME=LINK@EVENT`` or ``NAME=LINK@EVENT+x,y,z``; anything else is a DataError.
     """
     frames: dict[str, Any] = {}
     for text in texts:
-        match = FRAME.fullmatch(text)
-        if match is None:
+        name, given, source = (part.strip() for part in text.partition("="))
+        match = SOURCE.fullmatch(source)
+        if not re.fullmatch(r"[^@\[\]]+", name) or name in frames or (given and not match):
             raise DataError(
-                f"frame {text!r} is not NAME, NAME=FEATURE, NAME=FEATURE[7:14] or "
-                "NAME=LINK@EVENT"
+                f"frame {text!r} is given twice, or is not NAME, NAME=FEATURE, "
+                "NAME=FEATURE[7:14], NAME=POSES.csv or NAME=LINK@EVENT"
             )
-        source, event, start = match["source"], match["event"], match["start"]
-        if event:
-            frames[match["name"]] = LinkPose(source, event)
-        elif source is None:
-            frames[match["name"]] = FramePose(ENVIRONMENT, constant=None)
-        else:
-            columns = slice(int(start), int(match["stop"])) if start else None
-            frames[match["name"]] = FramePose(source, columns)
+        frames[name] = source or FramePose(ENVIRONMENT, constant=None)
+        if match and match[2]:
+            frames[name] = FramePose(match[1], slice(int(match[2]), int(match[3])))
     return frames or None
 
 

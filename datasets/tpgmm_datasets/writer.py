@@ -1,8 +1,10 @@
-"""Write demonstrations as a LeRobot data set of version 3.0."""
+"""Write demonstrations as a LeRobot data set of version 3.0, or add frames to one."""
 
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -13,15 +15,23 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 
+from tpgmm_datasets.conversion.assembly import FrameSource, frame_sources, stored_frames
+from tpgmm_datasets.conversion.poses import MeasuredPoses
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.columns import (
+    ENVIRONMENT,
     action_column,
     demonstration_columns,
     feature_table,
     features_of,
+    frame_columns,
+    with_frames,
 )
+from tpgmm_datasets.lerobot.episodes import Relaxed, read_episodes
 from tpgmm_datasets.lerobot.files import METADATA_KEY, file_path, free_place, write_tables
+from tpgmm_datasets.lerobot.hub import local_folder
 from tpgmm_datasets.lerobot.layout import Layout, open_layout
+from tpgmm_datasets.lerobot.parquet import open_parquet, read_columns
 from tpgmm_datasets.lerobot.statistics import (
     QUANTILES,
     Statistics,
@@ -31,7 +41,7 @@ from tpgmm_datasets.lerobot.statistics import (
 from tpgmm_torch.atomic import replacing
 from tpgmm_torch.data.demonstrations import Demonstration, check_demonstrations
 
-__all__ = ["save_lerobot"]
+__all__ = ["add_frames", "save_lerobot"]
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -136,6 +146,117 @@ def save_lerobot(
         info = declared if old is None else _extended(old, declared)
         _Writer(new, info, old).write(demonstrations, tasks, commanded)
     return path
+
+
+def add_frames(path: str | Path, out: str | Path, frames: Mapping[str, FrameSource]) -> Path:
+    """Write a copy of a LeRobot data set (v3.0) with the poses of more frames.
+
+    They are put behind what is in ``observation.environment_state``, seven values each, so that
+    LeRobot's policies see the objects too. All else stays as it is; videos are linked where
+    that can be, else copied.
+
+    Parameters
+    ----------
+    path : str or Path
+        The data set, as for :func:`load_lerobot`.
+    out : str or Path
+        The folder of the copy; it must not exist.
+    frames : mapping of str to str, Path, Frame, sequence or mapping of Frame
+        A table of poses, or frames that are given, as for :func:`load_lerobot`. Where a link is
+        at an event can be learned without such a copy.
+
+    Returns
+    -------
+    Path
+        The folder of the copy.
+
+    Raises
+    ------
+    DatasetError
+        If the set is damaged or of another version, the folder exists, a frame is there
+        already, or its poses do not fit to the episodes. There is no copy then.
+    """
+    path, out = local_folder(path), Path(out)
+    layout = open_layout(path)
+    for problem in layout.problems:
+        raise problem
+    if layout.version != "v3.0" or not layout.episodes:
+        raise DatasetError(
+            f"frames are added to sets of v3.0, this is {layout.version} with "
+            f"{len(layout.episodes)} episodes: convert it first (tpgmm dataset convert, or "
+            "LeRobot's own converter, which keeps videos)"
+        )
+    sources = frame_sources(layout, frames, layout.episodes)
+    if not sources or not all(isinstance(one, MeasuredPoses) for one in sources.values()):
+        raise DatasetError(
+            f"a table (NAME=POSES.csv) or frames by episode can be added, got {dict(frames)}; "
+            "LINK@EVENT and features are learned from the set as it is"
+        )
+    old = layout.features.get(ENVIRONMENT)
+    declared = {ENVIRONMENT: with_frames(old, list(sources))}
+    features = {**layout.info["features"], **declared}
+    with replacing(out) as new:
+        if out.exists():
+            raise DatasetError(f"{out} exists; remove it, or give another folder for the copy")
+        hidden = shutil.ignore_patterns(".*")
+        shutil.copytree(path, new, ignore=hidden, copy_function=_link_videos)
+        found, whole = dict[int, dict[str, Any]](), dict[str, Any]()
+        for file in dict.fromkeys(episode.file for episode in layout.episodes):
+            wanted = [episode for episode in layout.episodes if episode.file == file]
+            parts = []
+            for rows in read_episodes(layout, wanted, [old] if old else [], Relaxed(())):
+                values = rows.values.get(ENVIRONMENT, np.empty((len(rows.time), 0)))
+                poses = stored_frames(layout, sources, rows)
+                column = frame_columns(values, poses, declared, rows.episode.index)
+                parts.append(feature_table(column, declared))
+                statistics = episode_statistics(column)
+                whole = merge_statistics(whole, statistics) if whole else statistics
+                found[rows.episode.index] = statistics[ENVIRONMENT]
+            column = pa.concat_tables(parts)[ENVIRONMENT]
+            _rewrite(path, new, file, {ENVIRONMENT: column})
+        for listed in (path / "meta" / "episodes").glob("*/*.parquet"):
+            file = listed.relative_to(path)
+            index = read_columns(listed, path, ["episode_index"])["episode_index"].to_pylist()
+            columns = {}
+            for name in whole[ENVIRONMENT]:
+                key = f"stats/{ENVIRONMENT}/{name}"
+                listing = [found[number][name].tolist() for number in index]
+                columns[key] = pa.array(listing, _episode_type(key))
+            _rewrite(path, new, file, columns)
+        meta = new / "meta"
+        try:
+            stored = {**json.loads((meta / "stats.json").read_text(encoding="utf-8"))}
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise DatasetError(f"no statistics: {error}", file="meta/stats.json") from error
+        stored[ENVIRONMENT] = {name: v.tolist() for name, v in whole[ENVIRONMENT].items()}
+        _write_json(meta / "stats.json", stored)
+        _write_json(meta / "info.json", {**layout.info, "features": features})
+    return out
+
+
+def _link_videos(source: str, target: str) -> None:
+    """Link what is large and never changed in place, else copy."""
+    if Path(source).suffix in (".mp4", ".png", ".jpg"):
+        with suppress(OSError):
+            os.link(os.path.realpath(source), target)
+            return
+    shutil.copy2(source, target)
+
+
+def _rewrite(old: Path, new: Path, file: Path, columns: Mapping[str, Any]) -> None:
+    """Write a parquet file of a set with some columns replaced, or added behind the others."""
+    with open_parquet(old / file, old, ()) as parquet:
+        table = parquet.read()
+    for name, column in columns.items():
+        if name in table.column_names:
+            table = table.set_column(table.column_names.index(name), name, column)
+        else:
+            table = table.append_column(name, column)
+    write_tables(new / file, [table])
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=4), encoding="utf-8")
 
 
 def _tasks(task: str | Sequence[str], count: int) -> list[str]:
@@ -273,8 +394,8 @@ class _Writer:
             "total_tasks": len(self.tasks),
             "splits": {"train": f"0:{self.episodes}"},
         }
-        for name, content in (("info.json", self.info), ("stats.json", statistics)):
-            (meta / name).write_text(json.dumps(content, indent=4), encoding="utf-8")
+        _write_json(meta / "info.json", self.info)
+        _write_json(meta / "stats.json", statistics)
 
 
 def _episode_type(key: str) -> pa.DataType:

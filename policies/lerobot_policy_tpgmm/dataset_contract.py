@@ -74,7 +74,8 @@ def _check_links(config: TPGMMConfig, kinematics: Kinematics) -> None:
             raise UnknownNameError(
                 "link", pose.link, f"the robot (frame {name!r})", kinematics.links
             )
-        clear = pose.event == "start" or config.environment_names or not config.frames
+        at_start = pose.event == "start" and pose.offset is None
+        clear = at_start or config.environment_names or not config.frames
         if not clear and name not in (config.frames or ()):
             raise DataError(
                 f"frame {name!r} is at {config.training.link_frames[name]!r} in the episodes; "

@@ -266,7 +266,8 @@ def observed_frames(
     Where a link is at the start follows from the joints, unless the names of the entries of
     ``config`` tell of the frame. The ``summary`` is that of the demonstrations.
     """
-    start = {name for name, pose in config.link_poses().items() if pose.event == "start"}
+    poses = config.link_poses().items()
+    start = {name for name, pose in poses if pose.event == "start" and pose.offset is None}
     if summary is not None:
         start |= {name for name, shown in summary.frames.items() if shown.link is not None}
     placed = {*(config.frames or ()), *poses_named(config.environment_names)}

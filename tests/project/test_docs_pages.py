@@ -14,6 +14,7 @@ import typer
 from packaging.requirements import Requirement
 from typer.testing import CliRunner
 
+from tests.support import first_skill
 from tpgmm_datasets import load_lerobot, save_lerobot
 from tpgmm_datasets.bottle.experiment import bottle_operators
 from tpgmm_datasets.bottle.skill import TASK, BottleShaking
@@ -49,7 +50,7 @@ def blocks(page: Path) -> Iterator[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory) -> Path:
-    """A folder with what ``tpgmm demo`` leaves: fewer steps, demonstrations and components."""
+    """A folder with what ``tpgmm demo`` leaves, if shorter, and with recordings of a cup."""
     folder = tmp_path_factory.mktemp("pages")
     skill = BottleShaking(rate=10)
     path = folder / "out" / "demo" / "dataset"
@@ -59,6 +60,7 @@ def demo(tmp_path_factory) -> Path:
     model = TaskParameterizedGMM(12, bottle_operators(), skill.robot).fit(aligned)
     save(model, folder / "out" / "demo" / "model")
     (folder / "robot.urdf").write_text(upper_body_urdf(), encoding="utf-8")
+    first_skill.record(folder)
     return folder
 
 

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -627,6 +627,89 @@ def a_bottle_that_is_nowhere(_):
 def a_tick_with_the_bottle_elsewhere(_):
     model = bottle_model(4, tol=1e6).fit(shown())
     model.step(1.0, usual().joints, moved(0.0, 1.0, 0.0)(usual()).frames)
+
+
+# -- measured poses ------------------------------------------------------------------------
+
+
+def moving(start, step):
+    return [f"{e},{start + step * n},0.{n},0,0" for e in range(3) for n in range(9)]
+
+
+STILL, ONES = "episode,x,y,z", ["0,0.3,0.1,0.0", "1,0.3,0.2,0.0", "2,0.4,0.2,0.0"]
+#: A table of a cup's poses beside a set of three episodes: name, header, rows, what is told.
+MEASURED = (
+    (
+        "an_episode_without_a_pose",
+        STILL,
+        ONES[:2],
+        r"episode 2: .* 0 rows for this .*--episodes",
+    ),
+    (
+        "two_poses_for_an_episode",
+        STILL,
+        [*ONES, ONES[1]],
+        r"episode 1: .*2 rows for this .*'time'",
+    ),
+    (
+        "episodes_from_one",
+        STILL,
+        ["1,0,0,0", "2,0,0,0", "3,0,0,0"],
+        r"episodes 3, the set has 0 to 2",
+    ),
+    ("episodes_by_name", STILL, ["a,0,0,0", "b,0,0,0"], r"'episode' holds no numbers"),
+    ("half_episodes", STILL, ["0.5,0,0,0"], r"episodes 0.5, the set has 0 to 2"),
+    ("no_rows", STILL, [], r"no rows"),
+    ("no_episodes", "x,y,z", ["0,0,0"], r"columns .* Name them episode"),
+    ("no_height", "episode,x,y", ["0,0.3,0.1"], r"Name them episode, x, y, z"),
+    ("half_a_quaternion", f"{STILL},qx,qy,qz", ["0,0,0,0,0,0,0"], r"qw, qx, qy, qz"),
+    (
+        "two_rotations",
+        f"{STILL},yaw,yaw_deg",
+        ["0,0,0,0,0,0"],
+        r"\['yaw_deg'\] are unknown or there twice",
+    ),
+    ("semicolons", "episode;x;y;z", ["0;0;0;0"], r"are unknown"),
+    ("another_column", f"{STILL},score", ["0,0,0,0,1"], r"\['score'\] are unknown"),
+    ("another_object", "episode,mug.x,mug.y,mug.z", ONES, r"'mug.z'\]. Name them .*cup.x"),
+    ("millimetres", STILL, ["0,300,100,0", *ONES[1:]], r"episode 0: .*316.2 m away.*x_mm"),
+    ("degrees", f"{STILL},yaw", [f"{row},90" for row in ONES], r"in degrees\? .*yaw_deg"),
+    ("a_gap", STILL, ["0,0.3,,0.0", *ONES[1:]], r"episode 0: .*'y' lacks a value"),
+    ("infinity", STILL, ["0,0.3,inf,0.0", *ONES[1:]], r"episode 0: .*NaN or infinite|inf m"),
+    ("no_unit", f"{STILL},qx,qy,qz,qw", [f"{row},0,0,0.6,0.9" for row in ONES], r"norm .* off"),
+    ("milliseconds", "episode,time,x,y,z", moving(0, 20), r"from 0 to 160,.*in seconds"),
+    ("time_of_day", "episode,time,x,y,z", moving(1.7e9, 0.02), r"from the start of each"),
+    ("no_time_goes_by", "episode,time,x,y,z", moving(0.1, 0), r"time does not increase"),
+)
+
+
+def load_measured(folder, header, rows):
+    sets.write(folder / "set")
+    (folder / "poses.csv").write_text("\n".join([header, *rows]))
+    load_lerobot(folder / "set", frames={"cup": folder / "poses.csv"})
+
+
+for name, header, rows, told in MEASURED:
+    make = partial(load_measured, header=header, rows=rows)
+    MISTAKES.append(Mistake("poses", name, told, make))
+
+
+@mistake("poses", r"a Frame for all, or one for each of .*; got list of 3 float")
+def a_position_in_place_of_a_frame(folder):
+    sets.write(folder / "set")
+    load_lerobot(folder / "set", frames={"cup": [0.3, 0.1, 0.0]})
+
+
+@mistake("poses", r"turn: bottle: .*the pose of l_hand at grasp .*offset=")
+def the_object_for_the_hand_that_held_it(_):
+    def grasped(item):
+        frame = upper_body().state(item.joints[len(item) // 2]).pose("l_hand")
+        vars(frame).update(at="l_hand@grasp")
+        return replace(item, frames={"bottle": frame})
+
+    model = learn(each(grasped))
+    pose = grasped(shown()[0]).frames["bottle"]
+    model.predict([Situation(shown()[0].joints[0], {"bottle": Frame(pose.position)})])
 
 
 # -- values --------------------------------------------------------------------------------

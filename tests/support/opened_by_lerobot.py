@@ -10,7 +10,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from written_sets import FPS, assert_same, demonstration  # this folder is on the path
 
 from tpgmm_datasets import load_lerobot, save_lerobot
+from tpgmm_datasets.writer import add_frames
 from tpgmm_torch.data.demonstrations import Demonstration
+from tpgmm_torch.data.frames import Frame
 
 NUMBERS = ("episode_index", "index", "frame_index")
 
@@ -86,6 +88,40 @@ def check_sets_of_lerobot(root, written):
         assert_same(found, expected, 1e-6)
 
 
+def check_added_frames(folder):
+    """A set of LeRobot's with a video opens with an object's poses, pictures included."""
+    names, rng = ["x", "y", "z"], np.random.default_rng(0)
+    vector = {"dtype": "float32", "shape": (3,), "names": names}
+    video = {"dtype": "video", "shape": (64, 96, 3), "names": ["height", "width", "channels"]}
+    features = {"observation.state": vector, "action": vector, "observation.images.top": video}
+    made = LeRobotDataset.create(
+        "local/set", fps=FPS, features=features, root=folder / "filmed"
+    )
+    for length in (8, 5):
+        for _ in range(length):
+            values = {
+                name: rng.normal(size=3).astype(np.float32) for name in list(features)[:2]
+            }
+            picture = {"observation.images.top": rng.integers(0, 255, (64, 96, 3), np.uint8)}
+            made.add_frame({**values, **picture, "task": "reach"})
+        made.save_episode()
+    made.finalize()
+    poses = [Frame([0.3, 0.1, 0.0]), Frame([0.4, 0.2, 0.0])]
+    copied, old = (
+        opened(add_frames(folder / "filmed", folder / "copy", {"cup": poses})),
+        opened(folder / "filmed"),
+    )
+    for row in range(13):
+        after, before = copied[row], old[row]
+        assert torch.equal(
+            after.pop("observation.environment_state"), pose(poses[row > 7]).float()
+        )
+        for key, value in before.items():
+            same = torch.equal(after[key], value) if isinstance(value, torch.Tensor) else True
+            assert same, key
+    assert len(LeRobotDataset("local/set", root=folder / "copy", episodes=[1])) == 5
+
+
 def main(folder):
     written = [demonstration(seed, length=20 + seed) for seed in range(4)]
     for few in (written[:2], written[2:]):
@@ -98,6 +134,7 @@ def main(folder):
     check_every_frame(wide, written)
     bare = [Demonstration(d.time, d.joints, {}, d.joint_names) for d in written]
     check_sets_of_lerobot(folder / "theirs", bare)
+    check_added_frames(folder)
     print("all equal")
 
 

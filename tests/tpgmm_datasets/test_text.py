@@ -32,13 +32,17 @@ def test_episodes_units_and_frames_are_read_from_text():
     assert parse_units(two)["calibration"] == {"left_": "l.json", "right_": "r.json"}
     frames = parse_frames(["a", "b=poses", "c=poses[7:14]", "d=hand@close"])
     assert frames["a"].feature == "observation.environment_state"
-    assert (frames["b"].feature, frames["b"].columns) == ("poses", None)
+    assert frames["b"] == "poses"
     assert frames["c"].columns == slice(7, 14)
-    assert (frames["d"].link, frames["d"].event) == ("hand", "close")
+    assert frames["d"] == "hand@close"
+    texts = ["e = a@b/[1]=poses.csv", "f=hand@close+0,0,-0.1"]
+    assert parse_frames(texts) == {"e": "a@b/[1]=poses.csv", "f": "hand@close+0,0,-0.1"}
     assert parse_frames([]) is None
 
 
-@pytest.mark.parametrize("texts", [["a="], ["=b"], ["a=b[1]"], ["a=b@"], ["a@b"]])
+@pytest.mark.parametrize(
+    "texts", [["a="], ["=b"], ["a=b[1]"], ["a=b@"], ["a@b"], ["a=b", "a=c"]]
+)
 def test_a_frame_that_is_none_is_refused(texts):
     with pytest.raises(DataError, match="is not NAME, NAME=FEATURE"):
         parse_frames(texts)

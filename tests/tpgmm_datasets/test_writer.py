@@ -4,17 +4,21 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.lerobot_sets import to_v21
 from tests.support.written_sets import FPS, assert_same, demonstration, unit
 from tpgmm_datasets import DatasetError, load_lerobot, save_lerobot
 from tpgmm_datasets import writer as writer_module
+from tpgmm_datasets.writer import add_frames
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 
@@ -149,10 +153,7 @@ def test_an_interrupted_write_leaves_the_old_set_or_none(tmp_path, monkeypatch, 
     if append:
         save_lerobot(old, root, fps=FPS, task="reach")
 
-    def interrupt(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(writer_module, stage, interrupt)
+    monkeypatch.setattr(writer_module, stage, interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_lerobot([demonstration(1)], root, fps=FPS, task="reach", append=append)
     assert [path.name for path in tmp_path.iterdir()] == (["set"] if append else [])
@@ -175,3 +176,69 @@ def test_lerobot_opens_what_is_written_and_the_other_way_round(tmp_path):
     )
     assert result.returncode == 0, result.stderr[-3000:]
     assert "all equal" in result.stdout
+
+
+def saved(written, root):
+    """In two files, with a video beside them."""
+    for few in (written[:3], written[3:]):
+        save_lerobot(few, root, fps=FPS, task="reach", append=True)
+    (root / "videos").mkdir()
+    (root / "videos" / "file.mp4").write_text("pictures")
+    return root
+
+
+@pytest.mark.parametrize("kept", [(), ("bottle",), ("bottle", "hand")])
+def test_a_set_with_frames_added_is_the_one_that_had_them(tmp_path, kept):
+    whole = [demonstration(seed, length=10 + seed) for seed in range(5)]
+    few = [replace(one, frames={name: one.frames[name] for name in kept}) for one in whole]
+    added = {n: [one.frames[n] for one in whole] for n in ("bottle", "hand") if n not in kept}
+    had, root = saved(whole, tmp_path / "had"), saved(few, tmp_path / "set")
+    before = {file: file.read_bytes() for file in root.rglob("*") if file.is_file()}
+    if not added:
+        with pytest.raises(DatasetError, match=r"frames \['hand'\] some are in the set"):
+            add_frames(root, tmp_path / "copy", {"hand": [Frame([0, 0, 0])] * 5})
+        return
+    copy = add_frames(root, tmp_path / "copies" / "set", added)
+    for found, expected in zip(load_lerobot(copy), load_lerobot(had), strict=True):
+        assert_same(found, expected, 0.0)
+    assert read_info(copy) == read_info(had)
+    for file in (path.relative_to(had) for path in had.rglob("*") if path.is_file()):
+        if file.suffix == ".parquet":
+            one, other = (pd.read_parquet(folder / file) for folder in (copy, had))
+            pd.testing.assert_frame_equal(one[other.columns], other)
+        elif file.name == "stats.json":
+            stats = [json.loads((folder / file).read_text()) for folder in (copy, had)]
+            assert stats[0] == stats[1]
+    assert (copy / "videos" / "file.mp4").samefile(root / "videos" / "file.mp4")
+    assert not (copy / "meta" / "tasks.parquet").samefile(root / "meta" / "tasks.parquet")
+    save_lerobot(whole[:1], copy, fps=FPS, task="reach", append=True)  # it is a set like others
+    assert {file: file.read_bytes() for file in root.rglob("*") if file.is_file()} == before
+
+
+def test_frames_that_cannot_be_added_leave_no_copy(root, tmp_path, monkeypatch):
+    given = {"cup": [Frame([0.3, 0, 0])] * 3}
+    for frames, told in (
+        ({"cup": "hand@close"}, r"table .* or frames by episode .*'hand@close'.*LINK@EVENT"),
+        ({"bottle": given["cup"]}, r"frames \['bottle'\] some are in the set"),
+        ({}, "by episode can be added, got {}"),
+        ({"cup": given["cup"][:2]}, "list of 2 Frame"),
+        ({"cup": [Frame(np.zeros((12, 3)))] * 3}, "episode 1: frame 'cup' has 12 poses"),
+    ):
+        with pytest.raises(DatasetError, match=told):
+            add_frames(root, tmp_path / "copy", frames)
+    with pytest.raises(DatasetError, match=r"sets of v3\.0, this is v2\.1 .*dataset convert"):
+        add_frames(to_v21(root, tmp_path / "old"), tmp_path / "copy", given)
+    for stage in ("episode_statistics", "write_tables", "_write_json"):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(writer_module, stage, interrupted)
+            add_frames(root, tmp_path / "copy", given)
+    assert not (tmp_path / "copy").exists()
+    (root / "meta" / "stats.json").write_text("[")
+    with pytest.raises(DatasetError, match=r"meta/stats\.json: no statistics"):
+        add_frames(root, tmp_path / "copy", given)
+    with pytest.raises(DatasetError, match="old exists; remove it"):
+        add_frames(root, tmp_path / "old", given)
+
+
+def interrupted(*_):
+    raise KeyboardInterrupt

@@ -109,6 +109,8 @@ class FrameSummary:
     link : str or None
         The link of the robot that was there at the start of every demonstration: the frame of
         a new situation then follows from its start posture.
+    at : str or None
+        ``"LINK@EVENT"`` where it was not an object's pose but a link's in every demonstration.
     """
 
     low: Sequence[float]
@@ -119,11 +121,14 @@ class FrameSummary:
     turn: Region
     moves: bool = False
     link: str | None = None
+    at: str | None = None
 
     def __post_init__(self) -> None:
         _check_numbers(self, low=(3,), high=(3,), orientation=(4,), angle=())
         if not len(self.place.mean) == len(self.turn.mean) == 3 or type(self.moves) is not bool:
             raise DataError("a frame has a place and a turn of 3 numbers, and moves or not")
+        if "@" not in ("@" if self.at is None else self.at):
+            raise DataError(f"a frame is at LINK@EVENT, got {self.at!r:.60}")
 
     @classmethod
     def of(cls, paths: Sequence[PathSummary], links: Mapping[str, Frame]) -> Self:
@@ -153,6 +158,7 @@ class FrameSummary:
             Region.of(rotations, "turn"),
             any(path.moves for path in paths),
             same[0] if same else None,
+            paths[0].at if len({path.at for path in paths}) == 1 else None,
         )
 
     def rotation_vectors(self, orientations: Array) -> Array:
@@ -415,6 +421,12 @@ class TrainingSummary:
         remedy = "Is the quaternion (w, x, y, z)? Else show the skill so too"
         if known.turn.distance(swapped) <= UNLIKELY * self.limit:
             remedy = "Read as (x, y, z, w) it would fit: quaternions are (w, x, y, z)"
+        if known.at is not None:
+            remedy = (
+                f"It was the pose of {known.at.replace('@', ' at ')} in the demonstrations: "
+                "give where that is to be, and not an object's pose; or learn the object's, "
+                f"LinkPose(..., offset=Frame(...)) (--frame {name}={known.at}+X,Y,Z,YAW)"
+            )
         degrees = f"{np.rad2deg(angle):.0f} deg from the mean, shown up to "
         return f"{name}: turned by {degrees}{np.rad2deg(known.angle):.0f}", remedy, ()
 

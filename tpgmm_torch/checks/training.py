@@ -53,6 +53,8 @@ class PathSummary:
         Whether it moves by more than a tracker's noise.
     recorded : bool
         Whether there is a pose for each time step.
+    at : str or None
+        As of the frame: the link and event whose pose it is.
     """
 
     position: Array
@@ -61,6 +63,7 @@ class PathSummary:
     high: Array
     moves: bool
     recorded: bool
+    at: str | None = None
 
     @classmethod
     def of(cls, frame: Frame) -> PathSummary:
@@ -74,6 +77,7 @@ class PathSummary:
             positions.max(axis=0),
             bool((first.change(frame, STILL, STILL / LEVER) > 1).any()),
             bool(frame.batch_shape),
+            frame.at,
         )
 
 

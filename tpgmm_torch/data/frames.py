@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -53,6 +53,8 @@ class Frame:
 
     position: Tensor
     orientation: Tensor
+    #: ``"LINK@EVENT"`` where it is a link's own pose at an event, and not an object's.
+    at: str | None = field(default=None, init=False, repr=False)
 
     def __init__(self, position: Any, orientation: Any = None) -> None:
         position = as_tensor(position, "the frame's position")
@@ -92,7 +94,9 @@ class Frame:
     def to(self, *args: Any, **kwargs: Any) -> Frame:
         """A copy on another device or of another dtype, like :meth:`torch.Tensor.to`."""
         parts = (part.to(*args, **kwargs) for part in (self.position, self.orientation))
-        return self._from(*parts)
+        moved = self._from(*parts)
+        vars(moved).update(at=self.at)
+        return moved
 
     def expand(self, batch: Sequence[int]) -> Frame:
         """The same pose for all of a batch, without copying."""

@@ -4,37 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from tpgmm_datasets.conversion.joints import JointColumns
-from tpgmm_datasets.conversion.poses import FramePose, LinkPose
+from tpgmm_datasets.conversion.poses import FramePose, LinkPose, MeasuredPoses
 from tpgmm_datasets.conversion.timing import resample, trim
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.events import Detector, parse_event, usual_event
 from tpgmm_datasets.lerobot.columns import ENVIRONMENT
 from tpgmm_datasets.lerobot.episodes import EpisodeRows
 from tpgmm_datasets.lerobot.event_flags import event_features, flagged_events
-from tpgmm_datasets.lerobot.layout import Feature, Layout
+from tpgmm_datasets.lerobot.layout import Episode, Feature, Layout
 from tpgmm_datasets.names import pose_groups
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
 from tpgmm_torch.exceptions import DataError
 
-__all__ = ["Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources"]
+__all__ = [
+    "Assembly", "EventSource", "FrameSource", "event_sources", "frame_sources",
+    "stored_frames",
+]  # fmt: skip
 
-FrameSource = str | FramePose | LinkPose | Frame
+Pose = FramePose | LinkPose | MeasuredPoses | Frame
+FrameSource = str | Path | Pose | Sequence[Frame] | Mapping[int, Frame]
 EventSource = str | Detector | Callable[[Demonstration], float]
 
 
 def frame_sources(
-    layout: Layout, frames: Mapping[str, FrameSource] | None
-) -> dict[str, FramePose | LinkPose | Frame]:
-    """Where each frame is; None stands for those that the data set itself names."""
+    layout: Layout, frames: Mapping[str, FrameSource] | None, chosen: Sequence[Episode]
+) -> dict[str, Pose]:
+    """Where each frame is in the chosen episodes; None stands for those that the set names.
+
+    Raises
+    ------
+    DatasetError
+        If a source is none, or has not one pose for each of these episodes.
+    """
     if frames is not None:
+        wanted = [episode.index for episode in chosen]
+        known = {episode.index for episode in layout.episodes}
         return {
-            name: _frame_source(layout, source) if isinstance(source, str) else source
+            name: _frame_source(layout, name, source, wanted, known)
             for name, source in frames.items()
         }
     feature = layout.features.get(ENVIRONMENT)
@@ -44,15 +57,24 @@ def frame_sources(
     }
 
 
-def _frame_source(layout: Layout, text: str) -> FramePose | LinkPose:
-    if "@" in text and text not in layout.features:
-        return LinkPose.parse(text)
-    return FramePose(text)
+def _frame_source(
+    layout: Layout, name: str, source: Any, wanted: Sequence[int], known: Collection[int]
+) -> Pose:
+    if isinstance(source, str | Path):
+        text, path = str(source), Path(source)
+        if text in layout.features:
+            return FramePose(text)
+        if path.suffix in (".csv", ".parquet") or path.is_file():
+            return MeasuredPoses.read(name, path, wanted, known)
+        return LinkPose.parse(text) if "@" in text else FramePose(text)
+    return (
+        source if isinstance(source, Pose) else MeasuredPoses.given(name, source, wanted, known)
+    )
 
 
 def event_sources(
     events: Mapping[str, EventSource] | None,
-    frames: Mapping[str, FramePose | LinkPose | Frame],
+    frames: Mapping[str, Pose],
     stored: Collection[str],
     names: Sequence[str] | None,
 ) -> dict[str, Detector | Callable[[Demonstration], float]]:
@@ -62,7 +84,7 @@ def event_sources(
     ----------
     events : mapping of str to str, Detector or callable, or None
         Those that are given.
-    frames : mapping of str to FramePose, LinkPose or Frame
+    frames : mapping of str to FramePose, LinkPose, MeasuredPoses or Frame
         Which may be at others.
     stored : collection of str
         Events that are there already.
@@ -104,6 +126,23 @@ def event_sources(
     return sources | usual
 
 
+def stored_frames(
+    layout: Layout, sources: Mapping[str, Pose], rows: EpisodeRows
+) -> dict[str, Frame]:
+    """The frames of an episode that are not at links."""
+    frames, where = dict[str, Frame](), rows.episode.where
+    for name, source in sources.items():
+        if isinstance(source, FramePose):
+            feature = layout.feature(source.feature)
+            places = source.select(name, feature)
+            frames[name] = source.frame(rows.values[feature.key], places, **where)
+        elif isinstance(source, MeasuredPoses):
+            frames[name] = source.frame(name, rows.time, **where)
+        elif isinstance(source, Frame):
+            frames[name] = source
+    return frames
+
+
 @dataclass(frozen=True)
 class Assembly:
     """What a demonstration is made of.
@@ -114,7 +153,7 @@ class Assembly:
         The data set.
     joints : JointColumns
         Where the joints are.
-    frames : mapping of str to FramePose, LinkPose or Frame
+    frames : mapping of str to FramePose, LinkPose, MeasuredPoses or Frame
         Where the pose of each frame is.
     events : mapping of str to Detector or callable
         Detectors, or functions from the demonstration, with all values of the joint feature,
@@ -137,7 +176,7 @@ class Assembly:
 
     layout: Layout
     joints: JointColumns
-    frames: Mapping[str, FramePose | LinkPose | Frame]
+    frames: Mapping[str, Pose]
     events: Mapping[str, Detector | Callable[[Demonstration], float]]
     robot: Any
     rate: float | None
@@ -147,12 +186,7 @@ class Assembly:
     def __post_init__(self) -> None:
         for name, source in self.frames.items():
             if isinstance(source, LinkPose) and self.robot is None:
-                raise DatasetError(f"frame {name!r} is at a link: pass robot=")
-            if not isinstance(source, (FramePose, LinkPose, Frame)):
-                raise DatasetError(
-                    f"frame {name!r} is a feature's name, FramePose, LinkPose or Frame, "
-                    f"got {type(source).__name__}"
-                )
+                raise DatasetError(f"frame {name!r} is at a link: pass robot= (--robot)")
 
     @property
     def features(self) -> list[Feature]:
@@ -168,7 +202,7 @@ class Assembly:
         demonstration = Demonstration(
             torch.from_numpy(rows.time),
             torch.from_numpy(joints),
-            self._stored_frames(rows),
+            stored_frames(self.layout, self.frames, rows),
             self.joints.names,
             flagged_events(rows),
         )
@@ -181,19 +215,6 @@ class Assembly:
         if self.robot is not None:
             demonstration = demonstration.reordered(self.robot.joint_names)
         return demonstration
-
-    def _stored_frames(self, rows: EpisodeRows) -> dict[str, Frame]:
-        frames = {}
-        for name, source in self.frames.items():
-            if isinstance(source, FramePose):
-                feature = self.layout.feature(source.feature)
-                places = source.select(name, feature)
-                frames[name] = source.frame(
-                    rows.values[feature.key], places, **rows.episode.where
-                )
-            elif isinstance(source, Frame):
-                frames[name] = source
-        return frames
 
     def _with_events(self, demonstration: Demonstration, rows: EpisodeRows) -> Demonstration:
         events = dict(demonstration.events)

@@ -1,9 +1,12 @@
-"""Object frames: from the columns of a set, or from the pose of a robot link at an event."""
+"""Frames: in the columns of a set, measured apart from it, or a robot's link at an event."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import pi
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -12,16 +15,35 @@ import torch
 from tpgmm_datasets.errors import DatasetError
 from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import pose_groups
+from tpgmm_datasets.tables import numbers, read_table
 from tpgmm_torch import quaternions
+from tpgmm_torch.checks.report import listed
+from tpgmm_torch.checks.training import FAR
 from tpgmm_torch.data.arrays import Array
 from tpgmm_torch.data.demonstrations import Demonstration
 from tpgmm_torch.data.frames import Frame
-from tpgmm_torch.exceptions import UnknownNameError
+from tpgmm_torch.exceptions import DataError, UnknownNameError
 
-__all__ = ["FramePose", "LinkPose"]
+__all__ = ["FramePose", "LinkPose", "MeasuredPoses"]
 
 #: Number of values of each way to write a rotation.
 ROTATIONS = {"wxyz": 4, "xyzw": 4, "rotvec": 3, "euler": 3, "yaw": 1, None: 0}
+#: How the rotation is written in a table, by the parts of a pose that it has.
+WRITTEN = {
+    "x y z": None,
+    "x y z yaw": "yaw",
+    "x y z roll pitch yaw": "euler",
+    "x y z qw qx qy qz": "wxyz",
+}
+#: A column of it: the object's name, the part, its unit. What ROS says in between is left out.
+COLUMN = r"(?:(.+?)[._/])??(\w+?)(?:_index|stamp)?(?:_(mm|cm|m|deg|rad))?"
+PLACE = r"(?<![a-z])(field|pose|transform|position|translation)[._/]"
+TURN = r"(?<![a-z])(orientation|rotation)[._/]"
+UNITS = {"mm": 1e-3, "cm": 1e-2, "deg": pi / 180}
+#: The object is not further from the link that holds it [m].
+REACH = 1.0
+#: Poses over more than so many times the length of an episode are on another clock.
+LONGEST = 10.0
 
 
 @dataclass(frozen=True)
@@ -147,6 +169,179 @@ class FramePose:
 
 
 @dataclass(frozen=True)
+class MeasuredPoses:
+    """A frame whose poses were measured apart from the data set.
+
+    Parameters
+    ----------
+    poses : mapping of int to Frame
+        By the episode's index in the set: one pose, one for each of its steps, or at ``times``.
+    times : mapping of int to Tensor of shape (T,)
+        When those that move were measured, from the start of the episode [s].
+    feature : str
+        Where they are from, in place of a feature of the set.
+    """
+
+    poses: Mapping[int, Frame]
+    times: Mapping[int, torch.Tensor] = field(default_factory=dict)
+    feature: str = "the frames that were given"
+
+    @classmethod
+    def read(
+        cls, name: str, path: str | Path, wanted: Sequence[int], known: Collection[int]
+    ) -> Self:
+        """Read a table (.csv or .parquet) with a row for each episode, or for each instant.
+
+        Its columns are ``episode`` (the index in the set), ``x``, ``y``, ``z`` [m], and the
+        rotation: ``yaw`` [rad], or ``roll``, ``pitch`` and ``yaw``, or ``qw``, ``qx``, ``qy``,
+        ``qz``, or none. For objects that move there is ``time`` too, in seconds from the start
+        of the episode. ``x_mm`` or ``yaw_deg`` is in another unit, ``cup.x`` the object's of
+        several, and ``pose.orientation.w`` as ROS says it.
+
+        Parameters
+        ----------
+        name : str
+            Of the frame.
+        path : str or Path
+        wanted, known : sequence of int
+            Episodes that are to be read, and all of the set.
+
+        Raises
+        ------
+        DatasetError
+            If columns are missing, unknown or twice there; an episode has no pose, or two at a
+            time; or a number is missing or cannot be in its unit.
+        """
+        where: dict[str, Any] = {"file": path}
+        try:
+            table = read_table(path)
+            used = _pose_columns(name, table.columns)
+            if table.empty:
+                raise DataError("the table has no rows")
+            episodes = numbers(table, [used.pop("episode")[0]])[:, 0]
+            if strange := [f"{index:g}" for index in np.unique(episodes) if index not in known]:
+                raise DataError(
+                    f"rows are for episodes {listed(strange)}, the set has {min(known)} to "
+                    f"{max(known)}, as 'tpgmm dataset info' counts"
+                )
+            time = used.pop("time", ("", 1.0))[0]
+            columns, factors = zip(*used.values(), strict=True)
+            pose = FramePose(" ".join(columns), None, WRITTEN[" ".join(used)], None)
+            poses, times = dict[int, Frame](), dict[int, torch.Tensor]()
+            for episode in wanted:
+                where = {"file": path, "episode": episode}
+                rows = table[episodes == episode]
+                if len(rows) != 1 and not (time and len(rows)):
+                    raise DataError(
+                        f"the table has {len(rows)} rows for this episode, and needs one; more "
+                        "where an object moves, with a column 'time' [s]. Episodes without a "
+                        "pose can be left out (episodes=, --episodes)"
+                    )
+                values = numbers(rows, columns) * factors
+                _check_units(values, list(used))
+                poses[episode] = pose.frame(values, list(range(len(columns))))
+                if poses[episode].batch_shape:
+                    times[episode] = torch.from_numpy(numbers(rows, [time])[:, 0])
+                    if bool((times[episode].diff() <= 0).any()):
+                        raise DataError("time does not increase: two rows are for one instant")
+        except (DataError, UnknownNameError) as error:
+            raise DatasetError(f"frame {name!r}: {error}", **where) from error
+        return cls(poses, times, str(path))
+
+    @classmethod
+    def given(
+        cls, name: str, frames: Any, wanted: Sequence[int], known: Collection[int]
+    ) -> Self:
+        """Frames by episode, or one for each episode that is read; the rest as :meth:`read`.
+
+        Raises
+        ------
+        DatasetError
+            If there are others, or more or less of them.
+        """
+        given = frames if isinstance(frames, Mapping | Sequence) else ()
+        several = dict(
+            given if isinstance(given, Mapping) else zip(wanted, given, strict=False)
+        )
+        fits = len(several) == len(given) and {*wanted} <= {*several} <= {*known}
+        if not fits or not all(isinstance(frame, Frame) for frame in several.values()):
+            kinds = {type(frame).__name__ for frame in several.values()}
+            raise DatasetError(
+                f"frame {name!r} is a feature's name, a table of poses, LINK@EVENT, FramePose, "
+                "LinkPose, a Frame for all, or one for each of the episodes that are read, "
+                f"{listed([*map(str, wanted)])}, in a list or {{episode: Frame}}; got "
+                f"{type(frames).__name__} of {len(given)} {', '.join(sorted(kinds))}"
+            )
+        return cls(several)
+
+    def frame(self, name: str, time: Array, **where: Any) -> Frame:
+        """The frame in an episode whose steps are at ``time`` [s].
+
+        Raises
+        ------
+        DatasetError
+            If there are other times, or not as many poses as steps.
+        """
+        pose, measured = self.poses[where["episode"]], self.times.get(where["episode"])
+        if measured is not None:
+            begin, end, length = float(measured[0]), float(measured[-1]), float(time[-1])
+            if end <= 0 or begin > length or end - begin > LONGEST * length:
+                raise DatasetError(
+                    f"frame {name!r} was measured from {begin:.6g} to {end:.6g}, the episode "
+                    f"takes {length:.4g} s: times in {self.feature} are in seconds, from the "
+                    "start of each episode",
+                    **where,
+                )
+            pose = pose.resampled(measured, torch.from_numpy(time))
+        if pose.batch_shape not in ((), (len(time),)):
+            raise DatasetError(
+                f"frame {name!r} has {len(pose.position)} poses, the episode {len(time)} steps",
+                **where,
+            )
+        return pose
+
+
+def _pose_columns(name: str, columns: Iterable[Any]) -> dict[str, tuple[str, float]]:
+    """Column and factor of episode, time, and the parts of the pose of ``name`` in order."""
+    found: dict[str, tuple[str, float]] = {}
+    known, wrong = {"episode", "time", *" ".join(WRITTEN).split()}, []
+    for column in columns:
+        text = re.sub(PLACE, "", str(column).strip(" /").lower())
+        match = re.fullmatch(COLUMN, re.sub(TURN, "q", text))
+        thing, part, unit = match.groups() if match else ("", "", "")
+        ours = (thing or name.lower()) == name.lower()
+        if part not in known or (ours and part in found):
+            wrong.append(column)
+        elif ours:
+            found[part] = column, UNITS.get(unit, 1.0)
+    ordered = [p for p in WRITTEN if {*p.split(), "episode"} == {*found} - {"time"}]
+    if wrong or not ordered:
+        raise DataError(
+            f"the table has columns {list(columns)}"
+            + f", and {wrong} are unknown or there twice" * bool(wrong)
+            + f". Name them episode, x, y, z (or {name}.x, ...), and yaw, or qw, qx, qy, qz; "
+            "time if it moves; x_mm or yaw_deg in other units. Leave others out"
+        )
+    parts = ("episode", "time", *ordered[0].split())
+    return {part: found[part] for part in parts if part in found}
+
+
+def _check_units(values: Array, parts: Sequence[str]) -> None:
+    """Refuse poses (T, parts) that cannot be in metres and radians."""
+    turns = [i for i, part in enumerate(parts) if part in ("roll", "pitch", "yaw")]
+    if (largest := float(np.abs(values[:, turns]).max(initial=0.0))) > 2 * pi:
+        raise DataError(
+            f"an angle of {largest:.4g} rad is more than a turn: is it in degrees? Then call "
+            f"the columns {', '.join(f'{parts[i]}_deg' for i in turns)}"
+        )
+    if (distance := float(np.linalg.norm(values[:, :3], axis=1).max())) > FAR:
+        raise DataError(
+            f"it is {distance:.4g} m away from the base of the robot: in millimetres or "
+            "centimetres? Then call the columns x_mm, y_mm, z_mm, or x_cm, ..."
+        )
+
+
+@dataclass(frozen=True)
 class LinkPose:
     """A frame that is where a link of the robot is at an event.
 
@@ -162,29 +357,55 @@ class LinkPose:
     event : str or callable
         Name of an event of the demonstration, ``"start"`` and ``"end"`` among them, or a
         function from the demonstration to a time [s].
+    offset : Frame, optional
+        The object's pose in the link at that event. The frame is then the object's, as a
+        tracker tells it; without an offset it is the link's.
 
     Examples
     --------
     >>> LinkPose.parse("right_hand@close")
-    LinkPose(link='right_hand', event='close')
+    LinkPose(link='right_hand', event='close', offset=None)
+    >>> LinkPose.parse("right_hand@close+0,0,0.06").offset.position.tolist()
+    [0.0, 0.0, 0.06]
     """
 
     link: str
     event: str | Callable[[Demonstration], float]
+    offset: Frame | None = None
+
+    def __post_init__(self) -> None:
+        is_frame = isinstance(self.offset, Frame)
+        if self.offset is not None and not (is_frame and self.offset.position.norm() < REACH):
+            raise DatasetError(
+                f"an offset is the Frame of an object in link {self.link!r}, in metres and "
+                f"nearer than {REACH:g} m; got {self.offset}"
+            )
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """What ``LINK@EVENT`` stands for.
+        """What ``LINK@EVENT`` stands for, or ``LINK@EVENT+OFFSET``.
+
+        The offset is ``x,y,z`` [m], ``x,y,z,yaw`` [rad] or ``x,y,z,qw,qx,qy,qz``.
 
         Raises
         ------
         DatasetError
             If it is no such text.
         """
-        link, _, event = text.strip().rpartition("@")
-        if not link or not event or "@" in link:
+        match = re.fullmatch(r"([^@]+)@([^@]+?)(?:\+([^@+]*,[^@]*))?", text.strip())
+        if match is None:
             raise DatasetError(f"a link at an event is LINK@EVENT, got {text!r}")
-        return cls(link, event)
+        link, event, offset = match.groups()
+        if offset is None:
+            return cls(link, event)
+        try:
+            values = np.array([offset.split(",")], dtype=float)
+            rotation = {3: None, 4: "yaw", 7: "wxyz"}[values.shape[1]]
+            pose = FramePose(text, None, rotation).frame(values, list(range(values.shape[1])))
+        except (ValueError, KeyError) as error:
+            message = "the object in the link: x,y,z or x,y,z,yaw or x,y,z,qw,qx,qy,qz"
+            raise DatasetError(f"{text!r}: behind + is {message} ({error})") from error
+        return cls(link, event, pose)
 
     def time(self, demonstration: Demonstration, **where: Any) -> float:
         """When the event is [s].
@@ -207,7 +428,12 @@ class LinkPose:
             raise DatasetError(message, check="events", **where) from error
 
     def frame(self, demonstration: Demonstration, robot: Any, time: float) -> Frame:
-        """The pose of the link at the step nearest to ``time``."""
+        """The pose of the link, or of the object in it, at the step nearest to ``time``."""
         step = int((demonstration.time - time).abs().argmin())
         state = robot.state(demonstration.reordered(robot.joint_names).joints[step])
-        return Frame(state.position(self.link), state.orientation(self.link))
+        pose = Frame(state.position(self.link), state.orientation(self.link))
+        if self.offset is not None:
+            return pose.compose(self.offset.to(pose.position))
+        event = getattr(self.event, "__name__", self.event)
+        vars(pose).update(at=f"{self.link}@{event}")
+        return pose

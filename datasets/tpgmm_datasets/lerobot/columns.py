@@ -22,6 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from tpgmm_datasets.errors import DatasetError
+from tpgmm_datasets.lerobot.layout import Feature
 from tpgmm_datasets.names import POSE_PARTS
 from tpgmm_datasets.units import POSE_UNITS, with_pose_units
 from tpgmm_torch.data.arrays import as_array
@@ -33,7 +34,9 @@ __all__ = [
     "demonstration_columns",
     "feature_table",
     "features_of",
+    "frame_columns",
     "pose_values",
+    "with_frames",
 ]
 
 Array = np.ndarray[Any, Any]
@@ -72,10 +75,7 @@ def features_of(
     joints = _vector(dtype, first.n_joints, names, with_pose_units(names, listed))
     features = {STATE: joints}
     if first.frames:
-        parts = [f"{frame}.{part}" for frame in first.frames for part in POSE_PARTS]
-        features[ENVIRONMENT] = _vector(
-            dtype, len(parts), parts, POSE_UNITS * len(first.frames)
-        )
+        features[ENVIRONMENT] = with_frames(None, list(first.frames), dtype)
     for event in sorted({event for item in demonstrations for event in item.events}):
         if "/" in event or not event:
             raise DatasetError(f"LeRobot stores no column named {EVENT + event!r}: rename it")
@@ -85,6 +85,29 @@ def features_of(
         kind = "float32" if key == "timestamp" else "int64"
         features[key] = {"dtype": kind, "shape": [1], "names": None}
     return features
+
+
+def with_frames(
+    old: Feature | None, frames: Sequence[str], dtype: str = "float32"
+) -> dict[str, Any]:
+    """What is declared of ``observation.environment_state``, with frames behind the old values.
+
+    Raises
+    ------
+    DatasetError
+        If one of the frames is there already.
+    """
+    names, units = (
+        [f"{f}.{part}" for f in frames for part in POSE_PARTS],
+        POSE_UNITS * len(frames),
+    )
+    if old is not None:
+        before = old.names or tuple(map(str, range(old.width)))
+        if {*before} & {*names}:
+            raise DatasetError(f"of frames {frames} some are in the set", column=ENVIRONMENT)
+        names, units = [*before, *names], (*(old.units or ("",) * old.width), *units)
+        dtype = "float64" if old.dtype == "float64" else dtype
+    return _vector(dtype, len(names), names, units)
 
 
 def _vector(
@@ -145,6 +168,15 @@ def action_column(
             f"{commanded.n_joints} values"
         )
     return {ACTION: _cast(as_array(commanded.joints), feature["dtype"], ACTION, number)}
+
+
+def frame_columns(
+    values: Array, frames: Mapping[str, Frame], features: Mapping[str, Any], number: int
+) -> dict[str, Array]:
+    """The column of :func:`with_frames`: the old values (T, width), then the poses."""
+    poses = [pose_values(frame, len(values)) for frame in frames.values()]
+    joined = np.concatenate([values, *poses], axis=1)
+    return {ENVIRONMENT: _cast(joined, features[ENVIRONMENT]["dtype"], ENVIRONMENT, number)}
 
 
 def _frame_order(features: Mapping[str, Any]) -> list[str]:

@@ -3,13 +3,17 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
-from tests.support.lerobot_sets import DATA, add_feature, change_table, set_column
-from tpgmm_datasets import DatasetError, FramePose, load_lerobot
+from tests.support.lerobot_sets import DATA, Arm, add_feature, change_table, set_column
+from tpgmm_datasets import DatasetError, FramePose, LinkPose, load_lerobot
 from tpgmm_datasets.lerobot.layout import Feature
-from tpgmm_torch import quaternions
+from tpgmm_datasets.tables import write_table
+from tpgmm_torch import Frame, quaternions
 
 POSITION = np.array([0.1, -0.2, 0.3])
 RPY = np.array([0.3, -0.5, 1.1])
@@ -94,3 +98,113 @@ def test_a_frame_that_is_stored_by_another_name_is_not_taken_for_it():
         FramePose("observation.environment_state").select("cup", feature)
     named = FramePose("observation.environment_state", columns=names)
     assert named.select("cup", feature) == list(range(7))
+
+
+#: Ways to write a rotation about the vertical by an angle: columns, and values.
+TURNS = {
+    "nothing": ([], lambda a: []),
+    "yaw": (["yaw"], lambda a: [a]),
+    "yaw_deg": (["cup.yaw_deg"], lambda a: [math.degrees(a)]),
+    "roll, pitch, yaw": (["roll", "pitch", "yaw"], lambda a: [0, 0, a]),
+    "quaternion": (
+        ["qz", "qw", "qx", "qy"],
+        lambda a: [math.sin(a / 2), math.cos(a / 2), 0, 0],
+    ),
+    "ROS": (
+        [f"pose.orientation.{part}" for part in "xyzw"],
+        lambda a: [0, 0, -math.sin(a / 2), -math.cos(a / 2)],
+    ),
+}
+PLACES = {
+    "m": ("x", "y", "z"),
+    "mm": ("x_mm", "y_mm", "z_mm"),
+    "ROS": ("/cup/pose/position/x", "/cup/pose/position/y", "/cup/pose/position/z"),
+}
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    turn=st.sampled_from(sorted(TURNS)),
+    place=st.sampled_from(sorted(PLACES)),
+    moves=st.booleans(),
+    suffix=st.sampled_from([".csv", ".parquet"]),
+    seed=st.integers(0, 99),
+)
+def test_a_table_gives_each_episode_its_own_pose(root, turn, place, moves, suffix, seed):
+    rng, (columns, written) = np.random.default_rng(seed), TURNS[turn]
+    shown = rng.uniform(-3, 3, size=(3, 1 + moves, 4))
+    rows = [
+        [
+            episode,
+            0.05 * (1 + step),
+            *(1000 if place == "mm" else 1) * pose[:3],
+            *written(pose[3]),
+        ]
+        for step in range(1 + moves)
+        for episode, pose in enumerate(shown[::, step])
+    ]
+    table = pd.DataFrame(rows, columns=["episode", "time", *PLACES[place], *columns])
+    file = root.parent / f"poses{suffix}"
+    write_table(table if moves else table.drop(columns="time"), file)
+    read = load_lerobot(root, frames={"cup": file if seed % 2 else str(file)}, episodes=[0, 2])
+    for one, poses in zip(read, shown[[0, 2]], strict=True):
+        frame = one.frames["cup"]
+        assert frame.batch_shape == ((len(one),) if moves else ())
+        # it stands still before the first and after the last
+        for found, (*position, angle) in zip(
+            frame[[0, -1]] if moves else [frame], poses, strict=True
+        ):
+            half = (
+                [math.cos(angle / 2), 0, 0, math.sin(angle / 2)] if columns else [1.0, 0, 0, 0]
+            )
+            assert found.position.tolist() == pytest.approx(position)
+            assert abs(float(found.orientation @ torch.tensor(half).double())) == pytest.approx(
+                1
+            )
+
+
+def test_frames_are_given_for_all_episodes_that_are_read(root):
+    several = [Frame([0.2 + 0.1 * x, 0, 0]) for x in range(3)]
+    by_index = dict(enumerate(several))
+    for frames in (several, by_index):
+        read = load_lerobot(root, frames={"cup": frames})
+        for one, frame in zip(read, several, strict=True):
+            assert one.frames["cup"].position.tolist() == frame.position.tolist()
+    [last] = load_lerobot(root, frames={"cup": by_index}, episodes=[2])
+    assert last.frames["cup"].position[0] == several[2].position[0]
+    for wrong, told in (
+        (several[:2], "got list of 2 Frame"),
+        (several * 2, "got list of 6 Frame"),
+        ({0: several[0], 1: several[1]}, "got dict of 2 Frame"),
+        (by_index | {7: several[0]}, "got dict of 4 Frame"),
+    ):
+        with pytest.raises(
+            DatasetError, match=rf"'cup' is .* one for each .* 0, 1, 2, .*{told}"
+        ):
+            load_lerobot(root, frames={"cup": wrong})
+
+
+def test_an_offset_makes_a_frame_at_a_link_the_objects(root):
+    robot, turned = Arm("left_elbow", "right_elbow"), "+0.1,0,0.2,1.5707963"
+    read = load_lerobot(
+        root, robot=robot, frames={"hand": "hand@close", "cup": f"hand@close{turned}"}
+    )
+    for one in read:
+        hand, cup = one.frames["hand"], one.frames["cup"].seen_from(one.frames["hand"])
+        assert (hand.at, one.frames["cup"].at) == ("hand@close", None)
+        assert cup.position.tolist() == pytest.approx([0.1, 0, 0.2])
+        assert cup.orientation.tolist() == pytest.approx([0.5**0.5, 0, 0, 0.5**0.5])
+
+
+@pytest.mark.parametrize(
+    "text, told",
+    [
+        ("hand@close+0,0", "behind [+] is the object"),
+        ("hand@close+0,0,up", "behind [+] is"),
+        ("hand@close+0,0,0,0.5,0,0,0", "norm of a quaternion is off by 0.5"),
+        ("hand@close+0,0,60", "in metres and nearer than 1 m"),
+    ],
+)
+def test_an_offset_that_is_none_is_refused(text, told):
+    with pytest.raises(DatasetError, match=told):
+        LinkPose.parse(text)

@@ -28,6 +28,8 @@ def archive(tmp_path_factory, bottles):
 
 
 def test_a_zipped_data_set_is_read_with_the_robots_joints(archive, bottles):
+    with pytest.raises(DataError, match=r"poses\.csv is not in the set"):
+        sources.uploaded([archive], upper_body(), ["cup=/etc/poses.csv"])
     read = sources.uploaded([archive], upper_body())
     assert len(read) == 2
     for one, other in zip(read, bottles, strict=True):

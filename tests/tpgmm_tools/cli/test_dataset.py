@@ -105,6 +105,18 @@ def test_joints_are_stored_in_radians_at_the_rate_that_is_asked_for(tmp_path, ra
         assert item.joints.numpy() == pytest.approx(expected.numpy(), abs=1e-5)
 
 
+def test_measured_poses_are_added_to_a_copy(arm, tmp_path):
+    (tmp_path / "poses.csv").write_text("episode,x,y,z\n0,.3,0,0\n1,.4,0,0\n2,.5,0,0")
+    frame = ("--frame", f"cup={tmp_path / 'poses.csv'}")
+    text = output("dataset", "add-frames", arm[0], *frame, "--out", tmp_path / "new")
+    assert text == f"cup added to the copy {tmp_path / 'new'}\n"
+    for n, found in enumerate(load_lerobot(tmp_path / "new")):
+        assert list(found.frames) == ["bottle", "cup"]
+        assert found.frames["cup"].position[0] == pytest.approx(0.3 + 0.1 * n)
+    told = refusal("dataset", "add-frames", arm[0], *frame, "--out", tmp_path / "new")
+    assert "exists; remove it" in told
+
+
 @pytest.mark.parametrize("tasks", [[], ["reach", "shake"]])
 def test_an_episode_that_has_not_one_task_of_its_own_needs_to_be_told(arm, tmp_path, tasks):
     root = to_v21(arm[0], tmp_path / "old")

@@ -168,11 +168,32 @@ def test_a_frame_at_a_link_follows_from_the_start_posture():
     assert beside.frames["cup"].link is None
 
 
+@pytest.mark.parametrize("at", [None, "l_hand@close"])
+def test_a_frame_that_was_a_links_pose_is_not_taken_for_an_object(at):
+    starts, turns = np.zeros((6, 2)), np.tile([0.0, 1.0, 0.0, 0.0], (6, 1))
+    shown = [Frame(np.zeros(3), turn) for turn in turns]
+    for frame in shown:
+        vars(frame).update(at=at)
+    kinematics = JointSpace(("j0", "j1"))
+    items = [
+        Demonstration([0.0, 1.0], np.stack((start, start)), {"cup": frame.to(torch.float64)})
+        for start, frame in zip(starts, shown, strict=True)
+    ]
+    summary = TrainingSummary.of(summarize(items, kinematics), kinematics)
+    summary = TrainingSummary.from_config(json.loads(json.dumps(summary.config())), kinematics)
+    assert summary.frames["cup"].at == at
+    assert summary.findings(None, {"cup": Frame([0, 0, 0], turns[0])}) == []
+    [finding] = summary.findings(None, {"cup": Frame([0, 0, 0])})
+    assert "turned by 180 deg" in finding.message
+    assert ("It was the pose of l_hand at close" in finding.remedy) == (at is not None)
+    assert ("(x, y, z, w)" in finding.remedy) == (at is None)
+
+
 def damages(config):
     """Copies of nested dictionaries and lists, one value spoiled or left out in each."""
     for key, value in config.items() if isinstance(config, dict) else enumerate(config):
         for wrong in (None, "x", [], -1.5, 1.0, float("nan"), {}, True):
-            if wrong != value and not (key == "link" and wrong is None):
+            if wrong != value and not (key in ("link", "at") and wrong is None):
                 spoiled = copy.copy(config)
                 spoiled[key] = wrong
                 yield key, wrong, spoiled

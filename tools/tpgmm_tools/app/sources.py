@@ -59,7 +59,11 @@ def uploaded(
     if kinds == {".zip"} and len(paths) == 1:
         with TemporaryDirectory() as place:
             folder = _unpacked(paths[0], Path(place))
-            return load_lerobot(folder, robot=robot, frames=parse_frames(frames))
+            sources = parse_frames(frames) or {}
+            for one in map(str, sources.values()):
+                if one.endswith((".csv", ".parquet")):
+                    raise DataError(f"{one} is not in the set: tpgmm dataset add-frames")
+            return load_lerobot(folder, robot=robot, frames=sources or None)
     if not paths or not kinds <= {".csv", ".parquet"}:
         names = ", ".join(path.name for path in paths) or "no file"
         raise DataError(

@@ -234,6 +234,34 @@ def convert(
     )
 
 
+@options.command(
+    app, "tpgmm dataset add-frames recordings/arm --frame cup=poses.csv --out out/arm"
+)
+def add_frames(path: str, *, frame: list[str], out: Path) -> None:
+    """Write a copy of a data set (v3.0) with measured poses of objects.
+
+    They are put into observation.environment_state, where lerobot-train sees them too; 'tpgmm
+    fit' takes the table itself. Videos are linked or copied.
+
+    Parameters
+    ----------
+    path : str
+        A LeRobot data set: its folder.
+    frame : ``NAME=POSES.csv``
+        An object and its poses, repeatable: a table (.csv or .parquet) with columns episode,
+        x, y, z in metres, and yaw in radians or qw, qx, qy, qz if it is turned; and time in
+        seconds, if it moves.
+    out : ``DIR``
+        Folder of the copy.
+    """
+    from tpgmm_datasets.text import parse_frames
+    from tpgmm_datasets.writer import add_frames
+
+    frames = parse_frames(frame) or {}
+    add_frames(path, out, frames)
+    typer.echo(f"{', '.join(frames)} added to the copy {out}")
+
+
 def _tasks(episodes: Sequence[Episode]) -> list[str]:
     """The task of each episode, of which it must have one."""
     from tpgmm_torch.exceptions import DataError

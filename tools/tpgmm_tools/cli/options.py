@@ -35,9 +35,11 @@ class DataOptions:
     ----------
     frame : ``NAME[=SOURCE]``
         An object's pose, repeatable: NAME (found by the names in
-        observation.environment_state), NAME=FEATURE, NAME=FEATURE[7:14], or NAME=LINK@EVENT,
-        where a link of the robot is at an event: one of the set, of --event, 'close', 'open'
-        or 'stop' of that link, 'start' or 'end'. Default: all poses that the set names.
+        observation.environment_state), NAME=FEATURE, NAME=FEATURE[7:14], NAME=POSES.csv
+        (columns episode, x, y, z, and yaw or qw, qx, qy, qz; time if it moves), or
+        NAME=LINK@EVENT, where a link of the robot is at an event: one of the set, of --event,
+        'close', 'open' or 'stop' of that link, 'start' or 'end'; +x,y,z behind it is the object
+        in the link. Default: all poses that the set names.
     event : ``NAME=HOW``
         How an event is found, repeatable: NAME=closing:SIGNALS or opening:SIGNALS (when a
         gripper's are low), contact: or release:SIGNALS (high), moving:FRAME, stop:LINK;
