@@ -74,10 +74,13 @@ class Signals:
         options["joint_names"] = joint_names
         assembly = open_recording(path, robot=robot, **options).assembly
         layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
-        called = joint_names if isinstance(joint_names, Mapping) else {}
-        state = _renamed(layout.features.get(STATE, source), called)
+        called = joint_names if isinstance(joint_names, Mapping) else None
+        if called is None and joint_names is not None:  # all of them are given
+            source = replace(source, names=columns.names, misnamed="")
+        state = layout.features.get(STATE, source)
+        state = _renamed(source if state.key == source.key else state, source, called or {})
         action = layout.features.get(ACTION)
-        action = action and _renamed(action, called)
+        action = action and _renamed(action, source, called or {})
         environment = layout.features.get(ENVIRONMENT)
         scales = {
             name: as_scale(unit, source.key)
@@ -102,9 +105,15 @@ class Signals:
         )
 
 
-def _renamed(feature: Feature, called: Mapping[str, str]) -> Feature:
-    names = feature.names and tuple(called.get(name, name) for name in feature.names)
-    return replace(feature, names=names)
+def _renamed(feature: Feature, source: Feature, called: Mapping[str, str]) -> Feature:
+    """As somebody else calls its values; what names none has those of the joints."""
+    names = feature.names
+    if names is None and feature.width == source.width:
+        names = source.names
+    elif feature.misnamed:
+        message = f"its values cannot be told apart: {feature.misnamed}. {REMEDY}"
+        raise DatasetError(message, column=feature.key)
+    return replace(feature, names=names and tuple(called.get(name, name) for name in names))
 
 
 def _plain(pose: FramePose) -> bool:
