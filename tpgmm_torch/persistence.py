@@ -24,7 +24,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tpgmm_torch import operators as builtin_operators
-from tpgmm_torch.atomic import contents, consistent, read_whole, replacing
+from tpgmm_torch.atomic import consistent, contents, read_whole, replacing
 from tpgmm_torch.checks.summary import TrainingSummary
 from tpgmm_torch.data.holds import Hold
 from tpgmm_torch.estimator import TaskParameterizedGMM

@@ -35,7 +35,9 @@ SAME_DURATION, SAME_PHASE = 1.6, 0.15
 #: this [rad or m].
 SAME_PATH, SMALLEST_RANGE = 0.5, 0.2
 #: Fewer recordings do not show what a usual path is.
-FEWEST_PATHS = 5
+FEWEST_PATHS, FEWEST_REVERSED = 5, 3
+#: A path that, turned around, is off the median path by so much less runs backwards.
+REVERSED = 0.5
 BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
 
 
@@ -43,9 +45,9 @@ def check(demonstrations: Iterable[Demonstration], robot: Kinematics | None = No
     """Check whether recordings can be what they are taken for; nothing is changed.
 
     Checked are units, limits of position and speed, the order of unnamed joints, wraps, jumps,
-    clipped and stuck values; steps of time, gaps, durations and events; positions, orientations
-    and quaternion order of frames; copies, and episodes unlike the others. What is not found is
-    not thereby right.
+    clipped, stuck and still values; steps of time, gaps, durations and events; positions,
+    orientations and quaternion order of frames; copies, and episodes that run backwards or are
+    unlike the others. What is not found is not thereby right.
 
     Parameters
     ----------
@@ -182,22 +184,35 @@ def _copies(episodes: Sequence[RecordingSummary]) -> Iterator[Finding]:
 
 
 def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Iterator[Finding]:
-    """Episodes whose path is far from the median path."""
-    if len(episodes) < FEWEST_PATHS:
+    """Episodes whose path is far from the median path, or runs backwards along it."""
+    if len(episodes) < FEWEST_REVERSED:
         return
     paths = _aligned_signs(episodes, robot)
     scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
-    squares = ((paths - np.median(paths, axis=0)) / scale) ** 2
-    distances, joints = np.sqrt(squares.mean(axis=(1, 2))), squares.mean(axis=1)
-    usual = float(np.median(distances))
-    odd = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > usual]
+    usual = np.median(paths, axis=0)
+    squares, backwards = (((each - usual) / scale) ** 2 for each in (paths, paths[:, ::-1]))
+    distances, turned = (np.sqrt(each.mean(axis=(1, 2))) for each in (squares, backwards))
+    typical = float(np.median(distances))
+    reverse = np.flatnonzero((turned < REVERSED * distances) & (turned < SAME_PATH + typical))
+    if len(reverse):
+        off = "as recorded {:.2g}, turned around {:.2g}"
+        places = [f"demonstration {i} {off.format(distances[i], turned[i])}" for i in reverse]
+        message = (
+            f"paths run backwards, off the median in ranges of the joints: {listed(places)}"
+        )
+        remedy = "Are they stored in reverse, or another skill? Leave them out"
+        yield Finding("episodes", message, remedy, (), tuple(map(int, reverse)))
+    if len(episodes) < FEWEST_PATHS:
+        return
+    odd = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
+    odd = [i for i in odd if i not in reverse]
     if odd:
         names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
-        most = {i: names[int(joints[i].argmax())] for i in odd}
+        most = {i: names[int(squares[i].mean(axis=0).argmax())] for i in odd}
         places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
         message = (
             "paths differ from the median path, in ranges of the joints, by about "
-            f"{usual:.2g}, but {listed(places)}"
+            f"{typical:.2g}, but {listed(places)}"
         )
         remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
         yield Finding("episodes", message, remedy, tuple({*most.values()}), tuple(odd))
