@@ -267,8 +267,8 @@ def read_table(path: str | Path) -> pd.DataFrame:
         if path.suffix == ".csv":
             with path.open(encoding="utf-8", errors="replace") as file:
                 head, row = file.readline().strip(), file.readline()
-            mark = max(",;\t", key=head.count)
-            mark = mark if mark in head else r"\s+"
+            marks = [mark for mark in ",;\t" if mark in head and mark in row]
+            mark = marks[0] if marks else "," if "," in head else r"\s+"
             comma = mark != "," and re.search(r"\d,\d", row)
             # by default pandas is quicker and wrong in the last digit, and takes the first
             # column for names of rows where these are longer than the header
@@ -278,7 +278,7 @@ def read_table(path: str | Path) -> pd.DataFrame:
                     path, sep=mark, decimal="," if comma else ".", index_col=False,
                     skipinitialspace=True, float_precision="round_trip",
                 )  # fmt: skip
-            return read.rename(columns=lambda n: n[1:] if FORMULA.match(n[1:]) else n)
+            return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
         from pyarrow import parquet
 
         held = parquet.read_metadata(path)

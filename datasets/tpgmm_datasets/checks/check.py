@@ -36,8 +36,9 @@ SAME_DURATION, SAME_PHASE = 1.6, 0.15
 SAME_PATH, SMALLEST_RANGE = 0.5, 0.2
 #: Fewer recordings do not show what a usual path is.
 FEWEST_PATHS, FEWEST_REVERSED = 5, 3
-#: A path that, turned around, is off the median path by so much less runs backwards.
-REVERSED = 0.5
+#: A path runs backwards if, turned around, its steps go so much along those of the median path
+#: (cosine), and by so much more than as it was recorded.
+ALONG, BACKWARDS = 0.4, 0.2
 BY_HAND = "Was the event detected rightly? Give it by hand, or leave the episode out"
 
 
@@ -188,26 +189,25 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
     if len(episodes) < FEWEST_REVERSED:
         return
     paths = _aligned_signs(episodes, robot)
-    scale = np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
-    usual = np.median(paths, axis=0)
-    squares, backwards = (((each - usual) / scale) ** 2 for each in (paths, paths[:, ::-1]))
-    distances, turned = (np.sqrt(each.mean(axis=(1, 2))) for each in (squares, backwards))
-    typical = float(np.median(distances))
-    reverse = np.flatnonzero((turned < REVERSED * distances) & (turned < SAME_PATH + typical))
-    if len(reverse):
-        off = "as recorded {:.2g}, turned around {:.2g}"
-        places = [f"demonstration {i} {off.format(distances[i], turned[i])}" for i in reverse]
-        message = (
-            f"paths run backwards, off the median in ranges of the joints: {listed(places)}"
-        )
+    paths /= np.maximum(np.median(np.ptp(paths, axis=1), axis=0), SMALLEST_RANGE)
+    median = np.median(paths, axis=0)
+    along, turned = (
+        _cosines(np.diff(p, axis=1), np.diff(median, axis=0)) for p in (paths, paths[:, ::-1])
+    )
+    reverse = np.flatnonzero(turned > np.maximum(ALONG, along + BACKWARDS)).tolist()
+    if reverse:
+        places = [f"demonstration {i} ({turned[i]:.2f}, not {along[i]:.2f})" for i in reverse]
+        message = f"paths go along the median path if they run backwards: {listed(places)}"
         remedy = "Are they stored in reverse, or another skill? Leave them out"
-        yield Finding("episodes", message, remedy, (), tuple(map(int, reverse)))
+        yield Finding("episodes", message, remedy, (), tuple(reverse))
     if len(episodes) < FEWEST_PATHS:
         return
-    odd = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
-    odd = [i for i in odd if i not in reverse]
-    if odd:
-        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(len(scale)))
+    squares = (paths - median) ** 2
+    distances = np.sqrt(squares.mean(axis=(1, 2)))
+    typical = float(np.median(distances))
+    far = [i for i in outliers(distances, floor=SAME_PATH) if distances[i] > typical]
+    if odd := [i for i in far if i not in reverse]:
+        names = episodes[0].joint_names or tuple(f"joint {j}" for j in range(paths.shape[-1]))
         most = {i: names[int(squares[i].mean(axis=0).argmax())] for i in odd}
         places = [f"demonstration {i} by {distances[i]:.2g} (most {most[i]!r})" for i in odd]
         message = (
@@ -216,6 +216,13 @@ def _paths(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> It
         )
         remedy = "Is it the same skill, with columns of the same order and unit? Leave it out"
         yield Finding("episodes", message, remedy, tuple({*most.values()}), tuple(odd))
+
+
+def _cosines(steps: Array, usual: Array) -> Array:
+    """Of the angles between the steps (E, P - 1, n_joints) and usual ones, as vectors."""
+    lengths = np.sqrt((steps**2).sum((1, 2)) * (usual**2).sum())
+    cosines: Array = (steps * usual).sum((1, 2)) / np.maximum(lengths, 1e-12)
+    return cosines
 
 
 def _aligned_signs(episodes: Sequence[RecordingSummary], robot: Kinematics | None) -> Array:

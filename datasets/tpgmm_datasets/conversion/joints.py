@@ -92,6 +92,7 @@ def joint_feature(layout: Layout, joints: str | None = None) -> str:
     raise DatasetError(
         f"there are no {wanted}: none of {list(usual[joints])} is a column. Say which holds "
         f"them, joints=... (--joints), of {sorted(layout.features)}",
+        check="joints",
         file="meta/info.json",
     )
 
@@ -132,7 +133,7 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
     if isinstance(given, Mapping) or given is None:
         if feature.misnamed:
             message = f"its values cannot be told apart: {feature.misnamed}. {NAME_ALL}"
-            raise DatasetError(message, column=feature.key)
+            raise DatasetError(message, check="joints", column=feature.key)
         for name in given or ():
             if name not in (names or ()):
                 message = f"joint_names has {name!r}; the values are called {names}"
