@@ -40,10 +40,9 @@ def value_names(
     found = list(_leaves(names)) if names else []
     if not found or (len(found) == 1 < width and found[0][1] in re.split(r"[./]", key)):
         return None, ""
-    places = [place for *_, place in found if place is not None]
-    if places:
-        counted = [range(len(found)), range(1, len(found) + 1)]
-        if {*map(type, places)} != {int} or sorted(places) not in map(list, counted):
+    if places := [place for *_, place in found if place is not None]:
+        counts = [[*range(first, len(found) + first)] for first in (0, 1)]
+        if {*map(type, places)} != {int} or sorted(places) not in counts:
             return None, f"the positions of the names, {places}, do not count the values"
         found.sort(key=lambda leaf: leaf[2])
     bare = [name for _, name, _ in found]
@@ -55,9 +54,8 @@ def value_names(
         return tuple(bare), ""
     shared = {name for name, count in Counter(bare).items() if count > 1}
     flat = ["_".join((*g, name)) if name in shared else name for g, name, _ in found]
-    twice = {flat[i]: bare[i] for i in range(width) if flat.count(flat[i]) > 1}
-    if twice:
-        return None, f"{' and '.join(map(repr, twice.values()))} is there twice, of {bare}"
+    if twice := [name for name, whole in zip(bare, flat, strict=True) if flat.count(whole) > 1]:
+        return None, f"{twice[0]!r} is there twice, of {bare}"
     return tuple(flat), ""
 
 
@@ -66,17 +64,15 @@ def _leaves(names: Any) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
     rest: list[tuple[tuple[str, ...], Any, Any]] = [((), names, None)]
     while rest:
         groups, name, place = rest.pop()
-        if isinstance(name, dict):
-            items = [
+        if isinstance(name, list):
+            rest += [(groups, value, None) for value in reversed(name)]
+        elif isinstance(name, dict):
+            rest += [
                 ((*groups, k), v, None) if isinstance(v, dict | list) else (groups, k, v)
-                for k, v in name.items()
+                for k, v in reversed(name.items())
             ]
-        elif isinstance(name, list):
-            items = [(groups, v, None) for v in name]
         else:
             yield groups, name, place
-            continue
-        rest += reversed(items)
 
 
 #: What can be said where names do not match, and where there are none that can be used.

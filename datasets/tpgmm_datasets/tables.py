@@ -54,9 +54,8 @@ CLOCKS, CLOCK_ERROR = (1e9, 1e6, 1e3, 1.0), 0.05
 SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11}
 #: What is so called is no joint.
 COUNTS = re.compile(
-    r"((.*[._/])?(time_?stamp|stamp|seq|nanosec|nsecs?)|(.*stamp[._/])?secs?|time|clock|step|tick|frame|index"
-    r"|(frame|episode|task|sample)_(index|id|nr))(_(s|ms|us|ns))?",
-    re.IGNORECASE,
+    r"(?i)((.*[._/])?(time_?stamp|stamp|seq|nanosec|nsecs?)|(.*stamp[._/])?secs?|time|clock|step"
+    r"|tick|frame|index|(frame|episode|task|sample)_(index|id|nr))(_(s|ms|us|ns))?"
 )
 #: Columns of poses as ROS calls them.
 ROS_POSE = re.compile(
@@ -272,21 +271,20 @@ def read_table(path: str | Path) -> pd.DataFrame:
             comma = mark != "," and re.search(r"\d,\d", row)
             # by default pandas is quicker and wrong in the last digit, and takes the first
             # column for names of rows where these are longer than the header
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", pandas.errors.ParserWarning)
-                read = pandas.read_csv(
-                    path, sep=mark, decimal="," if comma else ".", index_col=False,
-                    skipinitialspace=True, float_precision="round_trip",
-                )  # fmt: skip
+            options: dict[str, Any] = {
+                "decimal": "," if comma else ".",
+                "float_precision": "round_trip",
+            }
+            options |= {"sep": mark, "index_col": False, "skipinitialspace": True}
+            with warnings.catch_warnings(action="error", category=pandas.errors.ParserWarning):
+                read = pandas.read_csv(path, **options)
             return read.rename(columns=lambda n: n.removeprefix("'") if FORMULA.match(n) else n)
         from pyarrow import parquet
 
-        held = parquet.read_metadata(path)
-        if held.num_rows * held.num_columns > MOST_NUMBERS:
-            raise ValueError(
-                f"it has {held.num_rows} rows of {held.num_columns} columns; at most "
-                f"{MOST_NUMBERS:g} numbers are read: write it in parts"
-            )
+        rows, columns = parquet.read_metadata(path).num_rows, len(parquet.read_schema(path))
+        if rows * columns > MOST_NUMBERS:
+            most = f"at most {MOST_NUMBERS:g} numbers are read: write it in parts"
+            raise ValueError(f"it has {rows} rows of {columns} columns; {most}")
         return pandas.read_parquet(path)
     except FileNotFoundError:
         raise DataError(f"there is no file {path}") from None
@@ -362,21 +360,17 @@ def _checked(
         raise DataError(f"a table is a pandas DataFrame, got {type(table).__name__}")
     if table.index.name == time:
         table = table.reset_index()
-    kept = {*(joints or ())}
+    kept = {*(joints or ()), *table.attrs.get(JOINTS, ())}
     table = table.rename(columns=lambda n: n if n in kept else _plain(str(n).strip()))
     table = table.dropna(how="all")
-    twice = {*table.columns[table.columns.duplicated()]} | {
-        name  # so pandas calls the second
-        for name in {*table.columns} - kept
-        if (match := re.fullmatch(r"(.+)\.\d+", name)) and match[1] in table.columns
-    }
-    if twice:
+    # the second of one name is NAME.1 of pandas
+    again = [n for n in table.columns if n not in kept and re.fullmatch(r".+\.\d+", n)]
+    twice = {n for n in again if n.rpartition(".")[0] in table.columns}
+    if twice := twice | {*table.columns[table.columns.duplicated()]}:
         raise DataError(f"the table has columns of one name: {sorted(twice)}")
     if len(table.columns) == 1 and (found := re.findall(r"[,;\t]|\s+", table.columns[0])):
-        raise DataError(
-            f"the table has one column, {table.columns[0]!r}: its fields are separated by "
-            f"{found[0]!r}, pandas.read_csv(..., sep={found[0]!r})"
-        )
+        message = f"the table has one column, {table.columns[0]!r}: its fields are separated by"
+        raise DataError(f"{message} {found[0]!r}, pandas.read_csv(..., sep={found[0]!r})")
     asked = () if episode == EPISODE else (episode,)
     for name in (time, *asked, *(joints or ())):
         if name not in table.columns:
@@ -385,10 +379,11 @@ def _checked(
         raise DataError("the table has no rows")
     if episode in table.columns and table[episode].isna().any():
         raise DataError(f"column {episode!r} lacks a value: to which episode is that row?")
-    empty = [n for n in _others(table, {time, episode, *kept}) if table[n].isna().all()]
+    empty = [
+        n for n in _others(table, {time, episode, *(joints or ())}) if table[n].isna().all()
+    ]
     if told := [name for name in empty if not UNNAMED.fullmatch(name)]:
-        message = f"columns {told} of the table are empty, and left out"
-        warnings.warn(message, PlausibilityWarning, stacklevel=3)
+        _warn(f"columns {told} of the table are empty, and left out")
     return table.drop(columns=empty)
 
 
@@ -417,8 +412,7 @@ def _joints(
     values = [name for name in taken if table[name].dtype.kind in "iuf"]
     counters = [name for name in values if COUNTS.fullmatch(name)]
     steady = {n: _steady(parts, n, time) for n in values if n not in counters}
-    counters += [name for name, kind in steady.items() if kind == "counter"]
-    if counters:
+    if counters := [*counters, *(n for n, kind in steady.items() if kind == "counter")]:
         raise DataError(
             f"columns {counters} count the rows or tell the time, and are no joints: drop them "
             "(pandas leaves its own out of a file with index=False), or say which are: "
@@ -427,13 +421,15 @@ def _joints(
     if unnamed := [name for name in taken if UNNAMED.fullmatch(name)]:
         raise DataError(f"columns {unnamed} have no name: name or drop them, or joints=[...]")
     if even := [name for name, kind in steady.items() if kind]:
-        warnings.warn(
+        _warn(
             f"columns {even} change by the same in every row: are they joints (joints=[...]), "
-            "or do they count something? Then drop them",
-            PlausibilityWarning,
-            stacklevel=3,
+            "or do they count something? Then drop them"
         )
     return names
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, PlausibilityWarning, stacklevel=4)
 
 
 def _steady(parts: Sequence[tuple[Any, pd.DataFrame]], name: str, time: str) -> str:
@@ -441,24 +437,23 @@ def _steady(parts: Sequence[tuple[Any, pd.DataFrame]], name: str, time: str) -> 
     steps = np.concatenate([np.diff(part[name].to_numpy(float)) for _, part in parts])
     if len(steps) < FEWEST_COUNTED - 1 or not steps[0]:
         return ""
-    if (steps == steps[0]).all() and steps[0] % 1 == 0:
-        return "counter"
+    even = np.allclose(steps, steps[0], rtol=1e-6, atol=0)
     ticks = np.concatenate([np.diff(part[time].to_numpy(float)) for _, part in parts])
-    if any(np.allclose(steps, rate * ticks, rtol=CLOCK_ERROR, atol=0) for rate in CLOCKS):
-        return "counter"
-    return "evenly" if np.allclose(steps, steps[0], rtol=1e-6, atol=0) else ""
+    rates = [rate for rate in CLOCKS if np.allclose(steps, rate * ticks, CLOCK_ERROR, 0)]
+    return "counter" if rates or (even and steps[0] % 1 == 0) else "evenly" * even
 
 
 def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
     """An episode's time and events in seconds: of dates, those since its first row."""
-    first, kind, to_datetime = part[time].iloc[0], part[time].dtype.kind, _pandas().to_datetime
+    first, kind = part[time].iloc[0], part[time].dtype.kind
     unit = next((u for u, low in SINCE_1970.items() if kind in "iuf" and first >= low), None)
     if kind in "biuf" and unit is None:
         return part
     options = {"unit": unit} if unit else {"format": "ISO8601", "utc": True}
     names = [time, *(name for name in part.columns if name.startswith(EVENT))]
     try:
-        dates = part[names] if kind == "m" else part[names].apply(to_datetime, **options)
+        dates = part[names]
+        dates = dates if kind == "m" else dates.apply(_pandas().to_datetime, **options)
         since = (dates - dates[time].iloc[0]).apply(lambda column: column.dt.total_seconds())
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(
@@ -470,11 +465,9 @@ def _in_seconds(part: pd.DataFrame, time: str) -> pd.DataFrame:
 
 def _plain(name: str) -> str:
     """A column's name; those of ROS's poses become this module's."""
-    match = ROS_POSE.fullmatch(name)
-    if match is None:
-        return name
-    stem = (match[1] or "pose").strip("/")
-    return f"{stem}.{match['x'] or 'q' + match['q']}"
+    if match := ROS_POSE.fullmatch(name):
+        return f"{(match[1] or 'pose').strip('/')}.{match['x'] or 'q' + match['q']}"
+    return name
 
 
 def _others(table: pd.DataFrame, known: set[str]) -> list[str]:

@@ -149,11 +149,11 @@ def names_of(feature: Feature, given: Names | None, robot: Any) -> tuple[str, ..
     if names is None and count == len(robot.joint_names) == 1:
         names = tuple(robot.joint_names)
     if names is None:
-        raise DatasetError(
+        message = (
             f"the set does not name its {count} values, and nothing else tells which are the "
-            f"robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}. {NAME_ALL}",
-            column=feature.key,
+            f"robot's {len(robot.joint_names)} joints, {list(robot.joint_names)}. {NAME_ALL}"
         )
+        raise DatasetError(message, column=feature.key)
     matched = match_names(robot.joint_names, names, feature.key)
     return tuple(matched.get(name, name) for name in names)
 
