@@ -74,13 +74,11 @@ class Signals:
         options["joint_names"] = joint_names
         assembly = open_recording(path, robot=robot, **options).assembly
         layout, columns, source = assembly.layout, assembly.joints, assembly.joints.feature
-        called = joint_names if isinstance(joint_names, Mapping) else None
-        if called is None and joint_names is not None:  # all of them are given
-            source = replace(source, names=columns.names, misnamed="")
-        state = layout.features.get(STATE, source)
-        state = _renamed(source if state.key == source.key else state, source, called or {})
+        called = joint_names if isinstance(joint_names, Mapping) else {}
+        given = None if called or joint_names is None else columns.names
+        state = _renamed(layout.features.get(STATE, source), source, called, given)
         action = layout.features.get(ACTION)
-        action = action and _renamed(action, source, called or {})
+        action = action and _renamed(action, source, called, given)
         environment = layout.features.get(ENVIRONMENT)
         scales = {
             name: as_scale(unit, source.key)
@@ -105,14 +103,16 @@ class Signals:
         )
 
 
-def _renamed(feature: Feature, source: Feature, called: Mapping[str, str]) -> Feature:
-    """As somebody else calls its values; what names none has those of the joints."""
-    names = feature.names
-    if names is None and feature.width == source.width:
-        names = source.names
-    elif feature.misnamed:
+def _renamed(
+    feature: Feature, source: Feature, called: Mapping[str, str], given: tuple[str, ...] | None
+) -> Feature:
+    """As somebody calls its values; what names none has the names of the joints in order."""
+    names, alike = feature.names, feature.width == source.width
+    if feature.misnamed and not (alike and given):
         message = f"its values cannot be told apart: {feature.misnamed}. {REMEDY}"
         raise DatasetError(message, column=feature.key)
+    if alike and (names is None or (given and names == source.names)):
+        names = given or source.names
     return replace(feature, names=names and tuple(called.get(name, name) for name in names))
 
 
